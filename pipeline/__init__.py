@@ -2,4 +2,5 @@
 
 import reskin  # noqa: F401  (imported first: it sets variables that NumPy reads on import)
 
-FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"  # in a checkout
+# Paths relative to a checkout.
+FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"

@@ -25,7 +25,7 @@ class Experiment(Strict):
         drawn for the experiment.
     settings: whether the scene's file must have a section of settings for the experiment, named after the stage.
     recorded: whether scenes with recorded captures may run the experiment.
-    alone: whether a scene may run only this experiment, because it needs neither folds nor places in mm.
+    alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
     """
 
     name: str

@@ -158,7 +158,7 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
-    """Resolve merge conflicts in data/captures.yaml, plan, dvc.lock and reports, if branches added other recordings."""
+    """Resolve conflicts in data/captures.yaml, plan, dvc.lock and reports, after merging a branch with recordings."""
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))

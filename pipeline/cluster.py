@@ -26,7 +26,8 @@ from reskin.numerics import signature
 CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
-CODE = (".py", ".json", ".safetensors")  # suffixes of the compared files; settings are sent with each call
+# Suffixes of the files that must be equal on all machines. Settings need not be, because they are sent with each call.
+CODE = (".py", ".json", ".safetensors")
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 
 
@@ -117,7 +118,7 @@ def _connect(address: str) -> Any:
 
 
 def _check_workers(client: Any, address: str) -> None:
-    """Raise if there is no worker, or if the results of a worker could differ from this process's."""
+    """Raise if there is no worker, or if the results of a worker could differ from those of this process."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
         raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HELP}")
@@ -138,11 +139,14 @@ def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker:
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Copy the result or error of a Dask future to `future`; a dead worker gives `BrokenExecutor`, as locally."""
+    """Copy the result or error of a Dask future to `future`.
+
+    If the worker died, the error is `BrokenExecutor`, as it would be on this machine.
+    """
     from distributed import KilledWorker
 
-    # Dask cancels calls if it loses the scheduler. Calls that this executor cancels need no other error: nobody waits
-    # for their results.
+    # Dask cancels calls if it loses the scheduler. Calls that `shutdown` cancelled get the same error, because nobody
+    # waits for their results.
     if submitted.cancelled():
         remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))

@@ -15,11 +15,11 @@ from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
-NEAR = 0.2  # readings count for one of these forces if their force differs from it by at most this fraction
+NEAR = 0.2  # a reading belongs to a force in `FORCES_N` if its own force differs by at most this fraction
 ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
-STEP_READINGS_N = 2000  # the chips' resolution is found from this many readings
-PRESSED_N = 0.5  # N; below this force, the field change of a weak chip is mostly noise
+STEP_READINGS_N = 2000  # number of readings from which the chips' resolution is determined
+PRESSED_N = 0.5  # below this force, the field change of a weak chip is mostly noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
@@ -106,7 +106,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 def _rate(readings: Readings) -> dict[str, float]:
     """Return the median rate of readings within a stop, in Hz, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
-    known_s = between_s[between_s > 0]  # also drops NaN (no clock)
+    known_s = between_s[between_s > 0]  # also excludes NaN, which means that there is no clock
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 
@@ -118,7 +118,7 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
 
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
-    """Return the median field change at each force in `FORCES_N`, and the ratio of weakest to strongest chip."""
+    """Return the median field change at each force in `FORCES_N`, and the median ratio of weakest to strongest chip."""
     size_uT = np.linalg.norm(change_uT, axis=1)
     numbers = {}
     for level_N in FORCES_N:

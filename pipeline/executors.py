@@ -70,7 +70,7 @@ def _context(imports: str) -> ForkServerContext:
 
 def end_workers() -> None:
     """Stop the fork server, so that the CPU time of workers is included in the CPU time of this process's children."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # would otherwise outlive this process
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # otherwise, the server would outlive this process
 
 
 class InProcessExecutor(Executor):

@@ -20,7 +20,7 @@ HEADER = """\
 # Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
-MANY_N = 30  # one stage ingests all captures of a recorded scene with more captures than this (docs/growth.md)
+MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
 NOT_INGESTED = {"walk"}  # kinds of protocols without a probe log; their experiments read raw captures
 
 

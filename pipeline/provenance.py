@@ -86,7 +86,7 @@ def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) 
     cpuinfo: content of Linux's /proc/cpuinfo. otherwise: the processor's name if `cpuinfo` has no model name.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
-    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # first processor
+    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # those of the first processor
     flags = set(values.get("flags", values.get("features", "")).split())
     model = values.get("model name") or otherwise or "unknown processor"
     plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())

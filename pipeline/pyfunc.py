@@ -28,5 +28,5 @@ class NetworkModel:
 
 
 def _load_pyfunc(path: str) -> NetworkModel:
-    """Load the network from `path`, the weights that the run's file MLmodel names; MLflow calls this function."""
+    """Load the network whose weights are in the file `path`; MLflow calls this function with the path in MLmodel."""
     return NetworkModel(read_network(Path(path)))

@@ -206,7 +206,7 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and that it has the sections that these need; the sections are not parsed."""
+    """Check a scene's experiments, and that the scene has the sections that they need; do not parse the sections."""
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))

@@ -30,7 +30,7 @@ METHODS = {
 CONFIDENCE = 0.95  # confidence level of intervals; convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
-DECIMALS = 12  # differences in %, mm2 or N2 are rounded to these; further decimals are rounding errors
+DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
 BOARDS_MIN = 4  # fewest boards for an interval; with fewer, the values of the boards are given
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
@@ -59,8 +59,8 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     Parameters
     ----------
     cards
-        Cards of models. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row
-        for all skins.
+        Model cards. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row for
+        all skins.
     points
         Points of sweeps, by experiment; each point has the scores of one training run.
 
@@ -176,7 +176,7 @@ def interval(values: Values, metric: str = "") -> list[float] | None:
     >>> [round(float(end), 2) for end in interval([1.0, 3.0])]  # t is 12.71 with one degree of freedom
     [-10.71, 14.71]
     >>> [round(float(end), 1) for end in interval([60.0, 90.0, 99.0, 95.0], "accuracy_pct")]
-    [46.2, 97.8]
+    [37.1, 98.5]
     """
     n = len(values)
     if n < 2:
@@ -296,8 +296,8 @@ def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict
 def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise over pairs of a training skin and a test skin, as the paper does (3 x 9 pairs).
 
-    The interval `ci95` treats both training skins and test boards as samples (`two_way_error`). `training_n` and
-    `boards_n` are their numbers.
+    The interval `ci95` treats both training skins and test boards as samples (`two_way_error`). `training_n` is the
+    number of training skins, `boards_n` the number of test boards.
     """
     skin_rows = by_skin(rows)
     pairs = over_units(skin_rows, "fold", "skin")
@@ -313,12 +313,12 @@ def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
-    """Compute the standard error, and its degrees of freedom, of a mean over rows and columns that are both samples.
+    """Compute the standard error, and its degrees of freedom, of the mean of a table with random rows and columns.
 
     Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
-    row means divided by the number of rows, plus the variance of the column means divided by the number of columns,
-    with Satterthwaite's degrees of freedom. The error is slightly too large, because the residual variance of cells is
-    counted twice. Return None for fewer than two rows or `BOARDS_MIN` columns.
+    row means divided by the number of rows, plus the variance of the column means divided by the number of columns. It
+    is slightly too large, because the residual variance of cells is counted twice. The degrees of freedom are
+    Satterthwaite's. Returns None for fewer than two rows or fewer than `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -375,7 +375,7 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 
 
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Summarise the difference between `method` and `single`, networks of one skin, on the test skins of `single`.
+    """Summarise `method` minus `single` on the test skins of `single`, whose networks are trained on one skin each.
 
     The result is like that of `paired`, but the interval and `p` use `two_way_error`, because both the boards and the
     training skins of `single` are samples.

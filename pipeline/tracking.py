@@ -30,8 +30,8 @@ LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
 LAYOUT = 2  # version of the content of MLflow runs; runs of older versions are written again
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
-TIMEOUT_S = 2.0  # for the answer of an HTTP server
-LOCK_TIMEOUT_S = 5.0  # for a locked SQLite store; UIs and other writers lock it for a much shorter time
+TIMEOUT_S = 2.0  # time in which an HTTP server must answer
+LOCK_TIMEOUT_S = 5.0  # how long to wait for a locked SQLite store; UIs and other writers lock it for much shorter
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
 # Keys of numbers.json that are not metrics of the report's run: run times, provenance, and values that other MLflow
 # runs contain.
@@ -99,7 +99,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     Parameters
     ----------
     models
-        Folders of models and cards, by stage.
+        Folders of models and model cards, by stage.
     curves
         Points of sweeps and experiments, by stage.
     reports
@@ -135,7 +135,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 
 
 class Publisher:
-    """Writes the MLflow runs of one scene, each once, and remembers the keys of the runs of current results.
+    """Writes the MLflow runs of one scene, each once, and remembers the keys of runs that contain current results.
 
     The tag `run_key`, a digest of a run's content, identifies the run.
     """
@@ -243,7 +243,7 @@ class Publisher:
             self.client.set_terminated(run_id)
 
     def write_report(self, reports: Path) -> None:
-        """Write the report's numbers and files to a run, whose key covers numbers, figures and tables, but not costs.
+        """Write the report's numbers and files to a run; its key depends on numbers, figures and tables, not on costs.
 
         Tag `inputs` identifies the results that a report shows. If earlier results were restored without their report
         (`dvc checkout` does not restore reports), the run of their report becomes the current one again.
@@ -289,7 +289,7 @@ class Publisher:
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Return a digest of a card without its commit, so that equal results of two commits are the same run."""
+    """Return a digest of a model card without its commit, so that equal results of two commits are the same run."""
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 
@@ -355,9 +355,10 @@ def _datasets(card: Mapping[str, Any]) -> list[Any]:
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
-    """Flatten numbers.json to (name, value, step); a list of rows that begin with a count is a curve over that count.
+    """Flatten numbers.json to rows (name, value, step).
 
-    Other lists, texts, costs and the content of training runs are left out.
+    A list of rows whose first key is a count becomes a curve over this count. Other lists, texts, costs and the content
+    of training runs are left out.
     """
     published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
     return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0)]

@@ -1,8 +1,8 @@
 """Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
 Measures how much these disturbances degrade the scores on held-out boards, and how much of the loss is recovered by
-two methods. One subtracts the reading of a separate reference chip. The other subtracts the common part: the uniform
-field that best fits the readings of all chips of the board.
+two methods. The first method subtracts the reading of a separate reference chip. The second method subtracts the common
+part: the uniform field that best fits the readings of all chips of the board.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -103,19 +103,20 @@ def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Pat
 class Instrument:
     """A board (`board`) and a separate reference chip (`aside`), both with their manufacturing errors.
 
-    `turn` are the rotations of the board's chips by design, without manufacturing errors. The methods that subtract a
-    field know only these.
+    `turn` contains the rotations of the board's chips in the design, without manufacturing errors. The methods that
+    subtract a field use only these rotations, because the errors of a real board are unknown.
     """
 
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    noise_uT: Float[np.ndarray, " 3"]  # standard deviation of the reference chip's change of field, per axis
+    # Noise of the reference chip's change of field: standard deviation per axis.
+    noise_uT: Float[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One ambient field; `added_uT` is the change of each input row that the field causes.
+    """One ambient field; `added_uT` is the change that the field causes in each input row.
 
     `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the field's
     strength, or the distance of the ball of iron and the rms fields that it causes.
@@ -225,7 +226,7 @@ def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
 def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> Instrument:
     """Draw the same board as in the captures of board `name`, and a reference chip with manufacturing errors.
 
-    The errors of the reference chip have the same distribution as those of the board's chips.
+    The manufacturing errors of the reference chip have the same distribution as those of the board's chips.
     """
     design, rig, chip = simulation.main_boards.design, simulation.rig, simulation.chip
     lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
@@ -261,7 +262,7 @@ def reference_uT(
 def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
     """Return the projection matrix that subtracts, from a reading, the uniform field that fits it best (least squares).
 
-    `turn` are the rotations of the chips by design.
+    `turn` contains the rotations of the chips in the design.
     """
     uniform = turn.transpose(0, 2, 1).reshape(-1, 3)  # readings of unit fields along x, y, z
     return np.eye(len(uniform)) - uniform @ np.linalg.pinv(uniform)
@@ -327,7 +328,7 @@ def iron_fields(
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),
 }  # fmt: skip
-DASHES = ("-", "--", "-.")  # distinguishes the lines of methods that have equal accuracy
+DASHES = ("-", "--", "-.")  # line styles of the methods, so that overlapping lines can be distinguished
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

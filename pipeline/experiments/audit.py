@@ -229,7 +229,8 @@ def _first_names(names: np.ndarray) -> str:
 # Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
 # 4.4-5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-# Smallest |dB| of the indentations compared, in units of a reading's noise: noise dominates the direction of weaker dB.
+# Smallest |dB| of the indentations that are compared, in units of a reading's noise. The direction of weaker dB is
+# dominated by noise.
 STRONG_NOISES = 10.0
 # Largest distance between a copy and its original, in units of a reading's noise. Two readings of the same contact
 # differ by 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
@@ -237,14 +238,15 @@ COPY_DISTANCE_NOISES = 2.0
 # Relative tolerance of the ratio |dB of a copy| / |dB of its original|. In a copied capture, all indentations have the
 # same ratio; between different skins, the ratio varies with the depth of the indentation.
 FACTOR_TOLERANCE = 0.1
-# Fraction of a capture's indentations that look copied, from which on the capture counts as a copy. Measured: 0 %
-# between four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least
-# 55 % in a copy with up to 8 uT added to single readings, and 42 % in a copy with 5 % random gain per channel.
+# A capture counts as a copy if at least this fraction of its indentations look copied. Measured fractions: 0 % between
+# four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least 55 % in a
+# copy with up to 8 uT added to single readings, and 42 % in a copy with 5 % random gain per channel.
 COPIED_SHARE_MAX = 0.3
-# Pairs of indentations compared per fold, which takes at most a second; exceeded where SAMPLE_MIN_N requires it.
+# Largest number of pairs of indentations to compare per fold, which takes at most a second. SAMPLE_MIN_N may require
+# more pairs.
 PAIRS_MAX_N = 100_000_000
-SAMPLE_MIN_N = 100  # indentations sampled from each capture
-CHUNK_PAIRS_N = 4_000_000  # pairs compared at once, in 16 MB of memory
+SAMPLE_MIN_N = 100  # smallest number of indentations sampled from a capture, if it has as many
+CHUNK_PAIRS_N = 4_000_000  # number of pairs that are compared at once, which takes 16 MB of memory
 
 
 @dataclass(frozen=True)
@@ -282,7 +284,7 @@ def noise_uT(ch_n: int) -> float:
 
 
 def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
-    """Find, for each test capture, the training skin that most of its indentations look copied from.
+    """Find, for each test capture, the training skin from which the largest fraction of its indentations looks copied.
 
     A random sample of the capture's indentations is compared with all indentations of every training skin.
     """
@@ -381,7 +383,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a network's scaler was fitted to the training rows alone, and not to training and test rows."""
+    """Check that a network's scaler was fitted to the training rows only, and not to training and test rows."""
     both_sides = np.concatenate([sides.train, sides.test])
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
@@ -408,7 +410,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
 def audit_tuning(
     where: str, tuning: Mapping[str, Any], *, bases: set[str], sides: Sides, indentation: Int[np.ndarray, " f"]
 ) -> list[Check]:
-    """Check section `tuning` of an adapted network's model card: the pretrained network, and the pokes adapted to.
+    """Check, in section `tuning` of a model card, which pretrained network was adapted, and to which pokes.
 
     `bases` are the keys of the pretrained networks that have the fold and seed of the adapted network.
     """
@@ -425,7 +427,7 @@ def audit_tuning(
 
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
-    """Count the networks of a variant that collapsed (nearly constant predictions), and the repeated training runs."""
+    """Count a variant's collapsed networks (nearly constant predictions), and how often training was repeated."""
     collapsed = [
         f"{card['question']}.{card['recipe_name']}.{card['fold']}.seed{card['seed_i']}"
         for card in cards

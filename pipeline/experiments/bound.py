@@ -1,6 +1,6 @@
 """Smallest error that the noise of the chips allows, compared with a network's scores (paper section 4).
 
-Computes the Cramér-Rao bound of place and force, estimated from one input row. The skin is simulated, and its
+Computes the Cramér-Rao bound for estimates of place and force from one input row. The skin is simulated, and its
 properties are assumed to be known.
 """
 
@@ -32,15 +32,15 @@ from reskin.physics.skin import Skin, changes_of_field, draw_skin, forces
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-ROW_READINGS_N = 1  # readings in one input row of a network (dataset.rows)
+ROW_READINGS_N = 1  # number of readings that are averaged in one input row of a network
 STEP_MM = 0.01  # step of the finite differences; steps from 0.002 to 0.05 mm give the same bound within 2 %
-NETWORK = "single_pass"  # training and test data never share readings of a press in this experiment
+NETWORK = "single_pass"  # experiment in which no press has readings in both the training data and the test data
 
 Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # x, y, depth in mm -> measured channels
 
 
 def bound(settings: Settings, models: Path, results: Path) -> None:
-    """Bound the errors of estimates from one input row, and compare them with the errors of the paper's network."""
+    """Compute lower bounds of the errors of estimates from one input row; compare them with the paper's network."""
     numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
     overall = numbers["all"]["with_label_errors"]
@@ -51,7 +51,7 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
 
 
 def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]:
-    """Return the bound of the errors on the first skin of the main protocol, averaged over places.
+    """Return lower bounds of the errors on the first skin of the main protocol, averaged over places.
 
     There is one bound for each depth, and one over all depths. Pokes that do not reach the skin are excluded, and their
     number is reported.
@@ -144,10 +144,10 @@ def expected_scores(
 def probability_within(
     limits: Float[np.ndarray, "n 2"], correlation: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Return P(|x| <= h and |y| <= k) for standard normal x and y with a correlation; `limits` are h and k, above 0.
+    """Return P(|x| <= h and |y| <= k) for correlated standard normal x and y.
 
-    The probabilities of the four outer corners are exact: they are computed with Owen's T function (Owen 1956,
-    equation 2.1).
+    `limits` contains h and k, which must be positive. The result is exact: the probability outside the limits is
+    computed with Owen's T function (Owen 1956, equation 2.1).
     """
     h, k = limits.T
     outside = np.zeros(len(h))
@@ -162,8 +162,8 @@ def by_depth(
 ) -> dict[str, Any]:
     """Return expected scores averaged over places, for each depth and over all depths.
 
-    `signal` has the scores without errors of the labels, `with_label_errors` those with the standard deviations
-    `labels`.
+    `signal` contains the scores for exact labels, `with_label_errors` the scores for labels whose errors have the
+    standard deviations `labels`.
     """
     no_errors = dict.fromkeys(labels, 0.0)
     scores = {

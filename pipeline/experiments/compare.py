@@ -36,14 +36,15 @@ from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
-ARROWS_N = 4  # places per board in the figure of arrows
+ARROWS_N = 4  # number of places per board in the figure of arrows
 WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field, from one poke to the next
 NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
 LIGHT_N = 1e-3  # force of a light touch
 PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
-# Values of k / mu in N/mm (spring constant of the skin's hold / friction coefficient under the tip). This ratio limits
-# how far a tip slides a skin: from no limit (full slide at any force) to a slippery tip.
+# Values of k / mu in N/mm (spring constant with which the skin is held / friction coefficient under the tip). This
+# ratio limits how far a tip can slide a skin. The first value means no limit (full slide at any force), the last a
+# slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -150,7 +151,7 @@ def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, An
 def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Return the data for the figures: changes of field at a few places, and |dB| against force.
 
-    The places are those of the group of pokes in the middle of the board's list of groups.
+    All places are from one group of pokes: the middle one in the board's list of groups.
     """
     in_group = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
     order = in_group[np.argsort(np.hypot(*aligned.place_mm[in_group].T), kind="stable")]
@@ -223,7 +224,7 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
     Memory is the fraction of a poke's change of field that remains in the next no-load reading. Returns an empty dict
     if either estimate is impossible.
     """
-    pokes = aligned.recorded  # in the chips' axes, on which memory does not depend
+    pokes = aligned.recorded  # in the chips' axes; the memory is the same in any axes
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
@@ -275,7 +276,10 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """Orientation of a chip's or the labels' axes relative to the scene: sign changes, then quarter turns about z."""
+    """Orientation of axes (of a chip or the labels) relative to the scene's.
+
+    The axes of the scene first change their signs, and are then rotated by quarter turns about z.
+    """
 
     quarters: int
     signs: tuple[int, int, int]
@@ -412,8 +416,8 @@ def _best_chips(
 
 
 CHIPS_N = 5  # orientations are checked only on boards with five chips, which are on all sides of the middle
-# The check is unreliable with fewer pokes, and takes seconds with more pokes, which do not improve the result (in
-# scene lab, every third of 65 places is enough).
+# With fewer pokes, the check is unreliable. With more, it takes seconds and is no more reliable (in scene lab, every
+# third of 65 places is enough).
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
@@ -493,7 +497,7 @@ TITLES = {
     "give_y_um": "give y, µm",
 }  # fmt: skip
 ARROW_MM = 6.0  # length of the longest arrow of a board
-BOARDS_MAX_N = 4  # boards whose arrows are drawn
+BOARDS_MAX_N = 4  # largest number of boards in the figure of arrows
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -48,9 +48,9 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-KNOWN_ROWS_N = 6000  # training rows, drawn at random, in which detectors search for nearest neighbours
-SINGLES_N = 1000  # single contacts that set the thresholds; the same number tests them
-DRAWN_N = 60  # pairs per board and separation in the figure
+KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
+SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
+DRAWN_N = 60  # number of pairs in the figure, for each board and separation
 SAME_PLACE = 0.0  # separation in mm: two pokes at one place show the effect of signal strength and noise alone
 TOLERANCE_MM = 0.5  # tolerance of a pair's separation, assumed; needed because places are on a grid
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
@@ -69,7 +69,7 @@ class Contacts(Strict):
 def contacts(
     settings: Settings, section: Contacts, folds: Path, indentations: Path, models: Path, results: Path
 ) -> None:
-    """Test networks on sums of two pokes of a held-out board, for every board; the networks were trained without it."""
+    """Test networks on sums of two pokes of every board; the networks for a board were trained without this board."""
     data = read_data(settings, indentations, folds)
     boards, plot_data = zip(
         *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
@@ -213,8 +213,9 @@ def _pairs_at_distance(
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
     """Split training rows into those that detectors are fitted to, and those that set the thresholds.
 
-    The thresholds are set by the last board; if there is only one board, by its last skin; if there is only one skin,
-    by its last pass. The third return value says which: `board`, `skin` or `pass`.
+    The thresholds are set with the rows of the last board. If there is only one board, they are set with the rows of
+    its last skin; if there is only one skin, with those of its last pass. The third return value is `board`, `skin` or
+    `pass`.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
@@ -265,8 +266,8 @@ def detection_rates(
 ) -> dict[str, Any]:
     """Return, for each detector, the percentages of single and of double contacts that score above its threshold.
 
-    `aside` are the scores of the single contacts that set the thresholds. `double` maps each separation in mm to the
-    scores of double contacts; the percentages for double contacts are also by separation.
+    `aside` contains the scores of the single contacts that set the thresholds, `single` those of other single contacts.
+    `double` maps each separation in mm to the scores of double contacts. The result also has areas under ROC curves.
     """
     limits = thresholds(aside, false_alarm_fraction)
     separated = {
@@ -322,9 +323,9 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 
 # --- Superposition of simulated fields ---
 
-PAIRS_N = 6  # pairs drawn for each separation
-MIDDLE_MM = 2.0  # largest distance, along each axis, of the point midway between both contacts from the skin's middle
-HEIGHTS_N = 9  # heights in the table of displacements, between which the second contact is interpolated linearly
+PAIRS_N = 6  # number of pairs drawn for each separation
+MIDDLE_MM = 2.0  # largest distance of a pair's midpoint from the skin's middle, along each axis
+HEIGHTS_N = 9  # number of heights in the table of displacements, which is interpolated linearly between heights
 
 
 def superposition(

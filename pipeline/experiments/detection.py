@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-NEIGHBOURS_N = 5  # nearest neighbours that a distance is averaged over (assumed)
+NEIGHBOURS_N = 5  # number of nearest neighbours over which a distance is averaged; assumed
 NOISE_uT = 15.0  # norm of a reading's noise over 15 channels; recorded boards have 3 to 5 uT per channel
 
 # Scores by name of the detector, one per reading. A larger score means that the reading is less like known readings.
@@ -26,7 +26,8 @@ def direction_distance(
 ) -> Float[np.ndarray, " f"]:
     """Return, for each row of `tested_uT`, the mean distance to its `NEIGHBOURS_N` nearest rows of `known_uT`.
 
-    Distances are between the vectors dB / (|dB| + noise), which depend on direction; they are short for weak fields.
+    Distances are between the vectors dB / (|dB| + noise), which have the direction of dB. Their length is near 1 for
+    strong fields, and near 0 for weak fields.
     """
     known, tested = (
         db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, tested_uT)

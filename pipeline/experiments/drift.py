@@ -54,12 +54,12 @@ from reskin.seeds import rng_for
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of the force in a target (x_mm, y_mm, F_N)
-POINTS_MAX_N = 2000  # points in the scatter plot
+POINTS_MAX_N = 2000  # largest number of points in the scatter plot
 DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 
 Count = Annotated[int, Field(ge=1)]
-# When the no-load reading is renewed: `initial`: never; `regular`: every `regular_n` contacts; `each`: before each
-# contact; `free`: whenever a reading is judged free of contact.
+# When a new no-load reading is taken: `initial`: only at the start; `regular`: every `regular_n` contacts; `each`:
+# before each contact; `free`: whenever a reading is judged free of contact.
 PolicyName = Literal["initial", "regular", "each", "free"]
 UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
 # Errors by metric. Rows are networks (one per skin and seed), columns are test windows.
@@ -105,8 +105,8 @@ class WindowPredictions:
     skin: str
     seed_i: int
     window_i: int
-    contacts_n: int  # contacts of the skin before the window
-    noload_off_uT: float  # rms difference between the policy's no-load field and one read just before each contact
+    contacts_n: int  # number of contacts of the skin before the window
+    noload_off_uT: float  # rms difference between the policy's no-load field and the one read just before each contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
@@ -300,7 +300,7 @@ def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
 
 
 def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Return the index of the first window after 45,000 contacts (paper figure 5b), or the index of the last window."""
+    """Return the index of the first window after 45,000 contacts (paper figure 5b), or of the last if there is none."""
     late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
     return late[0] if late else len(rows) - 1
 
@@ -320,7 +320,7 @@ class ContactForces:
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
     """Average true and predicted forces over the readings of each indentation, because readings are not independent.
 
-    All predictions must be for the same window; each element is for one skin, by one network.
+    All `predictions` must be for the same window, and no two of them for the same skin.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -339,7 +339,7 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
     """Return the mean of predicted minus true force, the standard error of this mean over contacts, and the slope.
 
-    The slope is that of predicted against true force, by least squares.
+    The slope is the least-squares slope of predicted force against true force.
     """
     error_N = contacts.predicted_N - contacts.true_N
     deviation_N = contacts.true_N - contacts.true_N.mean()
@@ -383,7 +383,7 @@ def points(contacts: ContactForces) -> dict[str, list[float]]:
 
 
 def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
-    """Return the mean over skins of `force_left` between the training window and window `window_i`.
+    """Return the mean over skins of `force_left`, which compares window `window_i` with the training window.
 
     Returns None if `force_left` is unknown for any skin.
     """
@@ -419,7 +419,7 @@ def force_left(early: Readings, late: Readings) -> float | None:
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
     """Return two rms values over channels: the change of field by a contact, and the noise of a no-load reading.
 
-    The change is relative to the no-load reading just before each contact, independent of the policy. The noise is
+    The change is relative to the no-load reading just before each contact, whatever the policy. The noise is
     estimated from the differences between successive no-load readings, between which there is little drift.
     """
     changes_uT = [subtract(capture.b_uT, capture.noload_uT)[~np.isnan(capture.x_mm)] for capture in captures]
@@ -445,7 +445,7 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Return a sentence on the times in `numbers` (see `pace`), with a remark on temperature for simulated captures."""
+    """Describe the times in `numbers` (see `pace`); for simulated captures, add a remark on temperature."""
     if "lasts_s" not in numbers:
         return "The times of the contacts are not known."
     every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"
@@ -549,9 +549,9 @@ class Comparison(NamedTuple):
 def compare_networks(
     quantity: str, unit: str, values: Mapping[str, Float[np.ndarray, " u"]], boards: Sequence[str]
 ) -> Comparison:
-    """Compare a quantity between the networks of two policies, in pairs of equal skin and seed.
+    """Compare a quantity between the networks of two policies, in pairs of networks with the same skin and seed.
 
-    `values` maps each of the two policies to one value per network; `boards` are the boards of the pairs.
+    `values` maps each of the two policies to one value per network; `boards` contains the board of each pair.
     """
     (policy, first), (other_policy, second) = values.items()
     over_boards, over_trainings = mean_over_boards(first - second, boards)
@@ -570,7 +570,7 @@ def _show_ends(over_boards: Stat, over_trainings: list[float] | None) -> str:
 def mean_over_boards(
     values: Float[np.ndarray, " u"], boards: Sequence[str]
 ) -> tuple[dict[str, Any], list[float] | None]:
-    """Return the statistic over boards of each board's mean value, and the 95 % interval of values over networks."""
+    """Return statistics over boards of the mean value per board, and the 95 % interval of the mean over networks."""
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
 
@@ -580,8 +580,9 @@ def judge_findings(
 ) -> list[dict[str, Any]]:
     """Test each finding of the paper for which the scene has the required policies and quantities.
 
-    `networks` are the errors of the networks by policy. Row i of two policies is a pair (same skin and seed) on board
-    `boards[i]`. `contacts_n` is the number of contacts before each window. `late` are the numbers of `late_force`.
+    `networks` contains the errors of the networks by policy. Under every policy, row i is a network with the same skin
+    (on board `boards[i]`) and seed. `contacts_n` is the number of contacts before each window. `late` contains the
+    numbers that `late_force` returns.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
@@ -626,8 +627,8 @@ def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float
 def late_bias(late: Mapping[str, Any]) -> Comparison:
     """Return the force bias after many contacts as a comparison with 0.
 
-    The interval over training runs is widened to two standard errors over indentations where these are larger; it is
-    None if there is a single network.
+    The interval over training runs is widened to two standard errors over indentations if these are larger; it is None
+    if there is only one network.
     """
     over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
     reach_N = INDENTATION_SES * late["bias_se_N"]
@@ -638,7 +639,7 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
 
 
 def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Combine the verdicts of all comparisons of a finding, both over boards and over training runs."""
+    """Combine the verdicts of all comparisons into the verdicts of a finding: over boards, and over training runs."""
     judged = combine_verdicts([verdict(comparison.over_boards) for comparison in comparisons])
     trainings = [comparison.over_trainings for comparison in comparisons]
     of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])

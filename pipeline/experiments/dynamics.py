@@ -26,9 +26,9 @@ from reskin.data.rows import TARGETS
 from reskin.metrics import score
 from reskin.models.trained import networks_held_out
 
-WINDOW_N = 5  # readings that the paper takes at rest (section 3)
+WINDOW_N = 5  # number of readings that the paper averages for a press at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose place is hard to estimate
-BINS_N = 5  # ranges of the duration of a press
+BINS_N = 5  # number of ranges of duration for which presses are scored separately
 LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # lags of the predicted force that are tried
 METHODS = ("one", "mean5", "mean5_of_middle")
 

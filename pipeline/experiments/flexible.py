@@ -36,7 +36,7 @@ from reskin.schema import Readings
 from reskin.seeds import rng_for
 
 DEPTH_DECIMALS = 2  # commanded depths in mm are rounded to this many decimals
-DRAWN_N = 400  # points in a panel of the figure
+DRAWN_N = 400  # number of points in a panel of the figure
 FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
 # Optional recipe whose inputs are the direction and length of dB; expected to depend less on the gap between skin and
 # chips.
@@ -99,7 +99,7 @@ def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
 
 
 def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
-    """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over the depths of both."""
+    """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over their common depths."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
         return float(np.median(np.concatenate([capture[depth_mm] for capture in captures if depth_mm in capture])))

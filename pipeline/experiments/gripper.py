@@ -31,14 +31,14 @@ from reskin.seeds import rng_for
 from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
-# Rate of the controller, duration of a run, and time from which on forces are scored.
+# Rate of the controller, duration of a run, and time after which forces are scored.
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0
 SWING = 3.0  # an object's stiffness varies between a third of its nominal value and three times this value
-# Indentation of the skin by 1 N, assumed, for a round tip (Hertz). It affects how fast a force is reached, and not the
-# force that is reached.
+# Assumed indentation of the skin by a force of 1 N with a round tip; it grows as in Hertz's law. It affects how fast a
+# force is reached, but not which force is reached.
 DEPTH_OF_1_N_MM = 0.8
-READINGS_N = 5  # readings averaged for the press of known force, as for each indentation (paper section 3)
-WITHIN = 0.1  # tolerance of the force relative to the aim (ours; the paper's gripper of section 6 holds a blueberry)
+READINGS_N = 5  # number of readings averaged for the press of known force, as for each indentation (paper section 3)
+WITHIN = 0.1  # tolerance of the held force, relative to the aim (our choice; the paper's gripper holds a blueberry)
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
 Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # dB in uT -> x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
@@ -117,7 +117,7 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
 
 def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
-    """Yield every force estimator: the name of the model, how it uses the press of known force, and its function."""
+    """Yield every force estimator: name of the model, use of the press of known force, and function of readings."""
     unlabelled = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])

@@ -12,7 +12,7 @@ from reskin.physics.skin import SkinDesign
 
 
 def read_known_boards(settings: Settings, indentations: Path, folds: Path) -> KnownBoards:
-    """Read the recorded boards of a scene (two or more), in the orientation that section compare states."""
+    """Read the recorded boards of a scene (two or more), rotated to the board axes defined by section `compare`."""
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:

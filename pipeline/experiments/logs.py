@@ -40,7 +40,7 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 
-PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of a shoe's pitch during each step
+PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of the pitch angle of a shoe during each step
 PERIOD_S = 1.0  # assumed period of the steps for a log with fewer than two contacts
 SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 
@@ -144,7 +144,7 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
 
 # --- Tables and figures ---
 
-MEANING = (  # {rate_hz} comes from the numbers
+MEANING = (  # the experiment's numbers are inserted by `str.format`
     "A log at {rate_hz:.0f} Hz with only times and readings, as a board writes it to an SD card: a quiet start, "
     "then footfalls at random places. The quiet start is the no-load reading; a contact is a change of field well "
     "above its noise. Places and forces are predicted by networks trained without the board, each scored separately: ± "

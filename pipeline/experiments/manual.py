@@ -1,7 +1,7 @@
 """Manual: networks adapted with hand pokes, whose places are unknown (paper section 5).
 
 The networks are tested on the robot's grid of the same skin. They are compared with networks adapted with the same
-number of robot pokes, and with networks trained for as long without pokes (the control).
+number of robot pokes, and with networks fine-tuned for the same number of steps without pokes (the control).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,7 +45,7 @@ from reskin.errors import SchemaError
 from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
 
-GRID = "grid"  # name of the variant that is adapted with robot pokes, as many as there are hand pokes
+GRID = "grid"  # name of the variant that is adapted with the same number of robot pokes instead of hand pokes
 
 
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:

@@ -36,11 +36,12 @@ RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 WARMER_K = 1.0  # rise of the skin's temperature
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # the earth's field at a middle latitude
-PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # places of the indentations for effects inside the skin: flank and edge
-BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of powder, for the effect of the powder's own field
+# Places of the indentations for effects inside the skin: between middle and edge, and near the edge.
+PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))
+BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of magnetic powder, to compute the powder's own field
 FRICTION = Friction(coefficient=0.8)  # between skin and tip; assumed, within a range of 0.5 to 1.2
 FEW = 5  # number of indentations for effects that take long to compute
-COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects whose computation follows every node separately
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects whose computation tracks every node separately
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Subject:
 
     board: Board
     skin: Skin
-    coarse: Skin  # the same skin on fewer nodes
+    coarse: Skin  # the same skin with fewer nodes
     plan: Plan
     tip_m: Float[np.ndarray, "n p 3"]
     used: tuple[str, ...]  # names of the effects that the main protocol computes
@@ -158,7 +159,7 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate the base's hold, by comparison with an infinite layer that slides freely and is linearly elastic."""
+    """Evaluate how the base holds the skin: compare with an infinite linearly elastic layer that slides freely."""
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
@@ -174,7 +175,8 @@ def _hold(subject: Subject) -> list[Effect]:
 def _free_edge(subject: Subject) -> list[Effect]:
     """Evaluate the free edge: compare the simulated infinite layer with a disc of radius R whose edge is free.
 
-    Material at radius r moves outwards by c / r in the infinite layer, and by c / r + c r / (3 R^2) in the disc.
+    With a constant c, material at radius r moves outwards by c / r in the infinite layer, and by
+    c / r + c r / (3 R^2) in the disc.
     """
     if subject.skin.base == "bonded":
         return []
@@ -197,7 +199,7 @@ def _free_edge(subject: Subject) -> list[Effect]:
 
 
 def _inside(subject: Subject) -> list[Effect]:
-    """Evaluate parts of the deformation model, by omitting or changing one part at a time under a few indentations."""
+    """Evaluate parts of the deformation model: omit or change one part at a time, for a few indentations."""
     skin, depth_m = subject.skin, float(subject.tip_m[..., 2].max()) + subject.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
@@ -231,7 +233,7 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
     """Return the displaced nodes under each indentation, for an indentation in small steps.
 
-    The nodes of all indentations are followed together, because the contact pressures are the same.
+    A single call to `follow` tracks the nodes of all indentations, because the contact pressures are the same.
     """
     r_m = np.concatenate([np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(subject.coarse.nodes_m[:, 2], len(PLACES_M))
@@ -269,7 +271,7 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
 
 
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
-    """Evaluate the powder's own field: compare with powder that this field also magnetises, to first order.
+    """Evaluate, to first order, the effect of the powder's own field on the magnetisation of the powder.
 
     The field of the powder is that of uniformly magnetised boxes (magpylib).
     """
@@ -295,7 +297,7 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
 def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
     """Return the effect of depths beyond 0.6 of the thickness, which published solutions do not cover.
 
-    No error is known; the description states the percentage of such stops over all skins.
+    No error is known; the description states the percentage of stops at such depths, over all skins.
     """
     depth_m = milli * simulation.main.plan(rng_for(seed, "left out"), simulation.main_boards.skin_mm).depth_mm.ravel()
     skins = [

@@ -137,7 +137,7 @@ def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
 
 
 def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
-    """Return the mean change of field of each poke, in the chips' axes; `pokes` are row numbers."""
+    """Return the mean change of field of each poke, in the chips' axes; `pokes` has the row numbers of each poke."""
     return np.array([data.rows.db_uT[row].mean(axis=0, dtype=np.float64) for row in pokes])
 
 
@@ -319,7 +319,7 @@ ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor time for calibrating a method to a skin, and per reading if many readings are estimated together."""
+    """Processor times in s: to calibrate a method to a skin, and to estimate one of many readings in one call."""
 
     name: str
     train_s: float
@@ -332,9 +332,10 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 def score_unlabelled(
     known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
-    """Score the universal models and the inversion with unlabelled pokes of the test skin, none, and another skin's.
+    """Score the universal models and the inversion with three sets of unlabelled pokes.
 
-    Returns the scores, and the processor times with pokes of the test skin.
+    The sets are: pokes of the test skin, no pokes, and pokes of another skin. Returns the scores with all sets, and the
+    processor times with pokes of the test skin.
     """
     points, times = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
@@ -369,7 +370,8 @@ def estimate_universal(
     by_network = calibrated.evaluate_networks(test_uT)
     network_s = time.process_time()
     map_seconds = Seconds("", ready_s - start_s, (both_s - ready_s) / len(test_uT))
-    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))  # calibrated together with the map
+    # The time of calibration is 0, because the network is calibrated together with the map.
+    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))
     places = by_map.place_mm, by_network.place_mm, combined.place_mm
     forces = by_map.force_N, np.exp(by_network.log_N), combined.force_N
     names = [f"{name}{way}" for name in UNIVERSAL]
@@ -394,7 +396,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the control of each method with no pokes or another skin's: the same method with the skin's own pokes."""
+    """Return the controls of methods without pokes or with another skin's: the same methods with the skin's pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
@@ -406,7 +408,7 @@ OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, simulated by changing the readings of a board in the same way as a wrong plug, driver or skin.
+# Foreign boards, simulated by changing the readings of a board as a wrong plug, driver or skin would change them.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -425,7 +427,7 @@ class Board:
     tested_uT: Float[np.ndarray, "b ch"]
 
     def alter(self, change: Callable[[Chips], Chips]) -> "Board":
-        """Return the readings of the board after `change` has been applied to its chips."""
+        """Return the board with `change` applied to the fields of its chips."""
         fields_uT = self.rest_uT, self.pool_uT, self.tested_uT
         return Board(*(change(b_uT.reshape(len(b_uT), -1, 3)).reshape(b_uT.shape) for b_uT in fields_uT))
 
@@ -434,7 +436,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
     """Evaluate the residual of the inversion, both as an alarm for foreign boards and as a flag for wrong estimates.
 
     A physical model is fitted to the unlabelled pokes of each board's first fold. It is inverted for test readings of
-    this board, and of foreign boards. `fraction` is the fraction of false alarms that the limits are set for.
+    this board, and of foreign boards. The limits are set for the fraction `fraction` of false alarms.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)

@@ -22,7 +22,7 @@ def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readi
 
 
 def only(captures: Sequence[Capture], folder: Path) -> Capture:
-    """Return the only element of `captures`, which were read from `folder`; raise `SchemaError` unless it has one."""
+    """Return the only capture read from `folder`; raise `SchemaError` if there are several, or none."""
     if len(captures) != 1:
         remedy = "Set skins_n: 1 for the experiment's protocol, and simulate the captures again."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
@@ -30,7 +30,7 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
-    """Return the ingest counts of each capture in a folder, which include the readings lost, together with `left_out`.
+    """Return the ingest counts of each capture in a folder (they include lost readings), and the counts `left_out`.
 
     left_out: the number of rows that the experiment excluded, by reason.
     """

@@ -62,14 +62,14 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Indentations(Strict):
-    """Indentations at all places (relative to the skin's centre), each to all depths."""
+    """Settings of indentations: at every place, relative to the skin's centre, to every depth."""
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # name of the method in the row that bounds the error of the reference itself
-CANDIDATES = "Gauss in z"  # name of the method that places nodes by `magnet.place_nodes`, as the simulator does
+REFERENCE = "reference"  # method name of the row whose error is an upper bound of the reference's own error
+CANDIDATES = "Gauss in z"  # method name of the rules that the simulator can use (`magnet.place_nodes`)
 ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
 
@@ -139,8 +139,8 @@ def rule_name(rule: Quadrature) -> str:
 def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
     """Choose the rule with the fewest nodes among those whose error at the worst depth is below `error_max`.
 
-    The run time is proportional to the number of nodes, which, unlike the run time, is the same whenever the experiment
-    is run.
+    The run time is proportional to the number of nodes. Unlike the measured run time, the number of nodes does not vary
+    from one run of the experiment to the next.
     """
     candidates = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in candidates.values() if row.error is not None and row.error < error_max]
@@ -174,7 +174,7 @@ def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
             times_s[round_i, i] = perf_counter() - start_s
     return [
         Seconds(*call.key, median_s=float(np.median(laps_s)) / call.indentations_n, repeats_n=repeats_n)
-        for call, laps_s in zip(calls, times_s.T, strict=True)  # one lap per round
+        for call, laps_s in zip(calls, times_s.T, strict=True)
     ]
 
 
@@ -187,8 +187,8 @@ Layers = Annotated[int, Field(ge=1, le=100)]
 class Quadratures(Indentations):
     """Settings of the study of quadratures.
 
-    Besides the indentations: the number of skins, and for each method its rules, as pairs of cell size in mm and number
-    of layers.
+    `skins_n` is the number of skins. `rules` maps each method to its rules, as pairs of cell size in mm and number of
+    layers.
     """
 
     skins_n: Annotated[int, Field(ge=1, le=100)]
@@ -221,8 +221,8 @@ def study_quadratures(
 ) -> tuple[list[Precision], list[TimedCall]]:
     """Compare every rule of every method with the reference on all trials.
 
-    Returns one row per rule, and the calls to time, which compute the first trial. `parts` of a row contains, by depth,
-    the error of the skin with the largest error; `error` is the largest of `parts`.
+    Returns one row per rule, and the calls to time, which compute dB of the first trial. `parts` of a row contains, for
+    each depth, the error of the skin with the largest error; `error` is the largest value in `parts`.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -245,7 +245,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return rms error / rms dB: by depth, for the skin with the largest ratio, and over all depths and skins."""
+    """Return rms error / rms dB, for each depth (the largest ratio of any skin) and over all depths and skins."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -267,9 +267,9 @@ EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
 ATOL = 1e-3  # absolute tolerance / relative tolerance; the states are a few percent of the force, which is 1
-DIVERGED = 1.0  # relative error from which on an integrator counts as diverged: the error is as large as the force
+DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
-DOWN_S, HELD_S = 0.3, 0.7  # a press is lowered, held, and released for the rest of the period
+DOWN_S, HELD_S = 0.3, 0.7  # times of lowering and holding the tip; the tip is lifted in the rest of the period
 
 # Times in s, and the elastic forces at these times. The elastic force is linear between two times (a linear piece).
 History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]
@@ -460,10 +460,11 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Prepare the sum over nodes alone, with the compiled kernel and precomputed displacements.
+    """Prepare only the sum over nodes, with the compiled kernel and precomputed displacements.
 
-    This is comparable with the times of magpylib. The kernel computes the field of each node at rest and displaced,
-    which avoids subtracting two large sums. With magpylib, the field at rest is computed only once.
+    The run time can be compared with those of the magpylib methods, with one difference. The kernel computes the field
+    of each node at rest and displaced, which avoids subtracting two large sums; with magpylib, the field at rest is
+    computed only once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
@@ -627,7 +628,10 @@ def draw_trial(
 
 
 def with_nodes(trial: Trial, rest: Nodes) -> Skin:
-    """Return the trial's skin with the nodes `rest`, which are relative to its centre and base, magnetised as usual."""
+    """Return the trial's skin with its nodes replaced by `rest`, magnetised by the design's array.
+
+    The positions in `rest` are relative to the skin's centre and base.
+    """
     b_T = magnet.array_field(rest.nodes_m, trial.skin.thickness_m, trial.design.polarity)
     j_T = magnet.magnetise(b_T, saturation_T=trial.design.saturation_T, half_field_T=trial.design.half_field_T)
     nodes_m = rest.nodes_m + np.append(trial.skin.seat_m, 0.0)
@@ -672,7 +676,7 @@ def _product(
     z_m: Float[np.ndarray, " j"],
     z_weight_m: Float[np.ndarray, " j"],
 ) -> Nodes:
-    """Return the tensor product of nodes along x, y and z; those along y equal those along x (the skin is square)."""
+    """Return the tensor product of nodes along x, y and z; x and y have the same nodes, because the skin is square."""
     nodes_m = np.stack(np.meshgrid(x_m, x_m, z_m, indexing="ij"), axis=-1).reshape(-1, 3)
     return Nodes(nodes_m, np.einsum("i,j,k->ijk", x_weight_m, x_weight_m, z_weight_m).ravel())
 
@@ -709,7 +713,7 @@ def runtime(settings: Settings, section: RunTime, results: Path) -> None:
 
 
 def _trials(simulation: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
-    """Draw the trials for the skins whose chips are nearest to the skin; these need the finest quadrature."""
+    """Draw trials for the `skins_n` skins that are closest to their chips, which need the finest quadrature."""
     boards_and_skins = [
         (draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board), skin)
         for board, skin in list_captures(simulation, MAIN)

@@ -21,7 +21,7 @@ from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
 RESOLVED_SHARE = 0.95  # a difference is resolved if this fraction of reading pairs is correctly ordered
-WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
+WATER_N_PER_ML = 9.81e-3  # weight of 1 mL (1 g) of water at 9.81 m/s^2
 
 
 def group_by_level(
@@ -32,9 +32,9 @@ def group_by_level(
     levels_n: int,
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
-    """Reshape readings by filling of the glass, weight level and reading.
+    """Reshape readings to axes (filling of the glass, weight level, reading, channel).
 
-    Successive readings with equal logged force form a stop, at one weight level. Raises `SchemaError` unless every
+    Successive readings with the same logged force form a stop, at one weight level. Raises `SchemaError` unless every
     filling has `levels_n` stops, all with the same number of readings.
     """
     starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
@@ -119,7 +119,7 @@ def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | No
     `share` is the fraction of correctly ordered pairs by difference (see `ordered_share`). Returns None if even the
     largest difference is not resolved.
     """
-    unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is one step
+    unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is a difference of one step
     last_i = int(unresolved_i.max(initial=-1))
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
 
@@ -133,7 +133,8 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
     fall disappears. If no step is large enough, the result has no `step_N`.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
-    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # noise of one rise
+    # `noise_uT` is the noise of a rise in one filling.
+    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan
     gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # mean rise per step between weights
     result: dict[str, Any] = {
         "holds": False,
@@ -169,7 +170,7 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     say(f"{settings.scene}: smallest resolved step: {resolved or 'none'}; {numbers['fillings_n']} fillings")
 
 
-MEANING = (  # {told_pct} comes from the numbers
+MEANING = (  # the experiment's numbers are inserted by `str.format`
     "The weight on the skin's centre increases step by step; the flat foot of the glass is simulated as the rig's "
     "round tip. A difference of weight is resolved if, for this and all larger differences, at least {told_pct:g} % of "
     "the pairs of readings within a held-out filling are in the order of their weights. The response is the component "

@@ -26,7 +26,7 @@ from reskin.seeds import rng_for, seed_for
 
 PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
 PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
-DRAWN_N = 400  # points in a panel of the figure
+DRAWN_N = 400  # number of points in a panel of the figure
 FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
 
 
@@ -70,7 +70,7 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
 
 
 def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
-    """Draw the random splits of every skin; rows with equal values of `group` are on the same side."""
+    """Draw the random splits of every skin; rows with equal values of `group` are on the same side of a split."""
     folds = []
     for skin in np.unique(rows.skin):
         skin_rows = np.flatnonzero(rows.skin == skin)

@@ -31,14 +31,14 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-NEAR_MM = 4.0  # places within this distance of a border between boards are near it (assumed: twice the thickness)
+NEAR_MM = 4.0  # places closer to a border between boards count as near it (assumed: twice the skin's thickness)
 Stats = dict[str, dict[str, float]]  # by metric: mean, n and, for several training runs, sd
 
 
 class Sleeve(SectionWithTraining):
     """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture are held out
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # fraction of each capture's pokes: the last ones are held out
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 

@@ -46,7 +46,7 @@ from reskin.seeds import rng_for
 PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # key in the ingest counts of captures with numbered places
 ROWS_MIN_N = 20  # smallest number of touched rows in a usable recording
 LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model that predicts the force
-SUMS_N = 100  # random sums of two single touches for each pair of places
+SUMS_N = 100  # number of random sums of two single touches, for each pair of places
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # mean direction of dB by place number
@@ -127,7 +127,7 @@ class Split:
 def touched_rows(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
     """Return the rows of a recording with enough force; raise `ParamsError` unless it has one or two numbered places.
 
-    `account` are the ingest counts of the recording, which name its places.
+    `account` contains the ingest counts of the recording, whose keys name its places.
     """
     places = tuple(sorted(int(match[1]) for name in account if (match := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):

@@ -24,9 +24,9 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # labels (commanded values in float32) that differ by less are equal
-LISTED_N = 8  # places or depths listed in an error message
-LINES_MAX_N = 40  # lines (visits of a place) in a panel of the figure
+SAME_MM = 1e-3  # labels (commanded values in float32) count as equal if they differ by less than this
+LISTED_N = 8  # largest number of places or depths listed in an error message
+LINES_MAX_N = 40  # largest number of lines (visits of a place) in a panel of the figure
 DECIMALS = 1  # fields in uT are rounded to this many decimals for the figures
 
 Count = Annotated[int, Field(ge=1)]
@@ -39,7 +39,7 @@ class Variation(Strict):
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]
     skins_n: Count
-    contacts_n: Count  # contacts of the worn skin within which indentations are compared
+    contacts_n: Count  # indentations of the worn skin are compared within its first `contacts_n` contacts
 
 
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
@@ -141,7 +141,8 @@ def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the mean changes of field of several skins; return the numbers, and the lines to draw.
 
-    `spread_uT` is the rms difference over channels and pairs of skins; `spread_pct` is relative to the rms change.
+    `spread_uT` is the rms difference over channels and pairs of skins. `spread_pct` is this difference as a percentage
+    of the rms change of field.
     """
     mean_uT = {skin: skin_visits.db_uT.mean(axis=0) for skin, skin_visits in visits.items()}
     size_uT = rms(np.array(list(mean_uT.values())))
@@ -153,7 +154,7 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
 
 
 def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Return the duration of a skin's first `contacts_n` contacts, and the rise of the chips' temperature meanwhile.
+    """Return how long a skin's first `contacts_n` contacts took, and how much the chips' temperature rose in that time.
 
     Values that were not recorded are left out.
     """
@@ -166,7 +167,7 @@ def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
-    """Choose `skins_n` skins: first the first skin of each board, then the second skins, and so on.
+    """Choose `skins_n` skins: the first skin of every board, then the second skin of every board, and so on.
 
     `boards` maps the names of skins to the names of their boards.
     """

@@ -46,7 +46,7 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.rig import actual_positions, read_force
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-WAVES_N = 48  # random cosines whose sum is a smooth error
+WAVES_N = 48  # number of random cosines whose sum is the smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -58,8 +58,8 @@ class Residual(Strict):
     """A smooth random error that is added to the simulated changes of field: sizes, and correlation lengths."""
 
     sizes: Sizes  # rms sizes relative to |dB|, one world per size
-    length_mm: Annotated[float, Field(gt=0, le=50)]  # along x and y
-    length_log_N: Annotated[float, Field(gt=0, le=10)]  # along the logarithm of the force
+    length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation length along x and y
+    length_log_N: Annotated[float, Field(gt=0, le=10)]  # correlation length along the logarithm of the force
     # Fraction of the error's variance that is specific to each skin; the rest of the error is the same on all skins.
     own_share: Annotated[float, Field(ge=0, le=1)]
 
@@ -223,7 +223,7 @@ def worlds(settings: Settings, section: Worlds, results: Path) -> None:
 
 
 def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
-    """Train the networks of all rows of table 2, and return their cards.
+    """Train the networks of all rows of table 2, and return their model cards.
 
     Single, multi and triplet networks are trained; the triplet networks are then adapted.
     """

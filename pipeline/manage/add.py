@@ -1,6 +1,7 @@
-"""Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, register it, plan its scene.
+"""Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, and register it.
 
-The whole recording is read and checked first. If adding fails or is stopped, all changes are undone.
+The scene is added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
+changes are undone.
 """
 
 import hashlib
@@ -25,7 +26,7 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # the places of a new capture are compared with those of this many latest captures of the scene
+COMPARED_N = 3  # number of the scene's latest captures with which the places of a new capture are compared
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:

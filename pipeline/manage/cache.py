@@ -20,7 +20,7 @@ from reskin.errors import SchemaError
 
 DAMAGED = ".reskin/damaged"  # the folder of objects that were set aside
 FOLDER = ".dir"  # suffix of an object that lists the files of a folder
-OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # names of objects; other files remain from a killed DVC process
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # names of objects; killed DVC processes leave other files
 READ_ONLY = 0o444  # the permissions that DVC gives objects
 
 

@@ -31,7 +31,8 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
-COPIES_N = 4  # copies of each file on disk: as fetched, in data/raw, in DVC's cache, and one in reserve
+# Disk space must be free for this many copies of each file: as fetched, in data/raw, in DVC's cache, one in reserve.
+COPIES_N = 4
 USE_FROM = "--from takes a git mirror or a folder that contains the files."
 Say = Callable[[str], None]
 

@@ -1,4 +1,4 @@
-"""Resolve the conflicts when branches with different recordings are merged: in registry, plan, dvc.lock and reports.
+"""Resolve merge conflicts between branches with different recordings: in registry, plan, dvc.lock and reports.
 
 Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """

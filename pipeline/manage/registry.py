@@ -38,7 +38,7 @@ def read_registry(root: Path) -> Registry:
 def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
-    """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another."""
+    """Return the registry with one more capture; raise `CaptureError` if it is a copy of, or contradicts, another."""
     entry = Entry(
         board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
         fingerprints=fingerprints, copy_of=None,
@@ -64,14 +64,14 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
             )
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:
-            what = f"{entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"
-            raise CaptureError(f"{where}: {what}. Add it to a scene of its own.")
+            what = f"it has {entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"
+            raise CaptureError(f"{where}: {what}. Add it to another scene.")
     added = entry.model_copy(update={"copy_of": original})
     return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
-    """Return the registry without a capture, and without its scene if that has no other capture."""
+    """Return the registry without a capture, and without the scene if the scene has no other capture."""
     if scene not in registry.captures:
         guess, known = did_you_mean(scene, registry.captures), ", ".join(sorted(registry.captures)) or "none"
         raise CaptureError(f"scene {scene} has no recorded captures.{guess} Scenes with recorded captures: {known}.")

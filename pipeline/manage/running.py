@@ -1,4 +1,4 @@
-"""Refuse to change a checkout while DVC runs in it, because its stages read the plan, the captures and dvc.lock."""
+"""Refuse to change a checkout while DVC runs in it, because stages read the plan, the captures and dvc.lock."""
 
 import os
 from pathlib import Path

@@ -388,7 +388,7 @@ def _show_ours(row: Row, ours: Any) -> str:
 
 
 def _show(row: Row, value: Any) -> str:
-    """Write a number with its unit, which a part of the path `ours` names; differences get a sign."""
+    """Write a number with its unit, which is taken from a suffix in the path `ours`; differences get a sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
     if row.rule in DIFFERENCES:

@@ -16,16 +16,17 @@ from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
 
 HEADLINE = "headline.svg"
 OFFSET = 0.17  # fraction of a row's height by which our score is above the row's middle, and the paper's below it
-WORST_MM = 2.0  # end of the colour scale of all error maps: twice the error that counts as correct
+WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
 TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
 SKIN_MM = (-2.0, 18.0)  # extent of the skin around the grid: "20mm x 20mm" (paper section 2)
-# Centres of the five chips under the skin, in the frame of the labels (paper section 2), and the side of a chip.
+# Centres of the five chips under the skin, in the coordinates of the labels (paper section 2), and the side of a chip.
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
 RANGES = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # metrics in figures, with their possible range
-LINEAR_BELOW_N = 65  # pokes; the axis is linear below this number, because a logarithmic axis cannot show 0
+# The axis of the number of pokes is linear below this number, because a logarithmic axis cannot show 0.
+LINEAR_BELOW_N = 65
 BARS = (
     "Bars: 95 % interval over boards. Two or three boards: lowest to highest value.\n"
     "One board: sd over seeds. Paper: printed sd. Bars are cut at impossible values."

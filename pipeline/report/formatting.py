@@ -35,11 +35,12 @@ SHORT = {
 }  # fmt: skip
 CONTROL = "Control: fine-tuned equally long, without the new skin's pokes (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
-UNIVERSAL = ("universal", 0)  # in experiment population: rows of the whole universal model without labels
+# `way` and `labels_n` of the rows of experiment population in which the complete universal model has no labels.
+UNIVERSAL = ("universal", 0)
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three digits, its interval over boards or else its standard deviation, and that over seeds."""
+    """Write a mean with three digits, then its interval over boards or else its sd, and its sd over seeds."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -96,19 +97,19 @@ def _three_digits(value: float) -> str:
 
 
 def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[str, str]:
-    """Write every metric of a row, as cells by title of column."""
+    """Write every metric of a row as text; return the cells by column title."""
     return {title: show(row.get(metric)) for metric, title in titles.items()}
 
 
 def scored(row: Mapping[str, Any]) -> dict[str, str]:
-    """Write every metric of a row, and n, as cells by title of column."""
+    """Write every metric of a row and n as text; return the cells by column title."""
     return scores(row) | {"n": n_of(row)}
 
 
 def beside(
     row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
-    """Write every metric of a row, the paper's value for it (`printed`), and n, as cells by title of column."""
+    """Write every metric of a row, the paper's value of this metric (`printed`) and n; return cells by column title."""
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}
@@ -196,7 +197,7 @@ def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
 
 
 def control_of(numbers: Results) -> dict[str, Any]:
-    """Return the control's row under its name, or nothing if there is no control."""
+    """Return the control's row under its name; return an empty dict if there is no control."""
     return {name: row for name, row in numbers.get("adapt", {}).items() if name == "control"}
 
 

@@ -426,7 +426,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
-        "drift_end": {  # of each policy, the last window, whose scores are means over networks
+        "drift_end": {  # the last window of each policy, whose scores are means over networks
             policy: {name: drift[policy][-1][name] for name in DRIFT_METRICS if name in drift[policy][-1]}
             for policy in POLICIES
             if policy in drift

@@ -40,7 +40,7 @@ NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 LONG = 40  # characters; a column with a longer cell is wide
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
-LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; its unit, px, is the point here
+LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; in these files, 1 px means 1 pt
 PX_PER_PT = 4 / 3
 WIDE_PT = 500.0  # a wider figure gets its own row
 LEGIBLE_PX = 8.0  # smallest legible letters; a figure scrolls before its letters become smaller

@@ -56,7 +56,7 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write table 2 of the paper and its figure as soon as their networks are trained; stage report writes them too."""
+    """Write table 2 of the paper and its figure as soon as the networks are trained; stage report writes them again."""
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -215,5 +215,5 @@ def planned_scene(settings: Settings) -> Scene:
 
 
 def read_cards(models: Path, stages: Iterable[str]) -> list[dict[str, Any]]:
-    """Read the cards of all models of these stages."""
+    """Read the model cards of these stages."""
     return [io.read_json(file) for stage in stages for file in sorted((models / stage).glob("*.json"))]

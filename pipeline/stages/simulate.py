@@ -1,4 +1,4 @@
-"""Stage simulate: raw captures of simulated skins, in the wire format of recorded ones."""
+"""Stage simulate: write raw captures of simulated skins, in the same wire format as recorded captures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Stages that score methods on held-out boards with different numbers of their labels: few_labels, universal."""
+"""Stages few_labels and universal: score methods on held-out boards, with different numbers of labelled presses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +28,11 @@ from reskin.universal.training import TrainingSettings
 
 
 def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
-    """Score networks, adapted networks and classical methods on the same rows, with every number of labels."""
+    """Score networks, adapted networks and classical methods on the same test rows, for every number of labels."""
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
     trained_entries: list[few.TrainedEntry] = []
-    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each uses networks of earlier steps
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # use networks of earlier steps
         pairs = step(study, trained_entries)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
         trained_entries = [
@@ -70,8 +70,8 @@ def universal(
 ) -> None:
     """Score the universal model on every held-out board for every number of labels, on the test rows of `few_labels`.
 
-    The map alone and the map with networks are scored. Each is built once from the other boards of the rig and once
-    from simulated skins.
+    The map alone and the map with networks are scored, both in two variants: made with the other boards of the rig, and
+    from simulated skins alone.
     """
     known = read_known_boards(settings, indentations, folds)
     variants = make_variants(known, section)

@@ -1,9 +1,9 @@
-"""Score places that 2 nearest neighbours predict without the contact's signal, on the folds within one skin.
+"""Predict places from inputs without the contact's signal, on the folds within one skin, and score the predictions.
 
-The input is the no-load field alone, or the number of the indentation in its pass. If such a prediction is accurate,
-networks may have learnt places from the order of the scan rather than from contacts. The hover control predicts the
-place of a hovering tip with models that were trained on contacts. The accuracy of the hover control is at chance level,
-unless the chips sense the tip itself.
+The method is k nearest neighbours (k = 2). The input is only the no-load field, or only the number of the indentation
+in its pass. If such a prediction is accurate, networks may have learnt places from the order of the scan rather than
+from contacts. The hover control predicts the place of a hovering tip with models that were trained on contacts. Its
+accuracy is at chance level, unless the chips sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ class Scan:
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack the no-load field and the number in the pass of every contact, in the order of the scene's rows."""
+    """Stack the no-load field and the indentation's number in its pass, in the order of the scene's rows."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -101,8 +101,8 @@ def score_before_contact(
 ) -> pa.Table:
     """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
 
-    networks: trained networks by fold, which the hover control uses in addition to the nearest neighbours. The table
-    has one row per fold and input or hover control.
+    networks: trained networks by fold, which the hover control uses in addition to nearest neighbours. The table has
+    one row per fold and input, and one per fold and model of the hover control.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
@@ -122,7 +122,7 @@ def score_before_contact(
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
-    """Score models that were trained on contacts on the hovering rows in the test passes of a fold."""
+    """Apply models that were trained on contacts to the hovering rows in a fold's test passes, and score them."""
     rows = data.rows
     test_passes = set(zip(rows.skin[fold.test], rows.pass_i[fold.test].tolist(), strict=True))
     in_test_passes = np.array(

@@ -1,4 +1,4 @@
-"""Choose settings from the cards of a scene's models, which were trained with each board held out in turn.
+"""Choose settings from the model cards of a scene, whose models were trained with each board held out in turn.
 
 The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
 number of steps, the budget, is not chosen, because each scene sets it. Every candidate is tried with the same budgets,
@@ -147,7 +147,7 @@ def _budget(card: Card) -> tuple[int, int]:
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # first card by recipe
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # the first card of each recipe
     return [
         {
             "recipe_name": name,

@@ -30,6 +30,8 @@ class FewLabels(SectionWithRows):
     """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
     adapted: recipes that are also adapted with unlabelled indentations. adapting: settings of these adaptations.
+    labelling: settings of fine-tuning on labelled indentations. rows_max_n: maximum number of training rows of a
+    classical method.
     """
 
     labels_n: Labels
@@ -70,7 +72,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Entry:
-    """Names of one result of the experiment: a method, its inputs, a number of labels and a fold."""
+    """Identifies one result of the experiment by its method, the method's inputs, number of labels and fold."""
 
     method: str
     inputs: str
@@ -136,9 +138,9 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw labelled indentations from the fold's pool; return their rows by number of labels.
+    """Draw the indentations of the fold's pool that are labelled; return their rows by number of labels.
 
-    The indentations of a smaller number are also in every larger one. Pool: see `adaptation_jobs`.
+    The indentations for a smaller number of labels are also used for every larger number. Pool: see `adaptation_jobs`.
     """
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)

@@ -32,7 +32,7 @@ from reskin.seeds import rng_for
 TRAINING_MODULE = "reskin.models.train"
 CACHE = ".reskin/cells"  # completed training runs; a cache, not an output
 
-PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and number of the seed
+PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe name, fold name and index of the seed
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def adaptation_job(
 
 
 def pool_lines(data: SceneData, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
-    """Draw `pokes_n` of a skin's indentations that are reserved for adaptation; order them along the robot's grid."""
+    """Draw `pokes_n` of the skin's indentations in the fold's adaptation pool; order them along the robot's grid."""
     pool = fold.pool[data.rows.skin[fold.pool] == skin]
     rng = rng_for(data.settings.seed, "pokes", skin, seed_i)
     return grid_lines(data.rows, take_pokes(data.rows, pool, pokes_n, rng))
@@ -192,7 +192,7 @@ def read_pretrained(models: Path) -> PretrainedNetworks:
 
 
 def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> dict[int, Pretrained]:
-    """Return the networks of recipe `base` and one fold, by number of the seed."""
+    """Return the networks of recipe `base` and one fold, by the index of their seed."""
     selected = {
         seed_i: network for (recipe, name, seed_i), network in pretrained.items() if (recipe, name) == (base, fold.name)
     }

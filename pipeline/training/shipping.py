@@ -1,4 +1,4 @@
-"""Make the universal model that `reskin` ships: `python -m pipeline.training.shipping` (a few minutes on one core).
+"""Train the universal model that is part of `reskin`: `python -m pipeline.training.shipping` (a few minutes).
 
 Writes reskin/universal/universal.safetensors and its card. The network has the training settings and the seed of scene
 lab, where it is tested as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
@@ -35,8 +35,8 @@ from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 
-PRESSES_N = (0, 12, FULL_SET_N)  # numbers of unlabelled presses; `reskin live` asks for 12
-PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether evenly spread
+PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
+PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",
@@ -58,7 +58,7 @@ CARD = {
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Choose likelihood powers for a misfit of 1 on simulated skins, by numbers of unlabelled presses and of labels."""
+    """Choose likelihood powers for a misfit of 1 by numbers of presses and labels, from coverage on simulated skins."""
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in LAW_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
@@ -75,9 +75,9 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
 def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Calibrate a model to a simulated skin with the given counts (presses, labels) from its pool.
+    """Calibrate a model in place to a simulated skin; `counts` are the numbers of presses and labels from its pool.
 
-    Returns readings to test it on, in the chips' axes, and their places in the frame of labels.
+    Returns the readings of the skin's test presses, in the chips' axes, and their places in the frame of labels.
     """
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
     rest_uT, pool_uT, tested_uT = (to_chips(db_uT) for db_uT in (skins.rest_uT[i][None], pool.db_uT, tested.db_uT))
@@ -94,7 +94,7 @@ def calibrate(
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` takes pairs."""
+    """Return the coverage of 90 % intervals for each power, in two equal columns as `best_powers` needs."""
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
     covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
@@ -103,7 +103,7 @@ def _coverages(
 
 @dataclass(frozen=True)
 class Inputs:
-    """The inputs of the shipped model."""
+    """Inputs for training the model: prior of the skins, training settings, numbers of labels, and seed."""
 
     prior: SkinPrior
     training: TrainingSettings
@@ -126,7 +126,7 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
 
 
 def make() -> None:
-    """Make the model, and overwrite its file and its card."""
+    """Train the model, and overwrite its file and its card."""
     inputs = read_inputs()
     times_s = [time.process_time()]
     tables = tabulate(NOMINAL, NOMINAL_SPREADS, inputs.prior.setup)

@@ -26,14 +26,14 @@ from reskin.universal.model import CalibratedModel, Evaluation, PressCalibration
 from reskin.universal.population import PLACES_N, Population, draw_population
 from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add_error
 
-EXPERIMENT = "labels"  # its folds are scored
-METHODS = ("universal map, ", "universal, ")  # the map alone; map and networks
-WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # titles of the variants
+EXPERIMENT = "labels"  # experiment whose folds are scored
+METHODS = ("universal map, ", "universal, ")  # first words of method names: the map alone; map and networks
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of method names, by variant
 REACH = 1.645  # half width of a 90 % interval, in standard deviations
-BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates for calibration on other boards
-NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidates for a misfit of 1, for simulated skins
-ASSUMED_POWER = 0.5  # if none is calibrated, for the map: as if channels had equal errors in pairs
-FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
+BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers, selected on other boards
+NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers for a misfit of 1
+ASSUMED_POWER = 0.5  # for places and forces of the map alone: as if channels had equal errors in pairs
+FORCE_MIN_N = float(FORCES_N[0])  # smaller forces of labelled presses are raised to this, the map's least force
 
 
 class Powers(NamedTuple):
@@ -52,9 +52,10 @@ class Estimates(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The data, model and likelihood powers that all folds share.
+    """The data, nominal model and likelihood powers that all folds share.
 
-    board_powers: by board and number of labels. nominal_powers: by number of labels, at a misfit of 1.
+    board_powers: powers of variant `rig`, by held-out board and number of labels. nominal_powers: powers of variant
+    `nominal` for a misfit of 1, by number of labels.
     """
 
     known: KnownBoards
@@ -65,12 +66,15 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class PoolCalibration:
-    """A model calibrated to a board's no-load field and its pool of presses, the first of which may serve as labels."""
+    """A model calibrated to a board without labels: to its no-load field and to the presses of its pool.
+
+    Pool: the presses that are reserved for calibration and not tested. The first of them may also serve as labels.
+    """
 
     presses: PressCalibration
     pool: LabelledPresses
     pool_mm: Float[np.ndarray, "m 2"]  # places of the pool's presses, estimated by the networks
-    misfit: float  # median over the pool
+    misfit: float  # median misfit (chi^2 per channel) of the pool's presses
 
     def with_labels(self, labels_n: int) -> CalibratedModel:
         """Condition the model on the labels of the first `labels_n` presses of the pool."""
@@ -81,20 +85,20 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Lower the powers of the nominal variant, according to the misfit of the unlabelled presses."""
+        """Lower the nominal variant's powers for a misfit of 1 to those for the misfit of this pool."""
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
-        """Return this calibration with the given presses first in the pool."""
+        """Return this calibration with the pool reordered: the presses with indices `first` come first."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
-        # The networks are conditioned again, because the order of the pool changes their sums in the last bits.
+        # Condition the networks again, because their sums over the pool depend on its order in the last bits.
         presses = replace(self.presses, data=CalibrationData(self.presses.data.rest_uT, pool.db_uT, pool.db_uT))
         return replace(self, presses=presses, pool=pool, pool_mm=self.pool_mm[order])
 
 
 def calibrate(model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses) -> PoolCalibration:
-    """Calibrate a model to a board without labels: to its no-load field, and to presses spread evenly over the skin."""
+    """Calibrate a model to a board's no-load field and to its pool, whose presses are spread evenly over the skin."""
     presses = model.calibrate(CalibrationData(rest_uT, pool.db_uT, pool.db_uT))
     misfit = float(np.median(presses.skin.evaluator.evaluate(pool.db_uT).misfit())) if len(pool) else 1.0
     return PoolCalibration(presses, pool, presses.even_mm, misfit)
@@ -113,12 +117,15 @@ def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: S
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Replace the standard deviations of an estimate by its rms errors under the distribution of another one."""
+    """Return `estimate` with other standard deviations.
+
+    They are the rms errors of `estimate` if the true place is distributed as in `other`.
+    """
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 
 def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequence[Powers]) -> list[Powers]:
-    """Lower powers according to the variance inflation of cross-validated labels."""
+    """Lower powers according to the variance inflation from cross-validation over the pool's first labels."""
     by_map: list[HeldOut] = []
     combined: list[HeldOut] = []
     for kept, held_out in folds_of_labels(min(labels_n, len(calibration.pool))):
@@ -137,10 +144,10 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
 def score_fold(
     benchmark: Benchmark, fold: Fold, rig: Mapping[str, Variant], labels_n: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Score both variants on one fold, by the map alone and with networks, for every number of labels."""
+    """Score both variants, each with and without networks, on the test rows of a fold, for every number of labels."""
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
-    if board not in known.presses:  # the keys are boards and skins if a board has several skins
+    if board not in known.presses:  # if a board has several skins, keys of `presses` name board and skin
         what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
         raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
@@ -164,20 +171,23 @@ def score_fold(
 
 
 def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
-    """Return the fraction of coordinates that are inside their 90 % intervals."""
+    """Return the fraction of true coordinates that are inside the 90 % intervals of the estimate."""
     return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
 
 
 def coverages(
     calibration: PoolCalibration, tested: LabelledPresses, labels_n: int, powers: Sequence[Powers]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each pair of powers, for the map alone and with networks."""
+    """Return the coverage of 90 % intervals on the tested presses, for each pair of powers.
+
+    The columns are the map alone, and map and networks.
+    """
     estimates = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
     return np.array([[coverage(each, tested.place_mm) for each in pair] for pair in estimates])
 
 
 def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
-    """Score estimates by the metrics of all methods, and by coverage and half width of their 90 % intervals."""
+    """Score estimates with the metrics that all methods have, and coverage and half width of 90 % intervals."""
     label_mm = known.frame.label(estimate.place_mm)
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
     scores = score_test(known.data, test, predicted)
@@ -189,23 +199,23 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
 
 
 def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Return the rows of each press of the pool, in the order in which experiment `labels` labels the presses."""
+    """Return the rows of each press in a fold's pool; the order is that in which experiment `labels` adds labels."""
     indentation = data.rows.indentation[fold.pool]
     return [fold.pool[indentation == press] for press in labelling_order(data.rows, fold, data.settings.seed)]
 
 
 def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
-    """Return the mean reading of each press in `pool_rows`."""
+    """Return the presses of a fold's pool in the order of `pool_rows`; each is the mean over its rows."""
     rows, presses = known.data.rows, pool_rows(known.data, fold)
     target = np.array([rows.target[press_rows].mean(axis=0) for press_rows in presses], float)
     db_uT = np.array([rows.db_uT[press_rows].mean(axis=0) for press_rows in presses], float)
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = 24  # simulated skins for each of LAW_ERRORS, to calibrate the nominal variant's powers
+CALIBRATION_SKINS_N = 24  # simulated skins for each of LAW_ERRORS, for choosing the nominal variant's powers
 
 Coverages = Float[np.ndarray, "t 2"]  # rows: powers; columns: the map alone, the map with networks
-LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns changes of field with errors of the law
+LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns field changes with errors of the law added
 
 
 def law_error(scale: float = 1.0) -> LawError:
@@ -218,12 +228,13 @@ def law_error(scale: float = 1.0) -> LawError:
     return add
 
 
-AS_TRAINED = "further"  # names of errors are also names of random streams
+# Errors of the law on simulated skins for calibration, by name. The names are also names of random streams.
+AS_TRAINED = "further"
 LAW_ERRORS = {AS_TRAINED: law_error(), "further, missed twice": law_error(2.0)}
 
 
 def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[str, dict[int, Powers]]:
-    """Choose powers for each held-out board: those that are best on the other boards."""
+    """Choose, for each held-out board and number of labels, the powers with the best coverage on the other boards."""
     by_board = {board: _board_coverages(benchmark, board, labels_n) for board in benchmark.known.presses}
     return {
         board: {
@@ -235,9 +246,9 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 
 
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
-    """Choose powers for a misfit of 1 on simulated skins, by number of labels.
+    """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
 
-    The powers used for a board are these, divided by its misfit (Birge's ratio) and by the variance inflation of its
+    For a board, these powers are divided by the board's misfit (Birge's ratio) and by the variance inflation of its
     labels. The law's errors on the simulated skins are as large as in training. If there are labels, skins with errors
     twice as large are added, because the residuals at the labels reveal the size of the errors.
     """
@@ -252,13 +263,13 @@ def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int)
 
 
 def best_powers(candidates: Sequence[float], of_skins: Sequence[Coverages]) -> Powers:
-    """Choose the powers whose 90 % intervals have a coverage closest to 90 %, averaged over skins."""
+    """Choose the powers for which the coverage of 90 % intervals, averaged over skins, is closest to 90 %."""
     map_i, combined_i = np.abs(np.mean(of_skins, axis=0) - 0.9).argmin(axis=0)
     return Powers(candidates[map_i], candidates[combined_i])
 
 
 def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
-    """Draw skins of the prior, with noise and errors of the law."""
+    """Simulate skins drawn from a prior; the field changes include noise and errors of the law."""
     rng = rng_for(seed, "universal", prior.name, name)
     skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng)
     db_uT = error(skins, rng).reshape(skins.db_uT.shape)
@@ -269,13 +280,13 @@ def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error
 def calibrate_to_simulated(
     model: PriorModel, skins: Population, i: int, seed: int
 ) -> tuple[PoolCalibration, LabelledPresses]:
-    """Calibrate a model to a simulated skin; return it with the presses to test it on."""
+    """Calibrate a model to the pool of a simulated skin; return the calibration and the skin's test presses."""
     pool, tested = split_presses(skins, i, seed)
     return calibrate(model, skins.rest_uT[i].astype(float), pool), tested
 
 
 def split_presses(skins: Population, i: int, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split the presses of a simulated skin at random into a pool and presses to test on."""
+    """Split the presses of a simulated skin at random into a pool for calibration and test presses."""
     order = rng_for(seed, "universal", "pool", i).permutation(skins.db_uT.shape[1])
     parts = (skins.place_mm, skins.force_N, skins.db_uT)
     presses = LabelledPresses(*(part[i][order].astype(float) for part in parts))
@@ -288,7 +299,10 @@ def _simulated_coverages(calibration: PoolCalibration, tested: LabelledPresses, 
 
 
 def _board_coverages(benchmark: Benchmark, board: str, labels_n: Sequence[int]) -> dict[int, Coverages]:
-    """Compute coverages of the nominal variant on a board; a third of its presses is the pool, the rest is tested."""
+    """Compute coverages of the nominal variant on a board, by number of labels.
+
+    A random third of the board's presses is the pool for calibration; all other presses are tested.
+    """
     own = benchmark.known.presses[board]
     order = rng_for(benchmark.known.data.settings.seed, "universal", board).permutation(len(own.recorded))
     db_uT = own.db_uT.reshape(len(order), -1)

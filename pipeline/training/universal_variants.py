@@ -1,7 +1,7 @@
-"""Train or read the universal model before it is calibrated to a held-out board.
+"""Train universal models, or read them from files, before they are calibrated to a held-out board.
 
-There are two variants: `rig` is made from the recorded boards that are not held out, `nominal` from simulated skins
-alone.
+There are two variants of the model: `rig` is made from simulated skins and the recorded boards that are not held out,
+`nominal` from simulated skins alone.
 """
 
 from collections.abc import Mapping
@@ -32,13 +32,13 @@ from reskin.universal.model import PriorModel
 from reskin.universal.network import Weights, from_tensors, to_tensors
 from reskin.universal.training import NOMINAL_NAME, RecordedBoard, SkinPrior, TrainingSettings, train_networks
 
-READINGS_N = 100  # number of readings per press of a recorded board, for training
+READINGS_N = 100  # readings that training uses per press of a recorded board
 FORMAT = "reskin-universal-1"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The relation of a board's frame to the axes of its chips and to its labels.
+    """Conversions from chip axes to board axes, and between label coordinates and the board's frame.
 
     turn: for each chip, the rotation from its axes to the board's. middle_mm: the board's centre in label coordinates.
     mirrored: whether y of the labels points opposite to y of the board.
@@ -54,17 +54,20 @@ class Frame:
         return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
 
     def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert labels to places in the board's frame."""
+        """Convert label coordinates to places in the board's frame."""
         return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
 
     def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert places in the board's frame to labels."""
+        """Convert places in the board's frame to label coordinates."""
         return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
 
 
 @dataclass(frozen=True)
 class KnownBoards:
-    """The scene's recorded boards, before one is held out: `presses` by board, in the board's frame."""
+    """All recorded boards of a scene, including the one that is later held out.
+
+    presses: the presses on each board, in the board's frame.
+    """
 
     data: SceneData
     frame: Frame
@@ -74,21 +77,21 @@ class KnownBoards:
 
 @dataclass(frozen=True)
 class Variant:
-    """The model before calibration to a board, and the prior of the skins that it was made from."""
+    """A model before calibration to a board, and the prior from which its simulated skins were drawn."""
 
     prior: SkinPrior
     model: PriorModel
 
 
 class Variants(NamedTuple):
-    """The variant made from simulated skins alone; for each held-out board, the variant made from the other boards."""
+    """The nominal variant, and the variants `rig` by held-out board, each made from the other boards."""
 
     nominal: Variant
     rig: Mapping[str, Variant]
 
 
 def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
-    """Fit laws to the known boards, tabulate maps and train networks."""
+    """Fit a law to each known board; then tabulate a map and train networks for each variant."""
     with make_executor(imports="reskin.universal.training") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
@@ -101,7 +104,7 @@ def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
 
 
 def read_variants(known: KnownBoards, models: Path) -> Variants:
-    """Read the networks that `write_networks` wrote; fit laws and tabulate maps again, because these are not stored."""
+    """Read the networks that `write_networks` wrote; compute laws and maps again, because they are not stored."""
     with make_executor(imports="reskin.universal.map") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
@@ -113,7 +116,7 @@ def read_variants(known: KnownBoards, models: Path) -> Variants:
 
 
 def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
-    """Return the nominal prior, and for each board the prior made without it."""
+    """Return the nominal prior, then for each board the prior made from all other boards."""
     boards, setup = known.presses, known.setup
     laws = dict(
         zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
@@ -123,7 +126,7 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior made from all boards except one: from their laws, the laws' errors, and their readings."""
+    """Return the prior made from all boards except `board`: from their laws, the laws' errors, and their readings."""
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
@@ -132,7 +135,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit the residual to the errors of each law on the board that it was fitted to."""
+    """Fit a residual to the relative errors of the laws, each on the board that it was fitted to."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -144,7 +147,7 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select a board's readings for training: the same number for each press with a force."""
+    """Select a board's readings for training: `READINGS_N` of each press with a force, repeated if it has fewer."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     rows_by_press = own[
@@ -157,7 +160,7 @@ def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarr
 
 
 def write_networks(models: Path, variants: Variants, settings: TrainingSettings, seed: int) -> None:
-    """Write the networks of each variant, with a card."""
+    """Write the networks of each variant to a file, with a JSON card beside it."""
     with io.replacing(models) as folder:
         folder.mkdir()
         for variant in (variants.nominal, *variants.rig.values()):
@@ -167,7 +170,7 @@ def write_networks(models: Path, variants: Variants, settings: TrainingSettings,
 
 
 def read_networks(models: Path, name: str) -> list[Weights]:
-    """Read the networks of a prior, by its name."""
+    """Read the networks that were trained for the prior of this name."""
     return from_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
 
 
@@ -176,7 +179,7 @@ def _file_name(name: str) -> str:
 
 
 def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str, object]:
-    """Describe networks: the skins that they were trained on, and for what they are not suitable."""
+    """Return the card of a variant's networks: how they were trained, and what they must not be used for."""
     prior = variant.prior
     return {
         "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,

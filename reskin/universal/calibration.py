@@ -1,4 +1,4 @@
-"""Calibration data of one skin (checks and file format), and likelihood powers with their cross-validation."""
+"""Calibration data of one skin (validation, file format), and likelihood powers with cross-validation over labels."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,14 +15,14 @@ from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # five chips with three axes each
-FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no reading exceeds it; its square fits single precision
-RANGE_FACTOR = 2.0  # a label's force outside the model's range by this factor or more probably has a wrong unit
+FIELD_MAX_uT = 1e6  # 20 times the range of a chip; the square of this value fits single precision
+RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
 CHANNELS_RULE = f"This model needs {CHANNELS_N} numbers per reading: Bx, By, Bz of each of five chips."
-LABELS_MAX_N = 2000  # memory grows with the square of the number of labels, and time even faster
+LABELS_MAX_N = 2000  # memory grows with the square of the number of labels, and computing time grows faster still
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Return one or several readings as rows; raise SchemaError for a wrong number of channels."""
+    """Return one or several readings as a 2-D array, one row per reading; raise SchemaError for a wrong shape."""
     try:
         rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     except (TypeError, ValueError):  # text, or rows of different lengths
@@ -35,7 +35,7 @@ def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
 
 
 def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Return calibration readings as rows; raise SchemaError for values that are not finite or out of range."""
+    """Return calibration readings as a 2-D array; raise SchemaError for values that are not finite or too large."""
     rows_uT = check_shape(b_uT)
     _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in magnitude"
@@ -49,9 +49,10 @@ def check_labels(
     rows_n: int,
     reach_mm: Float[np.ndarray, "2 2"],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Return labels as arrays; raise SchemaError for places outside `reach_mm` or forces of 0 N or less.
+    """Return the places and forces of labelled presses as arrays; raise SchemaError if they are invalid.
 
-    There must be as many labels as readings, and at most LABELS_MAX_N.
+    Places must be within `reach_mm` (rows: least and largest x and y), and forces must be finite and above 0 N. There
+    must be one label for each of the `rows_n` readings, and at most LABELS_MAX_N labels.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
@@ -71,7 +72,7 @@ def check_labels(
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
-    """Raise SchemaError for labels' forces that are outside the model's range by a factor of 2 or more."""
+    """Raise SchemaError if a labelled force is outside the model's range by a factor of 2 or more."""
     least_N, most_N = float(range_N.min()), float(range_N.max())
     inside = (force_N > least_N / RANGE_FACTOR) & (force_N < RANGE_FACTOR * most_N)
     if not inside.all():
@@ -81,7 +82,7 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
 
 
 def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
-    """Return field changes of presses; raise SchemaError if all are below the noise, as they would be in mT."""
+    """Return the field changes; raise SchemaError if all are below the noise, for example because they are in mT."""
     strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), -1, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
         rule = f"{NOISE_uT:g} uT or more at some chip"
@@ -96,13 +97,14 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-FORMAT = "reskin-skin-1"
-SHAPES: Mapping[str, tuple[int, ...]] = {  # shapes of the arrays, without the first axis (presses)
+FORMAT, FORMAT_1 = "reskin-skin-2", "reskin-skin-1"  # files of the first format do not tell which forces are known
+SHAPES: Mapping[str, tuple[int, ...]] = {  # arrays in the file, with their shapes after the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
+    "force_known": (),
 }
 FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
 REMEDY = "Use a file that `save` wrote."
@@ -110,18 +112,32 @@ REMEDY = "Use a file that `save` wrote."
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses with known places (relative to the board's centre) and forces, and their field changes."""
+    """Presses with known places (relative to the board's centre), their forces and their field changes.
+
+    force_known: which forces are true; the others are estimates. The default is that all are true.
+    """
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
+    force_known: Bool[np.ndarray, " m"] | None = None
 
     def __len__(self) -> int:
         return len(self.force_N)
 
     def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
         """Select presses."""
-        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which])
+        known = None if self.force_known is None else self.force_known[which]
+        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which], known)
+
+
+def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses:
+    """Append labelled presses to others."""
+    known = [np.ones(len(part), bool) if part.force_known is None else part.force_known for part in (one, other)]
+    return LabelledPresses(
+        np.concatenate([one.place_mm, other.place_mm]), np.concatenate([one.force_N, other.force_N]),
+        np.concatenate([one.db_uT, other.db_uT]), np.concatenate(known),
+    )  # fmt: skip
 
 
 def no_presses() -> Float[np.ndarray, "0 ch"]:
@@ -134,9 +150,9 @@ def no_labels() -> LabelledPresses:
 
 @dataclass(frozen=True)
 class CalibrationData:
-    """All calibration data of one skin, along the board's axes.
+    """All calibration data of one skin, in the board's frame and axes.
 
-    rest_uT: no-load field. presses_uT: field changes of presses at unknown places, at most `FULL_SET_N`. even_uT: field
+    rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. labels: presses at known places.
     """
 
@@ -147,25 +163,35 @@ class CalibrationData:
 
 
 def write_calibration(data: CalibrationData, file: Path) -> None:
-    """Write calibration data, without the model, as safetensors."""
+    """Write calibration data to a safetensors file, which does not contain the model."""
     labels = data.labels
-    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT)
+    known = np.ones(len(labels)) if labels.force_known is None else labels.force_known.astype(float)
+    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT, known)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
 def is_calibration(file: Path) -> bool:
-    """Return whether a file is one of `write_calibration`; raise SchemaError if a file of such a size is damaged."""
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
+    """Return whether `write_calibration` wrote this file.
+
+    Raises SchemaError if the file is damaged, unless it is too large for a file of calibration data.
+    """
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, FORMAT_1)
 
 
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
-    """Read calibration data; raise SchemaError for places outside `reach_mm` (relative to the board's centre)."""
+    """Read the calibration data that `write_calibration` wrote.
+
+    Raises SchemaError for other files, and for labelled places outside `reach_mm` (rows: least and largest x and y,
+    relative to the board's centre).
+    """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
-    if metadata.get("format") != FORMAT:
+    if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
+        tensors = dict(tensors) | {"force_known": np.ones(len(tensors["labelled_N"]))}
+    elif metadata.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
@@ -179,24 +205,25 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
     )
     rest_uT = check_readings(tensors["rest_uT"])[0]
-    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"])
+    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
     return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels
-PRIOR_N = 40.0  # weight of the prior (an inflation of 1), as a number of coordinates (docs/learning.md)
+PRIOR_N = 40.0  # the prior, an inflation of 1, counts like this number of labelled coordinates (docs/learning.md)
 NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| of a standard normal z
 
-HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]  # estimates with each power, and true places in mm
+# Held-out labels: estimates with each power, and true places in mm.
+HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]
 
 
 @dataclass(frozen=True)
 class LikelihoodPowers:
-    """Table of likelihood powers by numbers of unlabelled presses and labels, determined on simulated skins.
+    """Likelihood powers for a misfit of 1, tabulated by numbers of presses and labels; determined on simulated skins.
 
-    The powers are those for a misfit of 1. anywhere: by number of presses at unknown places, then by number of labels.
-    even: by number of labels, for presses that are evenly spread over the skin. Powers are interpolated between numbers
-    of labels. For the number of presses, the largest tabulated number that does not exceed it is used.
+    anywhere: powers by number of presses at unknown places, then by number of labels. even: powers by number of labels,
+    for presses that are evenly spread over the skin. The logarithm of the power is interpolated linearly between
+    tabulated numbers of labels. A number of presses that is not tabulated is rounded down to a tabulated one.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
@@ -209,17 +236,17 @@ class LikelihoodPowers:
         return float(np.exp(np.interp(labels_n, tabulated_n, np.log([powers[n] for n in tabulated_n]))))
 
     def are_enough(self, presses_n: int) -> bool:
-        """Return whether the misfit of this number of presses is used."""
+        """Return whether this number of presses is large enough for their misfit to be used."""
         return any(0 < n <= presses_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
-        """Return the powers as an entry of the model's card."""
+        """Return the powers as a JSON object for the model's card."""
         anywhere = {str(presses_n): _named(powers) for presses_n, powers in self.anywhere.items()}
         return {"anywhere": anywhere, "even": _named(self.even)}
 
     @classmethod
     def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
-        """Read the entry of a model's card."""
+        """Create the powers from the JSON object that `to_card` returns."""
         anywhere = {int(presses_n): _numbered(powers) for presses_n, powers in card["anywhere"].items()}
         return cls(anywhere, _numbered(card["even"]))
 
@@ -249,7 +276,7 @@ def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[
 
 
 def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
-    """Return for each power the factor by which squared errors of held-out labels exceed the estimated variances."""
+    """Return, for each power, the factor by which squared errors of held-out labels exceed the estimated variances."""
     inflations = []
     for i in range(powers_n):
         errors_sd = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
@@ -258,8 +285,10 @@ def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
 
 
 def variance_inflation(errors_sd: Float[np.ndarray, "m 2"]) -> float:
-    """Return the variance inflation for errors in standard deviations.
+    """Return the variance inflation for errors that are divided by their estimated standard deviations.
 
-    It is the square of the mean absolute error, relative to that of a normal distribution: outliers are not squared.
+    The inflation is the square of (mean absolute error / mean absolute value of a standard normal variable). Absolute
+    errors are used because they are less sensitive to outliers than squared errors. The prior of weight `PRIOR_N` pulls
+    the inflation towards 1.
     """
     return ((PRIOR_N + float(errors_sd.sum()) / NORMAL_MEAN) / (PRIOR_N + errors_sd.size)) ** 2

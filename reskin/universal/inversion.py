@@ -19,27 +19,27 @@ PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "
 LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin must be above its chips and be magnetised
 PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded boards instead
 ROUNDS_N = 3  # each round searches places with the current law, then fits parameters and places together
-EVALUATIONS_MAX_N = 8  # evaluations of all derivatives per round
-STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in place and log force
-REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # bounds of |x|, |y| and of the force
-CELL = 1.0  # maximum distance of a search's result from the nearest lattice point, in steps of the lattice
-BLOCK_N = 500  # number of readings per block, to bound memory
+EVALUATIONS_MAX_N = 8  # maximum number of least-squares steps per round
+STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in x or y, and in log force
+REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # largest |x| and |y|; least and largest force
+CELL = 1.0  # maximum length of the Gauss-Newton step in each coordinate, in steps of the lattice
+BLOCK_N = 500  # readings are searched in blocks of this size, to bound memory
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Field changes of a law on a lattice of places and forces, and their slopes per step of the lattice."""
+    """Field changes simulated with a law on a lattice of places and forces, and their slopes per lattice step."""
 
     place_mm: Float[np.ndarray, "h 2"]
     log_N: Float[np.ndarray, " h"]
-    step: Float[np.ndarray, "3"]  # mm, mm, log N
+    step: Float[np.ndarray, "3"]  # steps of the lattice in x (mm), y (mm) and log force
     field_uT: Float[np.ndarray, "h ch"]
     slope_uT: Float[np.ndarray, "h ch 3"]
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Places and forces that were found, and residuals |dB - simulated| / |dB|."""
+    """Place and force found for each reading, and the residual |dB - simulated dB| / |dB|."""
 
     place_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
@@ -47,7 +47,7 @@ class SearchResult:
 
 
 def chart(law: Law, setup: Setup) -> Chart:
-    """Simulate a law at all places and forces of the lattice (about 2,900 presses in one second)."""
+    """Simulate presses with a law at all places and forces of the lattice (about 2,900 presses, one second)."""
     axis_mm, log_N = lattice_mm(), np.log(FORCES_N)
     points = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
     flat = points.reshape(-1, 3)
@@ -59,19 +59,19 @@ def chart(law: Law, setup: Setup) -> Chart:
 
 
 def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
-    """Search a chart for each reading: take the point with the nearest field, then one Gauss-Newton step."""
+    """Find the place and force of each reading: the chart's point with the nearest field, then a Gauss-Newton step."""
     blocks = [_search(known, db_uT[i : i + BLOCK_N]) for i in range(0, max(len(db_uT), 1), BLOCK_N)]
     names = SearchResult.__annotations__
     return SearchResult(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
 
 def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
-    # Squared distances minus |dB|^2, which is the same for all points.
+    # Squared distances of readings from points, without |dB|^2, which does not change which point is nearest.
     distance_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T
     nearest = distance_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[nearest], known.slope_uT[nearest]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
-    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # for coordinates without effect
+    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # in case a coordinate has no effect
     steps = np.linalg.solve(square + damping, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
     steps = np.clip(steps, -CELL, CELL)
     residual_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)
@@ -91,7 +91,7 @@ def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Least squares over the law's parameters and x, y and log F of each press, in this order."""
+    """Joint least-squares fit of the law's parameters, followed by x, y and log F of each press."""
 
     law: Law
     setup: Setup
@@ -122,8 +122,8 @@ class _JointFit:
         return np.concatenate([changes.ravel(), rest, priors])
 
     def slopes(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "r p"]:
-        # The coordinates of a press affect only the rows of this press. Three simulations of all presses therefore give
-        # the columns of all coordinates.
+        # The coordinates of a press affect only the residuals of this press. Therefore three simulations, each with one
+        # coordinate of all presses changed, give the derivatives with respect to all coordinates.
         n, channels_n = self.db_uT.shape
         first, parameters_n = self.residuals(values), len(PARAMETERS)
         columns = np.zeros((len(first), len(values)))

@@ -1,8 +1,9 @@
-"""Compiled loops of the map: likelihoods of hypotheses given readings, and means over the hypotheses.
+"""Compiled loops of the map: likelihoods of hypotheses given readings, and moments over all hypotheses.
 
 A hypothesis is a pair of a place and a force; the force index varies fastest. The Gaussian of a hypothesis, with mean m
 and covariance C, is stored as W and W m, where W'W is the inverse of C. For a reading d, chi^2 = |W d - W m|^2.
-Likelihoods are in single precision. The error of chi^2 is below 0.01 for hypotheses under which a reading is likely.
+Likelihoods are computed in single precision. The error of chi^2 is below 0.01 for hypotheses under which a reading is
+likely.
 """
 
 import math
@@ -18,7 +19,10 @@ LANES_N = 64  # Gaussians per block (axis `l`), for vector instructions
 
 @dataclass(frozen=True)
 class LinearMeans:
-    """Means of Gaussians, linear in some parameters, in blocks; copies of the last Gaussian fill the last block."""
+    """Means of Gaussians as linear functions of some parameters, arranged in blocks of `LANES_N` Gaussians.
+
+    The last block is filled up with copies of the last Gaussian.
+    """
 
     mean: Float32[np.ndarray, "k ch l"]
     slope: Float32[np.ndarray, "k ch t l"]
@@ -28,7 +32,8 @@ class LinearMeans:
 class Gaussians:
     """Whitened Gaussians, and the log determinants of their covariances.
 
-    row: for each channel, W m, then the row of W up to the diagonal (W is lower triangular).
+    row: axis `f` has, for each channel, the channel's element of W m and then its row of W up to the diagonal (W is
+    lower triangular); axis `h` has the Gaussians.
     """
 
     row: Float32[np.ndarray, "f h"]
@@ -44,7 +49,7 @@ class Gaussians:
 
 
 def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
-    """Arrange Gaussians in blocks."""
+    """Arrange means and slopes of Gaussians in blocks of `LANES_N`."""
     blocks_n = -(-len(mean) // LANES_N)
     gaussian_i = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
     return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[gaussian_i], 1, -1)) for part in (mean, slope)))
@@ -55,10 +60,11 @@ def whiten(
     residual: Float32[np.ndarray, "h ch"], share: Float32[np.ndarray, " h"], error_cov: Float32[np.ndarray, "ch ch"],
     noise_var: float,
 ) -> Gaussians:  # fmt: skip
-    """Whiten Gaussians, given the parameters as their mean and the lower Cholesky factor L of their covariance.
+    """Whiten Gaussians for normally distributed parameters.
 
-    With M = mean + slope @ parameters, a Gaussian has the mean M + |M| residual and the covariance
-    (slope L)(slope L)' + |M|^2 share error_cov + noise_var 1.
+    `parameters` has the mean of the parameters and the lower Cholesky factor L of their covariance. With
+    M = mean + slope @ (mean of the parameters), a Gaussian has the mean M + |M| residual and the covariance
+    (slope L)(slope L)' + |M|^2 share error_cov + noise_var I, where I is the identity matrix.
     """
     channels_n = len(error_cov)
     row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
@@ -101,6 +107,7 @@ def _fill(of, parameters, errors, error_cov, noise_var, row):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _expect(of, value, errors, first, m, var):
+    # Compute the means m = M + |M| residual of one block (M: see `whiten`), and var = |M|^2 share.
     (mean, slope), (residual, share) = of, errors
     _clear(var)
     for i in range(len(m)):
@@ -118,6 +125,7 @@ def _expect(of, value, errors, first, m, var):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _spread(slope, root, s):
+    # Compute s = slope L, where L is the Cholesky factor `root`.
     for i in range(len(s)):
         for p in range(len(root)):
             _clear(s[i, p])
@@ -128,7 +136,7 @@ def _spread(slope, root, s):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _cov(s, var, error_cov, noise_var, a):
-    # Compute the lower triangle of s s' + var error_cov + noise_var 1.
+    # Compute the lower triangle of the covariance s s' + var error_cov + noise_var I.
     for i in range(len(a)):
         for j in range(i + 1):
             noise = noise_var if i == j else np.float32(0)
@@ -141,7 +149,7 @@ def _cov(s, var, error_cov, noise_var, a):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _root(a, log_det):
-    # Replace the lower triangle by the Cholesky factor L, with 1/L on the diagonal.
+    # Replace the lower triangle of `a` by its Cholesky factor, with the reciprocals of the diagonal elements.
     _clear(log_det)
     for j in range(len(a)):
         for p in range(j):
@@ -157,7 +165,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # Compute the inverse of the Cholesky factor in `a`; it is lower triangular, too.
+    # Compute the inverse of the Cholesky factor in `a`; the inverse is lower triangular, too.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -170,6 +178,7 @@ def _inverse(a, b):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _write(b, m, log_det, row):
+    # Write W m and W (here `b`) of one block in the order of `Gaussians.row`, followed by the log determinants.
     f, n, white_mean = 0, row.shape[1], np.empty(LANES_N, np.float32)
     for i in range(len(b)):
         _clear(white_mean)
@@ -181,7 +190,7 @@ def _write(b, m, log_det, row):
     row[f] = log_det[:n]
 
 
-# Loops over lanes are written out, because array expressions are not vectorised.
+# The following functions loop over lanes, because Numba does not vectorise the equivalent array expressions.
 @njit(inline="always")
 @no_type_check
 def _add(total, one, other):
@@ -220,7 +229,10 @@ def _clear(value):
 CELL_SD_MM = 0.2  # least standard deviation of a place: positions within a cell of the lattice are not distinguished
 TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
 LEAST = math.log(TINY)
-FARTHEST = 200.0  # log likelihoods further below the largest one than this are raised to this distance
+# Power of the map's probabilities of forces if the map alone estimates forces. It is small, because the map is too sure
+# of forces that the law hardly distinguishes. Chosen on both boards of scene lab.
+FORCE_POWER = 0.3
+FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one
 
 
 class Lattice(NamedTuple):
@@ -230,8 +242,8 @@ class Lattice(NamedTuple):
     log_N: Float[np.ndarray, " q"]
 
 
-Normals = Float[np.ndarray, "n 6"]  # means of x and y, their standard deviations; mean and sd of log F
-Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # x and y [n 2], their standard deviations [n 2], force in N [n]
+Normals = Float[np.ndarray, "n 6"]  # mean of x, mean of y, sd of x, sd of y, mean of log F, sd of log F
+Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # places [n 2], their standard deviations [n 2], force in N [n]
 
 
 def means(
@@ -249,14 +261,16 @@ def means(
 def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float,
-) -> Moments:  # fmt: skip
-    """Return moments of the map's marginal probabilities of places and of forces, each times normal distributions.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Multiply the map's marginal probabilities of place and of force by normal distributions; return the moments.
 
-    map_power: power of the map's likelihoods. power: power of the product; it affects standard deviations only.
+    The fourth array contains the mean log forces of the map alone, weighted by the power `FORCE_POWER` of its
+    probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
+    likelihoods. power: power of the product; it affects standard deviations only.
     """
-    moments = np.empty((len(deviance), 5))
+    moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), moments)
-    return moments[:, :2], moments[:, 2:4], moments[:, 4]
+    return moments[:, :2], moments[:, 2:4], moments[:, 4], moments[:, 5]
 
 
 @njit(cache=True, error_model="numpy")
@@ -287,6 +301,7 @@ def _means(deviance, best, at, half_power, found):
 def _products(deviance, best, at, normals, powers, found):
     place_mm, log_N = at
     likely, of_place, of_force = np.empty(deviance.shape[1]), np.empty(len(place_mm)), np.empty(len(log_N))
+    combined = np.empty(len(log_N))
     for r in range(len(deviance)):
         mean_x, mean_y, sd_x, sd_y, mean_log_N, sd_log_N = normals[r]
         _likelihoods(deviance[r], deviance[r, best[r]], powers[0], likely)
@@ -295,11 +310,12 @@ def _products(deviance, best, at, normals, powers, found):
             off_x, off_y = place_mm[p, 0] - mean_x, place_mm[p, 1] - mean_y
             of_place[p] -= 0.5 * ((off_x / sd_x) ** 2 + (off_y / sd_y) ** 2)
         for q in range(len(of_force)):
-            of_force[q] -= 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
+            combined[q] = of_force[q] - 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
+            of_force[q] *= FORCE_POWER
         x, y, _, _ = _moments(of_place, place_mm, (0.0, 0.0), 1.0, likely)
         _, _, xx, yy = _moments(of_place, place_mm, (x, y), powers[1], likely)
         found[r, 0], found[r, 1], found[r, 2], found[r, 3] = x, y, _sd_mm(xx), _sd_mm(yy)
-        found[r, 4] = math.exp(_mean(of_force, log_N))
+        found[r, 4], found[r, 5] = math.exp(_mean(combined, log_N)), _mean(of_force, log_N)
 
 
 @njit(cache=True, error_model="numpy")
@@ -331,7 +347,8 @@ def _margins(likely, of_place, of_force):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _moments(log, place_mm, about_mm, power, likely):
-    # Weighted by a power of the probabilities: means of x and y, mean squares about a place. `likely` is a work array.
+    # Return the means of x and y and the mean squares of their distances from `about_mm`. The weights are a power of
+    # the probabilities, whose logarithms are `log`. `likely` is a work array.
     most, sum_, x, y, xx, yy = _most(log), 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(len(log)):
         likely[p] = _exp(power * (log[p] - most))
@@ -368,7 +385,7 @@ def _most(values):
 @no_type_check
 def _exp(x):
     # Exponential of x <= 0: Taylor series for x / 512, squared nine times, because the library's exp is not vectorised.
-    # The relative error is 1e-9 down to -100, and 5e-7 at -200.
+    # The relative error is at most 1e-9 for x >= -100, and 5e-7 at x = -200.
     p = (-FARTHEST if x < -FARTHEST else x) * (1 / 512)
     y = p * (1 / 24 + p * (1 / 120 + p * (1 / 720 + p * (1 / 5040 + p * (1 / 40320)))))
     y = 1.0 + p * (1.0 + p * (1 / 2 + p * (1 / 6 + y)))

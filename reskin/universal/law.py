@@ -28,13 +28,14 @@ def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
-# Same as in scene `quick`: the cheapest rule whose error is below 2 % of dB (measured by experiment `runtime`).
+# Quadrature rule for the skin's field, the same as in scene `quick`: the cheapest rule whose error is below 2 % of the
+# field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board; the first seven may differ between boards, the others belong to the rig."""
+    """Parameters of one skin on its board; all but the first seven are the same for all boards of a rig."""
 
     seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
@@ -44,12 +45,12 @@ class Law:
     label_x_mm: float  # true place of the tip minus its label, along the board's axes
     label_y_mm: float
     modulus_MPa: float
-    away_um_mm: float
-    give_x_um: float
+    away_um_mm: float  # slide of the skin under a press: um towards the centre per mm of distance from the centre
+    give_x_um: float  # displacement of the rig and the skin under a press (compliance of the rig)
     give_y_um: float
     # The following parameters are not fitted.
-    lets_go_N: float = 8.0  # force at which the slide towards the centre vanishes; chosen on both boards of scene lab
-    grip_N_mm: float = 8.75  # springs of 7 N/mm divided by a friction of 0.8 (nominal.yaml: skin.hold)
+    lets_go_N: float = 8.0  # force at which the slide `away_um_mm` vanishes; chosen on both boards of scene lab
+    grip_N_mm: float = 8.75  # lateral stiffness, 7 N/mm, over friction coefficient, 0.8 (nominal.yaml: skin.hold)
     tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
@@ -57,13 +58,13 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """What all laws of a scene share: the nominal skin design, the chips' positions, and the tip."""
+    """Data that all laws of a scene share: the nominal skin design, the chips' positions, and the tip."""
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # reverse the sign of all fields, as rotating a checkerboard skin by 90 degrees does
+    skin_flipped: bool  # all fields have the opposite sign, as after a rotation of a checkerboard skin by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
 
@@ -77,7 +78,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Dipoles of the magnetised skin, whose centre is at the origin."""
+        """Dipoles of the magnetised, undeformed skin; its centre is at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -88,7 +89,7 @@ class Setup:
         )
 
     def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
-        """Tabulate the deformation of a slipping skin to the greatest depth for which forces are computed."""
+        """Tabulate the deformation of a skin that slips on its base, for depths up to the deepest press in `slide`."""
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
         return deformation.tabulate(
@@ -119,9 +120,10 @@ def simulate_uT(
     force_N: Float[np.ndarray, " n"],
     rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes at the chips, in the board's axes, for presses with these labels.
+    """Return the field changes at the chips, in the board's axes, for presses with these labelled places and forces.
 
-    `rest` replaces the setup's dipoles (at the same nodes), for example for a skin with uneven filler.
+    The law's label offset and rotation convert labelled places to true ones. `rest` replaces the setup's dipoles (at
+    the same nodes), for example for a skin with uneven filler.
     """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
@@ -140,7 +142,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes of the nominal skin: nothing is fitted, no sliding, and the force of `layer`."""
+    """Return the field changes of the nominal skin: without fitted parameters or sliding, with forces from `layer`."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -149,7 +151,7 @@ def nominal_uT(
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count presses with a force beyond the range of a law, or of the nominal skin if `law` is None."""
+    """Count presses with a force above the range of a law, or of the nominal skin if `law` is None."""
     if law is None:
         curve_N, _ = _nominal_curve(setup)
         return int((force_N > curve_N[-1]).sum())
@@ -164,7 +166,7 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
 
 
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return forces on the nominal skin and their depths, to the greatest depth for which fields are tabulated."""
+    """Return the nominal skin's forces and depths, up to the greatest depth for which fields are tabulated."""
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
     curve_N = layer.force(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
@@ -187,28 +189,32 @@ def _changes_T(
 
 
 def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
-    """Replace some parameters of a law."""
+    """Return the law with the named parameters replaced by these values."""
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Of a fit: start and means of the priors; standard deviations of the priors; scales of the parameters. Assumed.
+# Assumed values for fits. START: start values, which are also the means of the priors. PRIOR: standard deviations of
+# the priors. STEP: scales of the parameters.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-SEVEN = (*OF_BOARD, "rotation_deg")  # may differ between boards; fitted with the other parameters of another board
-PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of dB
-# Weight of the growth with force: of the mean error of log|dB| in each group, minus the mean over groups.
+# Parameters that may differ between boards. When only these are fitted, the others come from a fit to another board.
+SEVEN = (*OF_BOARD, "rotation_deg")
+PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of |dB|^2
+# Weight of the residuals that compare the growth of |dB| with force. Each group of presses has one such residual: the
+# group's mean error of log|dB|, minus the mean over all groups.
 GROWTH_WEIGHT = 10.0
 OFFSET_uT = 200.0  # standard deviation of the no-load field due to chips' offsets (spreads.chip_offset_uT)
-# Evaluations of all derivatives. The fits of scene lab need 5; reducing ftol tenfold changes the cosine by 0.0001.
+# Maximum number of least-squares steps. The fits of scene lab need 5. A tenfold smaller ftol changes the cosine between
+# simulated and recorded field changes by 0.0001.
 EVALUATIONS_MAX_N = 10
 
 
 @dataclass(frozen=True)
 class AlignedPresses:
-    """Presses on a board, with fields and places in the board's axes."""
+    """Presses on a board, with places in the board's frame and fields along the board's axes."""
 
     recorded: RecordedPresses
     place_mm: Float[np.ndarray, "n 2"]
@@ -233,7 +239,7 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
         return np.concatenate([changes.ravel(), rest.ravel(), priors, GROWTH_WEIGHT * (by_group - by_group.mean())])
 
     first = np.array([getattr(start, name) for name in names])
-    # Fields have kinks at the tabulated depths, which would disturb smaller finite differences.
+    # Simulated fields have kinks at the tabulated depths. With a smaller diff_step, kinks would distort derivatives.
     result = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )

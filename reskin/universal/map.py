@@ -1,7 +1,7 @@
 """The map: for each place and force on one skin, a Gaussian model of the reading, conditioned on the skin's data.
 
-The prior consists of tables of simulated fields, which are linear in the skin's parameters, and of a Gaussian process
-for the error of the law.
+The prior consists of tables of simulated fields, linearised in the skin's parameters, and of a Gaussian process for the
+error of the law.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ from reskin.errors import SchemaError
 from reskin.universal.kernels import Lattice, LinearMeans, in_blocks, means, whiten
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 
-PITCH_MM, STEPS_N = 0.8, 22  # of the lattice of places: pitch, and number of places along x and along y
+PITCH_MM, STEPS_N = 0.8, 22  # lattice of places: pitch, and number of places along each axis
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
-LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is that of their logarithm
+LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is the standard deviation of their logarithm
 # Standard deviations of a skin's parameters about the mean of known boards of the same rig, or about nominal parameters
 # if no board is known. Assumed, and larger than the differences between the two recorded boards.
 RIG_SPREADS = {
@@ -31,15 +31,19 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# Nominal parameters. Only the form of the law and the mean slide (`away_um_mm`) come from recorded boards. The modulus
-# is that of Dragon Skin 10 with filler (150 to 230 kPa).
+# Nominal parameters. Only the form of the law and `away_um_mm` come from recorded boards; `away_um_mm` is the slide of
+# the skin towards its centre under a press, in um per mm of distance from the centre. The modulus is that of Dragon
+# Skin 10 with filler (150 to 230 kPa).
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
-STEP = 0.4  # step of the finite differences for slopes, in units of the spreads
+STEP = 0.4  # step of the finite differences that give the slopes, in units of the parameters' spreads
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Field changes for the central parameter values, by place (board's frame) and force, and their derivatives."""
+    """Field changes and no-load field of the central law, and their derivatives with respect to the parameters.
+
+    Field changes are tabulated by place (in the board's frame) and force. Derivatives are per spread of a parameter.
+    """
 
     names: tuple[str, ...]
     spreads: Float[np.ndarray, " t"]
@@ -61,9 +65,9 @@ def lattice_mm() -> Float[np.ndarray, " a"]:
 def tabulate(
     centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
 ) -> Tables:
-    """Simulate all places and forces for the central law and for a small change of each parameter.
+    """Simulate presses at all places and forces, for the central law and with each parameter slightly changed.
 
-    These are 50,000 presses; it takes about 30 s.
+    With the default forces, these are 4,356 presses per law, 70,000 in total; the simulation takes about 30 s.
     """
     axis_mm = lattice_mm()
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -84,7 +88,7 @@ def tabulate(
 
 
 def mean_law(laws: list[Law]) -> Law:
-    """Return the prior mean for a new board of a rig: the mean of the fitted laws, but nominal seat and rotation."""
+    """Return the prior mean for a new board of a rig: the mean of the fitted laws, with seat and rotation set to 0."""
     by_name = {name: np.array([asdict(law)[name] for law in laws]) for name in asdict(laws[0])}
     means = {
         name: float(np.exp(np.log(values).mean()) if name in LOGARITHMIC else values.mean())
@@ -99,31 +103,32 @@ def perturb(centre: Law, name: str, by: float) -> Law:
     return with_parameters(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
 
 
-Relative = Float[np.ndarray, "n ch"]  # relative to |dB|
-# Length scales of the law's errors. Their correlation is 0.74 between places 2 mm apart, and 0.2 for 6 mm.
+Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
+# Length scales of the law's errors in place and in log force. The errors' correlation is 0.74 between places that are
+# 2 mm apart, and 0.2 between places that are 6 mm apart.
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
 NOISE = 0.1  # fraction of the errors' variance that differs between presses at the same place
 SHARED = 0.55  # fraction of the errors' variance that boards have in common
-EVEN = 0.5  # weight of an isotropic covariance of channels, because few boards do not determine the covariance
+EVEN = 0.5  # weight of an isotropic matrix in the covariance between channels, which few boards do not determine well
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Relative errors of the law expected on a new board, given those on known boards (a Gaussian process)."""
+    """Gaussian process that predicts the law's relative errors on a new board from its errors on known boards."""
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
     solved: Float[np.ndarray, "m ch"]  # inverse covariance of the known errors times these errors
     channel_cov: Float[np.ndarray, "ch ch"]  # covariance between channels, with a trace of 1
-    noise: float
+    noise: float  # variance of the errors that differs between presses at the same place, relative to the total
 
     def at(self, place_mm: Float[np.ndarray, "n 2"], log_N: Float[np.ndarray, " n"]) -> Relative:
-        """Return the expected errors at these places and forces."""
+        """Return the law's expected relative errors for presses at these places with these log forces."""
         return SHARED * kernel(place_mm, self.place_mm, log_N, self.log_N) @ self.solved
 
 
 def no_residual(channels_n: int) -> Residual:
-    """Return the residual without known boards: a mean of zero and the same variance in all channels."""
+    """Return the residual for the case without known boards: zero mean, and the same variance in all channels."""
     empty = np.empty((0, 2)), np.empty(0), np.empty((0, channels_n))
     return Residual(*empty, np.eye(channels_n) / channels_n, noise=NOISE / 2)
 
@@ -133,10 +138,11 @@ def fit_residual(
     force_N: Sequence[Float[np.ndarray, " b"]],
     errors: Sequence[Float[np.ndarray, "b ch"]],
 ) -> Residual:
-    """Fit a Gaussian process to the law's relative errors on known boards: a common part and a part per board.
+    """Fit a Gaussian process to the law's relative errors on known boards.
 
-    For a new board, it expects a fraction `SHARED` of the errors of a single known board, or almost the mean errors of
-    many known boards.
+    The errors on a board are the sum of a part that all boards have in common and a part of this board alone. The
+    prediction for a new board is `SHARED` times the errors on the known board if there is only one, and close to the
+    mean error if there are many.
     """
     board_i = np.repeat(np.arange(len(errors)), [len(board) for board in errors])
     at_mm, log_N, error = np.concatenate(place_mm), np.log(np.concatenate(force_N)), np.concatenate(errors)
@@ -159,20 +165,24 @@ def kernel(
 
 
 LAW_ERROR = 0.35  # relative rms error of the law before conditioning: norm over channels divided by |dB|
-NOISE_uT = 4.5  # standard deviation of a reading, per channel
+NOISE_uT = 4.5  # standard deviation of a reading's noise, per channel
 
 
 @dataclass(frozen=True)
 class Information:
-    """Information about the parameters that an unlabelled press adds under each hypothesis."""
+    """Information about the parameters from one unlabelled press, under each hypothesis about its place and force."""
 
-    matrix: Float32[np.ndarray, "h tt"]
-    per_uT: Float32[np.ndarray, "h ch t"]  # information vector per deviation of a channel from its mean
+    matrix: Float32[np.ndarray, "h tt"]  # information matrix, flattened
+    per_uT: Float32[np.ndarray, "h ch t"]  # information vector per uT by which a channel deviates from its mean
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Hypotheses: all pairs of a place and a force (the force index varies fastest), with their expected fields."""
+    """Hypotheses about a press: all pairs of a place and a force, each with its expected field change.
+
+    The force index varies fastest. residual: the law's expected relative error. error_cov: covariance of the relative
+    error between channels.
+    """
 
     place_mm: Float[np.ndarray, "p 2"]
     log_N: Float[np.ndarray, " q"]
@@ -195,7 +205,7 @@ class Hypotheses:
 
     @cached_property
     def information(self) -> Information:
-        """Information that an unlabelled press adds, with the law's error before conditioning treated as noise."""
+        """Information from an unlabelled press; the law's error (before conditioning) is treated as noise."""
         slope_uT, h = self.slope_uT.astype(float), len(self.mean_uT)
         squared_uT2 = (self.mean_uT.astype(float) ** 2).sum(axis=1)
         cov = with_noise(squared_uT2[:, None, None] * self.error_cov)
@@ -205,12 +215,12 @@ class Hypotheses:
 
     @cached_property
     def expected_uT(self) -> Float32[np.ndarray, "h ch"]:
-        """Expected fields before conditioning, including the residual from known boards."""
+        """Expected field changes before conditioning, including the residual from known boards."""
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
 
 def lattice(tables: Tables, residual: Residual) -> Hypotheses:
-    """Return the hypotheses: all places of the tables that are on the skin, each with all forces."""
+    """Return the hypotheses: all tabulated places that are on the skin, each with all tabulated forces."""
     place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     on_skin = inside(place_mm)
     log_N, channels_n = np.log(tables.force_N), len(tables.rest_uT)
@@ -223,26 +233,30 @@ def lattice(tables: Tables, residual: Residual) -> Hypotheses:
 
 
 def with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch ch"]:
-    """Add the noise of a reading to covariances."""
+    """Add the variance of a reading's noise to the diagonals of covariance matrices."""
     return cov_uT2 + NOISE_uT**2 * np.eye(cov_uT2.shape[1])
 
 
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
 SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, however many labels there are
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
-ROUNDS_N = 3  # rounds of expectation maximisation
-EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses about the centre of the labels' frame
-WEIGHT_MIN = 1e-9  # relative to the largest weight; hypotheses with less weight have no effect in single precision
+ROUNDS_N = 3  # default number of rounds of expectation maximisation
+EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
+WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates for readings: places with standard deviations, forces, and misfits of the most likely hypotheses."""
+    """Estimates for readings: places and forces with standard deviations, and misfits of the most likely hypotheses.
+
+    sd_log_N: standard deviation of the logarithm of the force; NaN if forces are not calibrated.
+    """
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
     misfit: Float[np.ndarray, " n"]  # chi^2 per channel: about 1 for a press on this skin
+    sd_log_N: Float[np.ndarray, " n"]
 
 
 def concatenate(parts: Sequence[Estimate]) -> Estimate:
@@ -254,11 +268,11 @@ def concatenate(parts: Sequence[Estimate]) -> Estimate:
 
 @dataclass(frozen=True)
 class Likelihoods:
-    """Likelihoods of hypotheses given readings."""
+    """Likelihood of each hypothesis for each reading."""
 
     chi2: Float32[np.ndarray, "n h"]
     deviance: Float32[np.ndarray, "n h"]  # -2 log likelihood, up to a constant
-    best: Int64[np.ndarray, " n"]  # the most likely hypothesis
+    best: Int64[np.ndarray, " n"]  # index of the most likely hypothesis
     channels_n: int
 
     def misfit(self) -> Float[np.ndarray, " n"]:
@@ -277,15 +291,15 @@ class LabelledErrors:
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
-    solved: Float[np.ndarray, "m ch"]  # inverse times the errors at these presses
-    inverse: Float[np.ndarray, "m m"]  # of the errors' correlation matrix
+    solved: Float[np.ndarray, "m ch"]  # inverse of the correlation matrix times the errors at these presses
+    inverse: Float[np.ndarray, "m m"]  # inverse of the errors' correlation matrix
 
 
 @dataclass(frozen=True)
 class SkinMap:
-    """Posterior of one skin: its parameters and the law's errors.
+    """Posterior distribution of one skin's parameters and of the law's errors on this skin.
 
-    mean, cov: of the parameters' deviations from the central law, in units of the spreads.
+    mean, cov: mean and covariance of the parameters' deviations from the central law, in units of their spreads.
     """
 
     tables: Tables
@@ -323,7 +337,10 @@ class MapEvaluator:
             raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
-        """Return the law's expected errors, and the fraction of their variance that remains given the labels."""
+        """Return, for each hypothesis, the law's expected relative error, and how much of its variance remains.
+
+        The second value is the fraction of the error's variance that remains after conditioning on the labels.
+        """
         expected, labelled = skin.hypotheses.residual, skin.labelled
         if labelled is None:
             return expected, np.ones(len(expected), np.float32)
@@ -334,39 +351,39 @@ class MapEvaluator:
         return (expected + k @ labelled.solved).astype(np.float32), share.astype(np.float32)
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Likelihoods:
-        """Return the likelihoods of all hypotheses given readings."""
+        """Return the likelihoods of all hypotheses for each reading."""
         chi2, deviance = self._gaussians.evaluate(db_uT.astype(np.float32))
         return Likelihoods(chi2, deviance, deviance.argmin(axis=1), db_uT.shape[1])
 
     def mean(self, likelihoods: Likelihoods, power: float) -> Estimate:
         """Estimate places and forces as means over all hypotheses, weighted by a power of their likelihoods."""
         moments = means(likelihoods.deviance, likelihoods.best, self.lattice, power)
-        return Estimate(*moments, likelihoods.misfit())
+        return Estimate(*moments, likelihoods.misfit(), np.full(len(likelihoods.best), np.nan))
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
-        """Estimate places and forces of readings as means over all hypotheses."""
+        """Estimate places and forces of readings as means over all hypotheses, weighted by their likelihoods."""
         starts = range(0, len(db_uT), block_n)
         return concatenate([self.mean(self.evaluate(db_uT[i : i + block_n]), 1.0) for i in starts])
 
 
 def new_map(tables: Tables, residual: Residual | None = None) -> SkinMap:
-    """Return the prior map; `residual` is the law's expected error, from other boards of the rig."""
+    """Return the prior map; `residual` predicts the law's errors from its errors on other boards of the rig."""
     t, expected = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
     return SkinMap(tables, expected, lattice(tables, expected), np.zeros(t), np.eye(t))
 
 
 def condition_on_noload(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> SkinMap:
-    """Condition on the no-load field."""
+    """Condition the map on a skin's no-load field."""
     tables = skin.tables
     return _condition(skin, tables.rest_slope_uT, noload_uT - tables.rest_uT, np.full(len(noload_uT), OFFSET_uT**2))
 
 
 def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds_n: int = ROUNDS_N) -> SkinMap:
-    """Condition on presses at unknown places, by expectation maximisation over their places and forces."""
+    """Condition the map on presses at unknown places, by expectation maximisation over their places and forces."""
     information, expected_uT, posterior = skin.hypotheses.information, skin.hypotheses.expected_uT, skin
     for _ in range(rounds_n):
         weight = PRESS_WEIGHT * posterior.evaluator.evaluate(db_uT).probabilities()
-        total = weight.sum(axis=0)  # over presses, for each hypothesis
+        total = weight.sum(axis=0)  # sum over presses for each hypothesis
         kept = np.flatnonzero(total > WEIGHT_MIN * total.max())
         off_uT = weight[:, kept].T @ db_uT.astype(np.float32) - total[kept][:, None] * expected_uT[kept]
         matrix = (total[kept] @ information.matrix[kept]).reshape(skin.cov.shape)
@@ -376,7 +393,7 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
 
 
 def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -> SkinMap:
-    """Condition on evenly spread presses, whose mean place is assumed to be the centre of the labels' frame."""
+    """Condition the map on evenly spread presses; their mean place is assumed to be the centre of the labels' frame."""
     label_i = [skin.tables.names.index(name) for name in ("label_x_mm", "label_y_mm")]
     spread_mm = skin.tables.spreads[label_i]
     row = np.zeros((2, len(skin.mean)))
@@ -394,7 +411,7 @@ def condition_on_labels(
     force_N: Float[np.ndarray, " m"],
     db_uT: Float[np.ndarray, "m ch"],
 ) -> SkinMap:
-    """Condition on labelled presses: first the parameters, then the law's errors near these presses."""
+    """Condition on labelled presses: first the skin's parameters, then the law's errors near these presses."""
     if not len(place_mm):
         return skin
     mean_uT, slope_uT, expected = interpolate(skin, place_mm, force_N)
@@ -403,7 +420,7 @@ def condition_on_labels(
     root = np.linalg.cholesky(k)
     deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
     slope = slope_uT / magnitude_uT[:, None, None]
-    # Errors are correlated between presses (k) and between channels (error_cov): whiten both.
+    # The law's errors are correlated between presses (k) and between channels (error_cov): whiten over both.
     white = solve_triangular(
         root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
     )
@@ -423,7 +440,7 @@ def _condition(
 
 
 def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
-    """Add observations, given in information form, to the Gaussian of the parameters."""
+    """Condition the Gaussian of the parameters on observations, given as information matrix and information vector."""
     prior = np.linalg.inv(skin.cov)
     cov = np.linalg.inv(prior + matrix)
     return replace(skin, mean=cov @ (prior @ skin.mean + vector), cov=(cov + cov.T) / 2)
@@ -432,7 +449,7 @@ def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Fl
 def interpolate(
     skin: SkinMap, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m ch t"], Relative]:
-    """Interpolate means and slopes linearly in place and log F; return them and the expected relative errors."""
+    """Interpolate tabulated means and slopes linearly in place and log F; also return the law's expected errors."""
     tables = skin.tables
     axes = tables.axis_mm, tables.axis_mm, np.log(tables.force_N)
     points = np.column_stack([place_mm, np.log(force_N)])
@@ -457,7 +474,7 @@ def expected_gain(
     """Return how much a labelled press at each place would reduce the variance of the field changes over the skin.
 
     The variance is that of field changes divided by |dB|, given earlier labels. It is summed over channels and averaged
-    over all places of the map, at the median of its forces.
+    over all places of the map, each with the median of the tabulated forces.
     """
     hypotheses, error_cov, gains = skin.hypotheses, skin.error_cov, []
     median_force = slice(len(hypotheses.log_N) // 2, None, len(hypotheses.log_N))

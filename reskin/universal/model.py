@@ -9,11 +9,11 @@ recorded boards. It takes readings along the chips' axes, and its places are in 
 board's centre is at (8, 8) mm.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,12 +33,14 @@ from reskin.universal.calibration import (
     check_readings,
     check_shape,
     folds_of_labels,
+    join_labels,
     lower_by_misfit,
     lower_by_residuals,
     read_calibration,
     variance_inflations,
     write_calibration,
 )
+from reskin.universal.force import ESTIMATORS, LOG_CENTRE_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
@@ -62,27 +64,28 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
-FADES_PER_LABEL = 0.15  # each label weakens the centring of the networks' places, because labels determine it better
-OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of single errors about it
-MISFIT_MAX = 4.0  # chi^2 per channel, assumed; skins like those in training have about 1
-BLOCK_N = 200  # readings per block, to bound memory
+FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
+MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
-REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # least and largest x and y, relative to the centre
-CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next press
+REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # rows: least and largest x and y, relative to the board's centre
+CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Readings evaluated by map and networks; estimates with any likelihood power are computed from it.
+    """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The power affects standard deviations and, in `by_map`, also places and forces.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces.
     """
 
     evaluator: MapEvaluator
     likelihoods: Likelihoods
     network: NetworkEstimate
+    line: ForceLine
 
     __repr__ = one_line
 
@@ -92,38 +95,53 @@ class Evaluation:
 
     def by_network(self, power: float) -> Estimate:
         """Estimate with the networks alone; their misfit is NaN."""
-        own = self.network
-        return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), np.full(len(own.log_N), np.nan))
+        own, unknown = self.network, np.full(len(self.network.log_N), np.nan)
+        return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), unknown, unknown)
 
     def combined(self, power: float) -> Estimate:
         """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
 
         The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
-        are computed from a power of the product.
+        are computed from a power of the product. Forces are calibrated by the skin's line.
         """
+        place_mm, sd_mm, by_estimator = self._products(power)
+        log_N, sd_log_N = self.line.apply(by_estimator[ESTIMATORS.index(self.line.estimator)])
+        return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
+
+    def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
+        """Return the log forces of each of `ESTIMATORS` before their calibration."""
+        return self._products(1.0)[2]
+
+    def _products(self, power: float) -> tuple[np.ndarray, np.ndarray, Sequence[Float[np.ndarray, " n"]]]:
         normals = np.empty((len(self.network.log_N), 6))
         normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
         np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
         np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
         likelihoods = self.likelihoods
-        moments = products(likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power)
-        return Estimate(*moments, likelihoods.misfit())
+        place_mm, sd_mm, force_N, map_log_N = products(
+            likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power
+        )
+        return place_mm, sd_mm, (np.log(force_N), map_log_N, np.full(len(map_log_N), LOG_CENTRE_N))
 
 
 @dataclass(frozen=True)
 class CalibratedModel:
-    """Map and networks, calibrated to one skin; `offsets_mm` are added to the networks' places one after the other."""
+    """Map and networks, calibrated to one skin.
+
+    offsets_mm: corrections that are added to the networks' places, one after the other. line: calibration of forces.
+    """
 
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
+    line: ForceLine = field(default_factory=prior_line)
 
     __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
         """Return the model with its offsets added to the networks' last biases: faster, but in single precision."""
         offset_mm = sum(self.offsets_mm, np.zeros(2))
-        return CalibratedModel(self.skin, [shift_places(layers, offset_mm) for layers in self.networks], ())
+        return replace(self, networks=[shift_places(layers, offset_mm) for layers in self.networks], offsets_mm=())
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[float]) -> list[Estimate]:
         """Estimate places and forces with map and networks, once for each likelihood power."""
@@ -140,14 +158,35 @@ class CalibratedModel:
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
         """Evaluate map and networks on a block of readings."""
         evaluator = self.skin.evaluator
-        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT))
+        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line)
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-        """Estimate with the networks alone."""
+        """Estimate places and forces with the networks alone, with the offsets added to the places."""
         estimate = network.evaluate(self.networks, db_uT)
         for offset_mm in self.offsets_mm:
             estimate = replace(estimate, place_mm=estimate.place_mm + offset_mm)
         return estimate
+
+
+class HeldOutLabels(NamedTuple):
+    """Labelled presses, and their evaluation by a model that was calibrated without them."""
+
+    labels: LabelledPresses
+    evaluation: Evaluation
+
+
+def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
+    """Fit the calibration of forces to the labels whose force is known."""
+    pairs = [(fold.labels, fold.evaluation.log_forces()) for fold in folds]
+    known = [slice(None) if labels.force_known is None else labels.force_known for labels, _ in pairs]
+    true_N = [labels.force_N[which] for (labels, _), which in zip(pairs, known, strict=True)]
+    if not sum(map(len, true_N)):
+        return prior_line()
+    by_estimator = [
+        np.concatenate([log_N[i][which] for (_, log_N), which in zip(pairs, known, strict=True)])
+        for i in range(len(ESTIMATORS))
+    ]
+    return fit_line(by_estimator, np.log(np.concatenate(true_N)))
 
 
 @dataclass(frozen=True)
@@ -162,7 +201,7 @@ class PressCalibration:
 
     @cached_property
     def layers(self) -> list[Layers]:
-        """The conditioned networks."""
+        """The networks, conditioned on the skin's no-load field and its presses at unknown places."""
         return [network.condition(weights, self.data.rest_uT, self.data.presses_uT) for weights in self.networks]
 
     @cached_property
@@ -171,10 +210,16 @@ class PressCalibration:
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
     def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
-        """Condition on labelled presses."""
+        """Condition the map on labelled presses, and compute the offsets of the networks' places from them."""
         skin = condition_on_labels(self.skin, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
         return CalibratedModel(skin, self.layers, network_offsets_mm(self.even_mm, estimated_mm, labels.place_mm))
+
+    def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
+        """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
+        for kept, held_out in folds_of_labels(len(labels)):
+            model = self.with_labels(labels[kept]).with_offsets_in_biases()
+            yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
 
 
 @dataclass(frozen=True)
@@ -193,7 +238,7 @@ class PriorModel:
 
 
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
-    """Condition a map on presses at unknown places, then on the evenly spread ones."""
+    """Condition a map on presses at unknown places, then on the presses that are evenly spread over the skin."""
     skin = noload_map
     if len(data.presses_uT):
         skin = condition_on_presses(skin, data.presses_uT)
@@ -205,11 +250,11 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 def network_offsets_mm(
     even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return two corrections to add to the networks' places.
+    """Return two corrections to add to the places that the networks estimate.
 
-    The first moves the mean of the evenly spread presses (`even_mm`) towards the centre, by less the more labels there
-    are. The second is the mean error that then remains for labelled presses, which the networks estimate at
-    `estimated_mm`; it is shrunk by a Gaussian prior with mean zero.
+    The first correction moves the mean of `even_mm`, the estimated places of evenly spread presses, towards the centre.
+    Its size decreases with the number of labels. The second correction is the mean error that then remains for labelled
+    presses (estimated at `estimated_mm`, truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
     """
     centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -218,7 +263,7 @@ def network_offsets_mm(
 
 @dataclass
 class Universal:
-    """The model for the paper's board that comes with the project; it can be calibrated during use.
+    """The universal model that comes with the project, for the paper's board; it can be calibrated during use.
 
     First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
     presses at known places, in any order and any number of times. Each of these three methods changes the model in
@@ -240,10 +285,12 @@ class Universal:
         self._noload_uT: np.ndarray | None = None
         self._prior_map = new_map(self.tables)
         self._noload_map: SkinMap
-        self._misfits: np.ndarray  # of the unlabelled presses
+        self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        self._power: float | None  # None: not computed yet
+        self._folds: list[HeldOutLabels] | None  # of the labels; None: not computed yet
+        self._power: float | None
+        self._line: ForceLine | None
         self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
 
     def __repr__(self) -> str:
@@ -283,7 +330,10 @@ class Universal:
 
     @property
     def misfit(self) -> float:
-        """Median chi^2 per channel of unlabelled presses: about 1 for skins as in training; 1 if there are too few."""
+        """Median chi^2 per channel of unlabelled presses: about 1 for skins like those in training.
+
+        The value is 1 if there are too few presses.
+        """
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
@@ -292,7 +342,7 @@ class Universal:
 
         With a power of 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
         """
-        if self._power is None:  # cross-validation is slow, so it runs only when needed, and once per data set
+        if self._power is None:
             data = self._data
             tabulated = self.powers.power_for(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
@@ -301,11 +351,18 @@ class Universal:
             self._power = power
         return self._power
 
-    def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
-        """Take the mean of readings without contact as the no-load field, and condition the map on it.
+    @property
+    def line(self) -> ForceLine:
+        """Calibration of forces, from the labelled presses whose force is known."""
+        if self._line is None:
+            self._line = line_of_labels(self._held_out())
+        return self._line
 
-        Earlier presses are discarded, unless `keep` is set, as it should be for the same skin after drift. The model
-        is changed in place and returned.
+    def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
+        """Set the no-load field to the mean of readings without contact, and condition the map on it.
+
+        Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
+        already calibrated to. The model is changed in place and returned.
 
         Raises
         ------
@@ -322,9 +379,10 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
-        Use dozens of presses all over the skin, in one or several calls. The first set is used in several rounds of
-        estimation, later sets in one. Set `even` if these and all earlier presses together are evenly spread over the
-        skin (for example a grid with one press per place), so that their mean place is the skin's centre.
+        Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
+        expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
+        presses together are evenly spread over the skin (for example a grid with one press per place), so that their
+        mean place is the skin's centre.
         """
         db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
@@ -342,10 +400,13 @@ class Universal:
         b_uT: Float[np.ndarray, "*m ch"],
         *,
         keep: bool = False,
+        force_known: bool = True,
     ) -> "Universal":
         """Calibrate to one or several presses at known places with known forces.
 
-        Earlier labels are discarded, unless `keep` is set.
+        Earlier labels are discarded, unless `keep` is set. If only the places are known, pass estimated forces and
+        `force_known=False`: forces are then not calibrated to these presses. A single press of known force, such as a
+        weight on the middle of the skin, calibrates the forces of the whole skin.
 
         Raises
         ------
@@ -359,12 +420,9 @@ class Universal:
         )
         check_range(forces_N, self.tables.force_N)
         db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
-        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT)
+        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT, np.full(len(forces_N), force_known))
         if keep:
-            labels = LabelledPresses(
-                np.concatenate([before.place_mm, labels.place_mm]), np.concatenate([before.force_N, labels.force_N]),
-                np.concatenate([before.db_uT, labels.db_uT]),
-            )  # fmt: skip
+            labels = join_labels(before, labels)
             check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # all labels together may be too many
         data, press_map = replace(self._data, labels=labels), self._calibration.skin
         if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
@@ -397,17 +455,21 @@ class Universal:
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return the result of `estimate` for each likelihood power; only the standard deviations differ."""
-        estimates = self._model.estimate(self._change(b_uT), powers)
+        """Return the result of `estimate` for each likelihood power; only the places' standard deviations differ."""
+        estimates = replace(self._model, line=self.line).estimate(self._change(b_uT), powers)
         return [replace(estimate, place_mm=estimate.place_mm + CENTRE_MM) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
         """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
-        labels, folds = self._data.labels, []
-        for kept, held_out in folds_of_labels(len(labels)):
-            model = self._calibration.with_labels(labels[kept]).with_offsets_in_biases()
-            folds.append((model.estimate(labels.db_uT[held_out], powers), labels.place_mm[held_out]))
+        folds = [
+            ([fold.evaluation.combined(power) for power in powers], fold.labels.place_mm) for fold in self._held_out()
+        ]
         return variance_inflations(len(powers), folds)
+
+    def _held_out(self) -> list[HeldOutLabels]:
+        if self._folds is None:  # cross-validation is slow, so it runs only when needed, and once per set of labels
+            self._folds = list(self._calibration.held_out(self._data.labels))
+        return self._folds
 
     def save(self, file: Path | str) -> None:
         """Write this skin's calibration data to a file for `load_universal(file)`; raise SchemaError before `zero`."""
@@ -434,19 +496,19 @@ class Universal:
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate to all data, given the map that is conditioned on the no-load field only."""
+        """Calibrate to `data` from scratch, starting with a map that is conditioned on the no-load field only."""
         self._noload_map = noload_map
         self._misfits = np.full(len(data.presses_uT), np.nan)
         return self._set(condition_on_unlabelled(noload_map, data), data)
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Set the map that is conditioned on the unlabelled presses, and condition it on the labels."""
+        """Replace the calibration: `press_map` is conditioned on the unlabelled presses, and now on the labels."""
         missing = np.isnan(self._misfits)
-        if missing.any():  # a press keeps the misfit that it has in the first map conditioned on it
+        if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
             self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
-        self._power = None
+        self._folds = self._power = self._line = None
         return self
 
 

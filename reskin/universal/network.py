@@ -17,14 +17,14 @@ Weights = Mapping[str, np.ndarray]
 
 LAYERS_N = 3
 DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale the inputs dB/|dB|, log|dB| and no-load field to about 1
-LENGTH_MIN_uT = 1.0  # least |dB| by which dB is divided, so that tiny changes have no direction
+LENGTH_MIN_uT = 1.0  # if |dB| is smaller, dB is divided by this value instead, so that tiny changes have no direction
 PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
 LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
-FULL_SET_N = 65  # maximum number of unlabelled presses for conditioning, in training and use
+FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled presses
 
 
 class Layers(NamedTuple):
-    """Weights and biases of a network after it is conditioned on a skin."""
+    """Weights and biases of the layers of a network that is conditioned on a skin."""
 
     weight: tuple[Float32[np.ndarray, "_ _"], ...]
     bias: tuple[Float32[np.ndarray, " _"], ...]
@@ -76,7 +76,7 @@ def predict(
     rest_uT: Float[np.ndarray, " ch"],
     presses_uT: Float[np.ndarray, "c ch"],
 ) -> NetworkEstimate:
-    """Condition networks on a skin and evaluate them."""
+    """Condition networks on a skin, and estimate places and forces of readings with them."""
     return evaluate([condition(weights, rest_uT, presses_uT) for weights in networks], db_uT)
 
 
@@ -94,7 +94,7 @@ def to_tensors(networks: Sequence[Weights]) -> dict[str, np.ndarray]:
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> list[Weights]:
-    """Return the networks' weights, in order, from the arrays of a file."""
+    """Return the weights of each network from the named arrays of a file, in the networks' order."""
     networks: dict[int, dict[str, np.ndarray]] = {}
     for key, value in tensors.items():
         i, _, name = key.partition(".")
@@ -124,7 +124,7 @@ def _linear(weights: Weights, name: str) -> tuple[np.ndarray, np.ndarray]:
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _fill_inputs(db_uT, values):
-    # Direction and log length of a field change, scaled to about 1.
+    # Write the direction and the log length of a field change to `values`, scaled to about 1.
     length2 = 0.0
     for i in range(len(db_uT)):
         length2 += db_uT[i] ** 2

@@ -1,7 +1,7 @@
 """Simulated skins with random parameters around those of a central law, and presses on each skin.
 
-Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here but at each
-training step, so that training never uses the same skin twice.
+Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here: each training
+step draws them again, so that a skin never has the same field changes twice.
 """
 
 from collections.abc import Mapping
@@ -16,20 +16,21 @@ from reskin.physics.magnet import Quadrature
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT
 from reskin.universal.map import LOGARITHMIC, perturb
 
-COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # coarser than `law.RULE`, because the law itself has larger errors
-PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most as many presses
+COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # coarser than `law.RULE`; the law itself has larger errors
+PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most this number of presses
 PRESSES_N = 2 * PLACES_N  # presses per skin: half for conditioning, half for training
-PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press about its grid place
-ANYWHERE_SHARE = 0.5  # fraction of the training presses that are anywhere on the skin; the others are on the grid
+PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press from its grid place
+ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
-# Variation of boards and skins in addition to that of the law's parameters. Assumed, as are the parameters' spreads.
+# Variation of boards and skins in addition to that of the law's parameters. These values and the parameters' spreads
+# are assumed.
 THICKNESSES_MM = {1.8: 0.07, 1.9: 0.24, 2.0: 0.38, 2.1: 0.24, 2.2: 0.07}  # mm: probability
 TIPS_MM = {1.75: 0.25, 2.0: 0.5, 2.5: 0.25}  # radius, mm: probability
-LOG_AMPLITUDE_PER_MM = 0.95  # fits give a larger amplitude with a larger gap, because the effects compensate
-# Local variation of the log magnetisation: standard deviation, length scale, and number of cosines in the sum.
+LOG_AMPLITUDE_PER_MM = 0.95  # in fits, a larger gap comes with a larger amplitude, because their effects compensate
+# Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
-# Least values: chips are not inside the skin, and the displacement towards the centre is not negative.
+# Least values of drawn parameters: chips must not be inside the skin, and the skin must not slide away from its centre.
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}
 
 
@@ -37,8 +38,8 @@ LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}
 class Forces:
     """Distribution of the forces of presses: log-uniform from `least_N` to `largest_N`.
 
-    A fraction `light_share` is log-uniform from `light_N` to `least_N` instead. weight_N: force of an additional press
-    at the centre, if any.
+    A fraction `light_share` of the presses has a force that is log-uniform from `light_N` to `least_N` instead.
+    weight_N: force of an additional press at the centre, if any.
     """
 
     least_N: float = 0.5
@@ -78,7 +79,7 @@ def draw_population(
 ) -> Population:  # fmt: skip
     """Simulate skins around a central law, with 130 presses each (40 ms per skin).
 
-    `skins` is their number, or a slice of a longer sequence of skins.
+    `skins` is the number of skins, or a slice that selects some skins of a longer sequence.
     """
     setups = {
         (thickness_mm, tip_mm): replace(
@@ -89,7 +90,7 @@ def draw_population(
         for tip_mm in TIPS_MM
     }  # fmt: skip
     parts, selected = [], skins if isinstance(skins, slice) else slice(skins)
-    for skin_rng in rng.spawn(selected.stop)[selected]:  # drawing more skins does not change the first ones
+    for skin_rng in rng.spawn(selected.stop)[selected]:  # one per skin: the first skins do not depend on the number
         law = draw_law(centre, spreads, skin_rng)
         thickness_mm, tip_mm = (
             float(skin_rng.choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES_MM, TIPS_MM)
@@ -99,7 +100,7 @@ def draw_population(
 
 
 def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator) -> Law:
-    """Draw a skin's parameters around those of a central law; the amplitude is correlated with the gap."""
+    """Draw the parameters of a skin around those of a central law; the amplitude is correlated with the gap."""
     law = centre
     for name, spread in spreads.items():
         law = perturb(law, name, spread * rng.standard_normal())
@@ -126,19 +127,22 @@ def draw_skin(
 
 
 def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
-    """Draw places of presses in mm from the board's centre: the whole grid, then half of it, then places anywhere."""
+    """Draw places of presses in mm from the board's centre.
+
+    The order is: all places of the grid, half of them again, and places anywhere on the skin.
+    """
     grid_mm = grid()
     anywhere_n = int(PLACES_N * ANYWHERE_SHARE)
     repeated_mm = grid_mm[rng.permutation(PLACES_N)[anywhere_n:]]
     near_mm = np.concatenate([grid_mm, repeated_mm])
     near_mm = near_mm + JITTER_MM * rng.standard_normal(near_mm.shape)
     limit_mm = np.abs(grid_mm).max() + 0.3
-    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # about 85 % of them are inside
+    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # about 85 % of these are on the skin
     return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm)][:anywhere_n]])
 
 
 def grid() -> Float[np.ndarray, "65 2"]:
-    """Return the paper's grid in mm from its centre: 9 x 9 places without those in the corners."""
+    """Return the places of the paper's grid in mm from its centre: 9 x 9 places without four in each corner."""
     step = np.arange(-4, 5)
     steps = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
     return PITCH_MM * steps[np.abs(steps).min(axis=1) <= 2].astype(float)

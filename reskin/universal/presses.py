@@ -1,4 +1,7 @@
-"""Presses on a recorded board: mean field changes, noise, agreement with a simulation, growth with force and memory."""
+"""Presses on a recorded board: mean field changes, noise, and statistics to compare them with a simulation.
+
+The statistics are cosine, explained fraction, growth of the field change with force, and memory of the last press.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +15,8 @@ from reskin.schema import AXES_PER_CHIP_N, Readings
 # Degree of the polynomial for drift. In scene lab, the estimated memory is 10 % smaller with degree 8 and 50 % smaller
 # with degree 12, because the polynomial then also fits the memory.
 DRIFT_DEGREE = 4
-SERIES_MIN_N = 20  # least number of presses in a capture from which the memory is estimated
-SPREAD_MIN = 0.2  # least range of log F at a place from which the growth is estimated
+SERIES_MIN_N = 20  # captures with fewer presses are not used to estimate the memory
+SPREAD_MIN = 0.2  # places with a smaller range of log F are not used to estimate the growth
 
 
 @dataclass(frozen=True)
@@ -31,15 +34,15 @@ class RecordedPresses:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    noise_uT: Float[np.ndarray, "3"]  # standard deviation of readings about the mean of their press, by axis
-    excluded_n: int  # presses without a known place or a force above 0 N
+    noise_uT: Float[np.ndarray, "3"]  # standard deviation of readings from the mean of their press, along x, y and z
+    excluded_n: int  # number of excluded presses: unknown place, or force unknown or not above 0 N
 
     def __len__(self) -> int:
         return len(self.force_N)
 
 
 def pool(captures: Sequence[Readings]) -> RecordedPresses:
-    """Pool the presses of all captures of one skin on one board, in their order."""
+    """Combine the presses of all captures of one skin on one board, in the order of the captures."""
     parts = [_means(readings) for readings in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
@@ -82,7 +85,7 @@ def _means(readings: Readings) -> tuple[np.ndarray, ...]:
 
 
 def magnitudes_uT(db_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Return for each press |dB|, the norm over all channels."""
+    """Return |dB| of each press, the norm of its field change over all channels."""
     return np.linalg.norm(db_uT.reshape(len(db_uT), -1), axis=1)
 
 
@@ -97,7 +100,7 @@ def explained(simulated_uT: Float[np.ndarray, "n k 3"], recorded_uT: Float[np.nd
 
 
 def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Return d log|dB| / d log F, as the median over places; None if the force varies too little at every place."""
+    """Return the median over places of d log|dB| / d log F; None if the force varies too little at every place."""
     log_F, log_uT = np.log(presses.force_N), np.log(magnitudes_uT(db_uT))
     slopes = []
     for place in np.unique(presses.place_mm.round(2), axis=0):
@@ -111,17 +114,18 @@ def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float
 def memory(
     presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]
 ) -> float | None:
-    """Return the fraction of a press's field change that remains in the next no-load reading; None without data.
+    """Return the fraction of a press's field change that remains in the next no-load reading.
 
-    It is the mean over captures of a least-squares coefficient. The other regressors are the field change of the next
-    press and a polynomial for drift. Captures that are too short, or that repeat no-load readings, are skipped.
+    For each capture, no-load readings are regressed on the previous press's field change, the next press's field change
+    and a polynomial for drift; the result is the mean of the first coefficient. Captures are skipped if they are too
+    short or if successive presses have the same no-load reading. Returns None if no capture is left.
     """
     coefficients = []
     for capture_i in np.unique(presses.capture_i):
         own = np.flatnonzero(presses.capture_i == capture_i)
         rest = noload_uT[own].reshape(len(own), -1)
         if len(own) < SERIES_MIN_N or (np.diff(rest, axis=0) == 0).all(axis=1).any():
-            continue  # too short, or no-load readings were not taken before each press
+            continue  # too short, or without a no-load reading before each press
         drift = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(own) - 1), DRIFT_DEGREE)
         db = db_uT[own].reshape(len(own), -1)
         residuals = [part - drift @ np.linalg.lstsq(drift, part)[0] for part in (rest[1:], db[:-1], db[1:])]

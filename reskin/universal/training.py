@@ -36,12 +36,12 @@ from reskin.universal.network import (
 )
 from reskin.universal.population import PLACES_N, PRESSES_N, Population, draw_population
 
-FILM_SD = 0.02  # standard deviation of initial FiLM weights, small so that the code has little effect at first
+FILM_SD = 0.02  # standard deviation of initial FiLM weights; it is small so that the code has little effect at first
 OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
 
 
 class Network(nn.Module):
-    """Set encoder and regressor in PyTorch; the weights have the names of `draw_weights`."""
+    """Set encoder and regressor in PyTorch; the names of the weights are those from `draw_weights`."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
@@ -51,7 +51,10 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Return the code of each skin from those presses for which `kept` is 1; without any, the pooled value is 0."""
+        """Compute the code of each skin from the presses for which `kept` is 1.
+
+        If there are no such presses, the pooled features are 0.
+        """
         features = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
         features = torch.relu(self._linear("set2", features)) * kept[..., None]
         kept_n = kept.sum(1, keepdim=True)
@@ -77,7 +80,8 @@ class Network(nn.Module):
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
     """Return direction and log magnitude of each field change, and the skin's no-load field, scaled to about 1.
 
-    NumPy is used because `torch.log` differs between processors. No gradients with respect to readings are needed.
+    NumPy is used because the results of `torch.log` differ between processors. The result has no gradients; training
+    needs none, because inputs do not depend on weights.
     """
     db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
     length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
@@ -103,13 +107,14 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
     return weights
 
 
-SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # total number; those of recorded boards, if there are any
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins per step; recorded ones among them, if any
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
-NO_PRESSES_SHARE = 0.25  # fraction of skins without presses for conditioning; the others have 1 to 65
-NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading, by axis
-RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor from 0 to this
-# Ranges of the law's relative rms error: for skins simulated with and without known boards, and for recorded boards.
+NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; else 1 to 65 presses
+NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading's noise along x, y and z
+RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor between 0 and this value
+# Ranges from which the law's relative rms error is drawn: for simulated skins of a prior made with known boards, for
+# simulated skins of the nominal prior, and for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
 ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales in place and log F; number of cosines
 NOMINAL_NAME = "nominal"  # name of the prior that uses no recorded board
@@ -125,7 +130,7 @@ class TrainingSettings(Strict):
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """Readings of a recorded board in its frame and axes, the same number for each press."""
+    """Readings of a recorded board in the board's frame and axes, with the same number of readings for each press."""
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -138,8 +143,8 @@ class SkinPrior:
     """Distribution of the skins that networks are trained on.
 
     Skins are simulated with parameters around those of a central law. If boards of the rig were recorded, `recorded`
-    has their readings and `residual` the law's errors on them. follows_law: whether skins follow the law exactly, as in
-    a simulated scene.
+    has their readings and `residual` predicts the law's errors from those on these boards. follows_law: True if skins
+    follow the law exactly, as in a simulated scene, so that no errors are added.
     """
 
     name: str
@@ -153,10 +158,10 @@ class SkinPrior:
 
 @dataclass(frozen=True)
 class Batch:
-    """Skins of one training step.
+    """Skins of one training step, with the presses on each skin.
 
-    The network is conditioned on those of the first `PLACES_N` presses for which `kept` is 1, and trained to predict
-    `target` for all later presses.
+    The first `PLACES_N` presses of a skin serve for conditioning: the network is conditioned on those for which `kept`
+    is 1. It is trained to predict `target` (scaled x, y and log F) for the other presses.
     """
 
     db_uT: Float32[np.ndarray, "b m ch"]
@@ -166,7 +171,7 @@ class Batch:
 
 
 def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
-    """Draw skins, train networks on them one after the other, and return the networks' weights."""
+    """Simulate skins of a prior, train networks on them one after the other, and return the networks' weights."""
     rng = rng_for(seed, "universal", prior.name, "skins")
     skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng)
     names = ("universal", prior.name, "network")
@@ -175,7 +180,7 @@ def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> l
 
 def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Train one network and return its weights."""
-    torch.set_num_threads(1)  # with several threads, the order of summation would vary
+    torch.set_num_threads(1)  # with several threads, the order of summation and thus the result would vary
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
     optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
@@ -197,7 +202,8 @@ def loss_of(network: Network, batch: Batch) -> torch.Tensor:
     set_n = kept.shape[1]
     mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
-    # The likelihood trains only the standard deviations. If it also trained the means, hard presses would be ignored.
+    # The likelihood trains only the standard deviations. If it also trained the means, presses with large errors would
+    # have little influence on them, because the network would predict large standard deviations there.
     deviation = (mean - target).detach()
     return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * exp(-2 * log_sd)).mean()
 
@@ -239,14 +245,17 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw one reading for each of 130 presses of a recorded board; if it has fewer presses, some repeat."""
+    """Draw 130 presses of a recorded board (some repeatedly if it has fewer), and one reading of each."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw which presses of each skin the network is conditioned on: none for some skins, 1 to 65 for the others."""
+    """Draw which presses of each skin the network is conditioned on (1: yes, 0: no).
+
+    A fraction `NO_PRESSES_SHARE` of the skins has no such press; the others have 1 to 65.
+    """
     kept_n = np.where(rng.random(n) < NO_PRESSES_SHARE, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
     return (rank < kept_n[:, None]).astype(np.float32)
@@ -261,8 +270,8 @@ def add_error(
 ) -> Float32[np.ndarray, "b m ch"]:
     """Add a random error of the law that is smooth in place and log F.
 
-    Half of the error is proportional to |dB| at the chip, and half to |dB| over all chips. size: bounds of the relative
-    rms error, which is drawn for each skin.
+    Half of a channel's error is proportional to |dB| at its chip, half to |dB| over all chips. size: bounds between
+    which the relative rms error of each skin is drawn.
     """
     skins_n, _, channels_n = db_uT.shape
     rms = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
@@ -272,7 +281,7 @@ def add_error(
     coordinates = np.concatenate([place_mm, log_N[..., None]], axis=-1)
     phase = rng.uniform(0, 2 * np.pi, (skins_n, 1, ERROR_WAVES_N)).astype(np.float32)
     amplitude = rng.standard_normal((skins_n, ERROR_WAVES_N, channels_n), np.float32)
-    unit = np.cos(coordinates @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # its variance is 1
+    unit = np.cos(coordinates @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # unit variance
     chips = db_uT.reshape(*db_uT.shape[:2], -1, len(NOISE_uT))
     chip_scale = np.repeat(np.linalg.norm(chips, axis=-1), len(NOISE_uT), axis=-1) / np.sqrt(np.float32(len(NOISE_uT)))
     total_scale = np.linalg.norm(db_uT, axis=-1, keepdims=True) / np.sqrt(np.float32(channels_n))

@@ -208,7 +208,7 @@ def test_weight_share_belongs_to_the_calibrated_power(skins, monkeypatch):
             reach = 10.0 if power == BOARD_POWERS[1] else 0.0
             true_mm = np.vstack([skin.true[:, :2], [[0, 0]]])
             force_N = np.append(skin.true[:, 2] * np.exp(power), skin.weight.force_N * np.exp(0.1))
-            fake = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, np.full(len(force_N), np.nan))
+            fake = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, *np.full((2, len(force_N)), np.nan))
             found.append(dict.fromkeys(WAYS, fake))
         return found
 

@@ -182,7 +182,9 @@ def test_path_of_material_follows_the_flow():
     # 2 um: error of the spline between the nodes of the flow, while the material moves by up to 1 mm
     np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
     np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
-    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
+    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[
+        :, :2
+    ]  # components of the rotation from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 

@@ -180,7 +180,7 @@ def test_other_units_of_targets_scale_the_predictions(method, seed, power):
 def test_shifted_places_shift_the_predictions(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    target = np.round(target * 64) / 64  # so that the shift causes no rounding
+    target = np.round(target * 64) / 64  # multiples of 1/64 mm, which are still exact after the shift
     found = fit_to(method, db_uT, target).predict(query_uT)
     other = fit_to(method, db_uT, target + np.float32(shift_mm)).predict(query_uT)
     # additional tolerance: shifted predictions of up to 500 mm are rounded to float32 (6e-8)

@@ -146,7 +146,8 @@ def test_data_of_each_loss_term_changes_the_weights(name):
 
 
 def test_unlabelled_pokes_train_the_feature_layers_only():
-    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # no clipping, which would scale all layers
+    # one large step without clipping, which would scale the gradients of all layers
+    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
@@ -156,7 +157,7 @@ def test_unlabelled_pokes_train_the_feature_layers_only():
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
 def test_curve_is_the_mean_loss_of_each_block(steps_n):
-    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # so that the weights hardly change
+    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # a rate with which the weights hardly change
     job = some_job()
     (outcome,) = run([job], schedule)
     feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []

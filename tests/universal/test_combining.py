@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from reskin.seeds import rng_for
+from reskin.universal.force import prior_line
 from reskin.universal.map import SkinMap, new_map
 from reskin.universal.model import LABEL_SD_MM, OFFSET_SD_MM, Evaluation, network_offsets_mm
 from reskin.universal.network import NetworkEstimate
@@ -20,7 +21,7 @@ def skin() -> SkinMap:
 def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: float = 1.0) -> Evaluation:
     n = len(place_mm)
     network = NetworkEstimate(place_mm, np.full((n, 2), sd_mm), np.full(n, 1.0), np.full(n, 1.0))
-    return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network)
+    return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network, prior_line())
 
 
 def test_places_of_evenly_spread_presses_are_centred():

@@ -18,7 +18,7 @@ from reskin.universal.map import Estimate
 
 def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
     nothing = np.zeros(len(off_mm))
-    return Estimate(off_mm, np.full(off_mm.shape, sd_mm), nothing, nothing)
+    return Estimate(off_mm, np.full(off_mm.shape, sd_mm), nothing, nothing, nothing)
 
 
 @pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])

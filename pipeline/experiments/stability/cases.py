@@ -1,4 +1,4 @@
-"""Cases of the stability experiment: each is a row of its table, with the expected and the observed behaviour.
+"""The class `Case`, whose instances are the rows of the stability experiment's table, and functions that create cases.
 
 The other modules of this package run cases with given inputs. The experiment passes the inputs of a scene; the tests
 pass random inputs.
@@ -13,7 +13,7 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """The result of a case: expected and observed behaviour, and the error with its limit if the case has an error."""
+    """The result of one case: expected and observed behaviour and, if the case measures an error, error and limit."""
 
     area: str
     case: str

@@ -21,7 +21,7 @@ WRAP_COUNTS_N = 2**16  # an int16 wraps by this number of counts
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
-    """Run cases of fields beyond int16 and 50 mT, and of boards with a chip that fails, is stuck or was reset."""
+    """Run cases of fields beyond the range of int16 or 50 mT, and of a chip that fails, is stuck or was reset."""
     intact_uT = _still_board(chip, chips_n, seed)
     broken_i = min(BROKEN_I, chips_n - 1)
     return [
@@ -41,9 +41,9 @@ def _range() -> list[Case]:
 
 
 def out_of_range(b_uT: Float[np.ndarray, "n 3"], case: str, should: str, *, wrapped_n: int, clipped_n: int) -> Case:
-    """Read fields with a noiseless chip at GAIN_SEL 7, which clips at 50 mT and wraps as int16.
+    """Read fields with a noiseless chip at GAIN_SEL 7, which clips fields at 50 mT and wraps counts to int16.
 
-    `wrapped_n` and `clipped_n` are the numbers of values that the chip must count as wrapped and as clipped.
+    `wrapped_n` and `clipped_n` are the expected numbers of wrapped and of clipped values.
     """
     read_uT, overruns = read_bare(b_uT * micro, quiet(7), rng_for(0, "stability", "range"))
     step_uT = steps_uT(7)
@@ -95,7 +95,7 @@ def _marked(case: str, marked: Bool[np.ndarray, "f k"], expected: Bool[np.ndarra
 
 
 def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
-    # Resolution of a chip with the settings that it has after power-on.
+    # A chip that was reset has the resolution of its power-on settings.
     lsb_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])
     reset_uT, axes = intact_uT.copy(), _axes(broken_i)
     reset_uT[:, axes] = np.rint(intact_uT[:, axes] / lsb_uT) * lsb_uT
@@ -121,7 +121,7 @@ def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int)
 
 
 def _detect(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
-    """Look for faults in readings in the same way as ingestion; raise an error for any fault."""
+    """Check readings for faults as the ingest stage does; raise an error if there is any fault."""
     frames_n, chips_n, expected_lsb_uT = len(b_uT), b_uT.shape[1] // 3, None
     if gain_sel is not None:
         xy_uT, _, z_uT = steps_uT(gain_sel).tolist()

@@ -21,14 +21,15 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes of simulation and reference, so that quadrature errors cancel
+# Nodes of both the simulation and its reference, so that errors of quadrature cancel.
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
 PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation; the tip's axis passes through no node
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # depths / thickness
 FINER = 4  # number of steps of the reference / number of steps of the simulator
 STEPS_N = 40  # steps of the simulator over a depth of one thickness
-RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest wave number times contact radius
+RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest wave number * outer radius of the rings
 SIZES = (0.1, 1.0, 10.0)  # tip radius / thickness
-PRESSED = 0.4  # depth / the smaller of thickness and tip radius
+PRESSED = 0.4  # depth / min(thickness, tip radius)
 GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips; cell size / gap
 SLID_M = 0.1 * milli  # displacement of the sliding skin
 THICKNESSES_MM = (0.2, 20.0)  # thicknesses of the scaled skins
@@ -61,7 +62,7 @@ def deep(board: Board, skin: Skin) -> list[Case]:
 
 
 def tips(base: layer.Base) -> list[Case]:
-    """Run cases of sharp and blunt tips: compare the simulator's force with that of rings of pressure on a layer."""
+    """Run cases of sharp and blunt tips: compare the simulator's force with the force of rings of uniform pressure."""
     cases = []
     for size in SIZES:
         thickness_m, tip_m = 2 * milli, 2 * milli * size
@@ -84,7 +85,7 @@ def ring_force_N(
 ) -> float:
     """Return the force of a sphere pressed into a layer, approximated by rings of uniform pressure up to `reach_m`.
 
-    The surface under a ring touches the sphere, or the pressure of the ring is zero. The deflection by a ring is the
+    Under each ring, either the surface touches the sphere or the pressure is zero. The deflection by a ring is the
     Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number * thickness,
     the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
@@ -115,7 +116,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles with dB of a box."""
+    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles and of a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -137,7 +138,7 @@ def near(skin: SkinDesign) -> list[Case]:
 
 
 def scaled(board: Board, skin: Skin) -> list[Case]:
-    """Run cases in which all lengths are scaled: fields must not change, and forces must scale as lengths squared."""
+    """Run cases in which all lengths are scaled: dB must not change, and forces must scale with the length squared."""
     poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
     (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
     cases = []
@@ -156,7 +157,7 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
 
 
 def scale_skin(skin: Skin, scale: float) -> Skin:
-    """Return a skin of the same material with all lengths scaled; the stiffness of its springs scales as lengths."""
+    """Multiply all lengths of a skin by `scale`. The material is unchanged, so spring stiffness scales with length."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m

@@ -24,7 +24,7 @@ MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])
 STEPS_N = BLOCK_STEPS_N  # number of steps after which the training loop checks the loss for the first time
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
-# Tolerance of weights, which are near 0.1. Float32 sums in another order differ by 6e-8; 50 steps amplify this.
+# Tolerance for weights, whose size is about 0.1. The order of a float32 sum changes it by 6e-8; 50 steps amplify this.
 ROUNDING = 1e-4
 NEGLIGIBLE_RATE = 1e-12  # learning rate at which the weights hardly change
 SCALE_POWERS = (-20, -10, 10, 20)  # labels are multiplied by 2^power (1e-6 to 1e6), which causes no rounding errors
@@ -56,7 +56,7 @@ def triplet_cases(seed: int) -> list[Case]:
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Run cases of the training loop: overflow, a collapsed network, very few rows, and two runs from one seed."""
+    """Run cases of the training loop: overflow, a collapsed network, very few rows, and two runs with the same seed."""
     job, rows = _job(seed), _rows(seed)
     overflow = [
         _exploding_weights(job, rows, 1e1),

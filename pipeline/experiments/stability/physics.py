@@ -26,12 +26,12 @@ AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # depth / thickness of the indentations
-FLAGGED_DEPTH = 0.6  # depth / thickness from which on depths are flagged as not covered by published solutions
+FLAGGED_DEPTH = 0.6  # depth / thickness; published solutions do not cover larger depths, which are therefore flagged
 POKES_N = 2000
 BYTES_MAX_N = 1000  # memory limit per poke: 1 GB for 1e6 pokes; the result alone takes 120 bytes per poke
-PATH_MM = (0.0, 0.1, 0.5, 4.0)  # stops of a drag along a line
+PATH_MM = (0.0, 0.1, 0.5, 4.0)  # displacements at the stops of a straight drag
 STICKY = 1e6  # friction coefficient at which the tip never slips
-STIFF = signals.stiff(1e8)  # relaxation whose slowest time is 1e8 times the fastest
+STIFF = signals.stiff(1e8)  # its slowest relaxation time is 1e8 times its fastest
 
 
 def time_cases() -> list[Case]:
@@ -185,7 +185,7 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
 
 
 def single_precision(board: Board, fine: Skin) -> Case:
-    """Run a case of dB computed in float32, compared with float64."""
+    """Run a case that compares dB computed in float32 with dB computed in float64."""
     rest = fine.nodes_m, fine.moments_A_m2
     depths_m = mechanics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
     moved = mechanics.follow_dipoles(fine, PLACES_M[0], depths_m)
@@ -211,12 +211,12 @@ def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
 
 
 def memory(board: Board, skin: Skin) -> Case:
-    """Run a case of the memory use per poke, from the peak memory for `POKES_N` and for four times as many pokes."""
+    """Run a case of the memory per poke, computed from the peak memory for `POKES_N` and for 4 * `POKES_N` pokes."""
     rng = rng_for(0, "stability", "memory")
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory is not to be measured below
+    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not be counted below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     per_poke_n = (many_n - few_n) / (3 * POKES_N)
     observed = (

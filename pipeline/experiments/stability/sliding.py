@@ -1,7 +1,7 @@
 """Extreme cases of a skin that slides on its base.
 
-There are cases of drags with almost no and with very high friction, of a tip that is lifted after dragging, of
-indentations at the free edge, and of force control.
+The cases are: drags with almost no friction and with very high friction, a tip that is lifted after a drag,
+indentations at the free edge of the skin, and force control.
 """
 
 from dataclasses import replace
@@ -20,9 +20,9 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, f
 from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
-DEPTH = 0.35  # depth / thickness of the deepest drag of a scene, which has the largest shear
+DEPTH = 0.35  # depth / thickness; the deepest drag of any scene, which has the largest shear
 PLACE_M = np.array([5.0, -3.0]) * milli  # relative to the skin's centre; a drag at this place also rotates the skin
-WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli  # stops of a drag, as displacements along x
+WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli  # displacements along x at the stops of a drag
 HELD_M = 0.1 * milli  # displacement of the tip before it is lifted
 LIFTS_N = (3, 30)  # numbers of stops while the tip is lifted
 EDGE_M = 0.1 * milli  # distance of the indentations from the skin's edge
@@ -32,9 +32,9 @@ PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # dep
 
 
 def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run cases on a skin and a board without spreads.
+    """Run all cases of sliding, on a skin and a board that equal their designs.
 
-    Returns no cases if the skin is not held on its base by springs (`skin.hold`).
+    Returns an empty list if no springs hold the skin on its base (`skin.hold` is None).
     """
     if skin.hold is None:
         return []
@@ -55,7 +55,7 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    # On a skin with this friction, neither a press nor a drag slides the skin noticeably.
+    # With this low friction, neither a press nor a drag slides the skin noticeably.
     slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
@@ -80,9 +80,9 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
 
 
 def lift(board: Board, skin: Skin) -> Case:
-    """Run a case of a drag at the skin's centre with a tip that is then lifted.
+    """Run a case of a drag at the skin's centre, after which the tip is lifted.
 
-    The tangential force must decrease with the normal force, which limits the friction.
+    While the tip is lifted, the tangential force must decrease with the normal force, which limits the friction.
     """
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
@@ -105,7 +105,7 @@ def lift(board: Board, skin: Skin) -> Case:
 
 
 def edge(board: Board, skin: Skin) -> list[Case]:
-    """Run cases of indentations just inside the free edge, at the middle of a side and at a corner."""
+    """Run cases of two indentations just inside the skin's free edge: at the middle of a side, and at a corner."""
     half_m = np.array(skin.sides_m) / 2 - EDGE_M
     places_m = np.array([[half_m[0], 0.0], half_m])
     pokes_m = np.column_stack([skin.seat_m + places_m, np.full(2, 0.3 * skin.thickness_m)])
@@ -138,7 +138,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
 
 
 def force_control(skin: Skin) -> list[Case]:
-    """Run cases of force control: the depth for a force must be the same on loading and unloading."""
+    """Run cases of force control: a force must lead to the same depth on loading and unloading."""
     assert skin.hold is not None
     sizes = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
@@ -165,7 +165,7 @@ def _drag(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float)
 def _path(
     skin: Skin, start_m: Float[np.ndarray, "2"], way_m: Float[np.ndarray, " p"], share: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p 3"]:
-    """Return the stops of a drag along x, at displacements `way_m` and depths `share` * thickness."""
+    """Return the stops of a drag along x: displacements `way_m` from `start_m`, at depths `share` * thickness."""
     return np.column_stack([start_m[0] + way_m, np.full(len(way_m), start_m[1]), share * skin.thickness_m])
 
 

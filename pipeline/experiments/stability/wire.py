@@ -16,9 +16,9 @@ from reskin.seeds import rng_for
 
 AREA = "wire"
 FRAMES_N = 40
-CUT_I = 20  # the frame in which a stream is damaged
+CUT_I = 20  # index of the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # memory use is compared between streams of this number of blocks and of four times as many blocks
+BLOCKS_N = 3  # the memory use for a stream of this many blocks is compared with that for four times as many
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
 
 
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
-    """Decode a damaged stream; compare lost frames, false frames and uncounted bytes with what is allowed."""
+    """Decode a damaged stream; compare the numbers of lost frames, false frames and uncounted bytes with the limits."""
     decoded_frames, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
     sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), decoded_frames))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
@@ -97,7 +97,7 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # At room temperature, no float contains the bytes CR LF. If one did, a frame of another length could end there.
+    # The float32 of 25 degC does not contain the bytes CR LF. If it did, a frame of another length could end there.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
         "a stream without a byte": (b"", "binary", chips_n, "refused"),

@@ -1,4 +1,4 @@
-"""Checks of the verification experiment: each is a row of its table. Also the error measures that checks use.
+"""The class `Check`, whose instances are the rows of the verification experiment's table, and error measures.
 
 The other modules of this package run checks with given inputs. The experiment passes the inputs of a scene; the tests
 pass random inputs.
@@ -14,9 +14,9 @@ from reskin.physics.board import Spreads
 
 @dataclass(frozen=True)
 class Check:
-    """The result of a check: a property (`law`) of `subject`, compared with the reference `against`.
+    """The result of one check: a property (`law`) of `subject` is compared with the reference `against`.
 
-    `reason` explains the tolerance.
+    `reason` explains why the tolerance is this large.
     """
 
     subject: str
@@ -54,6 +54,6 @@ def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"
 
 
 def no_spread(spreads: Spreads) -> Spreads:
-    """Return spreads of zero, so that all boards and skins equal their design; used in checks of symmetry."""
+    """Return manufacturing spreads of zero, with which every drawn board and skin equals its design."""
     length = "skin_filler_length_mm"
     return spreads.model_copy(update={name: 0.0 for name in Spreads.model_fields if name != length})

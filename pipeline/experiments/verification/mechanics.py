@@ -35,12 +35,12 @@ A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
-FRICTION = 0.8  # coefficient
+FRICTION = 0.8  # coefficient of friction
 BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number * thickness
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the compliance of a layer, and the force up to 0.6 of the thickness, which published solutions cover."""
+    """Check the compliance of a layer, and the force at depths up to 0.6 of the thickness (published solutions)."""
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
@@ -55,12 +55,12 @@ def check_contact(skin: SkinDesign) -> list[Check]:
 
 
 def force_N(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
-    """Return the simulator's force in N, by default for a modulus of 1 Pa."""
+    """Return the simulator's indentation force in N, by default for a Young's modulus of 1 Pa."""
     return layer.force(depth_m, **asdict(press), modulus_Pa=modulus_Pa)
 
 
 def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray, " n"]:
-    """Return the force on an incompressible half-space with E = 1 Pa (Hertz): 16/9 E sqrt(R) d^1.5."""
+    """Return Hertz's force of a sphere on an incompressible half-space with E = 1 Pa: 16/9 E sqrt(R) d^1.5."""
     return 16 / 9 * np.sqrt(tip_m) * depth_m**1.5
 
 
@@ -90,9 +90,10 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
 
 
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
-    """Return W(z), the vertical displacement profile of a sliding layer under a pressure wave of amplitude 2 G k.
+    """Return W(z), the profile of the vertical displacement in a layer on a sliding base, under a pressure wave.
 
-    W solves four boundary conditions: W'' + W = 0 on both faces, W = 0 below, and 3 W' - W''' = 2 above.
+    The wave has the amplitude 2 G k (G: shear modulus, k: wave number); z is in units of 1 / k. W satisfies four
+    boundary conditions: W'' + W = 0 on both faces, W = 0 on the base, and 3 W' - W''' = 2 on the surface.
     """
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
@@ -161,9 +162,9 @@ def rings(depth_m: float, press: IndentedLayer) -> Check:
 
 
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
-    """Return the edges of rings that cover the simulator's contact, and their pressures for a modulus of 1 Pa.
+    """Divide the simulator's contact area into rings; return the radii of the ring edges and the pressure on each ring.
 
-    The pressures are found by collocation at the middle of each ring.
+    The pressures are in units of 2 G (G: shear modulus). They are found by collocation at the middle of each ring.
     """
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
@@ -174,9 +175,10 @@ def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarr
 
 
 def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
-    """Return the deflection at radius `r_m` for unit pressure / 2G on a disc.
+    """Return the deflection of the surface at radius `r_m` for a uniform pressure of 2 G on a disc of radius `disc_m`.
 
-    This is the deflection of a half-space (elliptic integrals) minus the effect of the base.
+    G is the shear modulus. The result is the deflection of a half-space (elliptic integrals) minus the effect of the
+    base.
     """
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
@@ -237,13 +239,13 @@ def straight_drag(
                  )  # fmt: skip
 
 
-STEPS_N = 12  # steps of an indentation; for a depth of 1.2 mm, each step is 0.1 mm
-STEP_M = 1e-7  # step of finite differences
+STEPS_N = 12  # number of depth steps of an indentation; for a depth of 1.2 mm, each step is 0.1 mm
+STEP_M = 1e-7  # half-width of central differences
 HELD = {"bonded": "stays", "slipping": "keeps its height"}
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check the deformation of a layer: in one linear step, and in an indentation to a depth in small steps."""
+    """Check the deformation of a layer in one linear step, and in an indentation to `depth_m` in several steps."""
     far = far_field(press, depth_m) if press.base == "slipping" else []
     return [*one_small_step(press, depth_m), *finite_deformation(press, depth_m), *sunken_surface(press, depth_m), *far]
 
@@ -291,7 +293,7 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     h_m = press.thickness_m
     r_m, z_m = _places(h_m, 25, 11)
     inside = len(r_m)
-    # One call follows the places, the neighbouring points for finite differences, and points on the base.
+    # A single call to `follow` tracks all points: the places, their neighbours for central differences, and the base.
     shifts = [(0.0, 0.0), (STEP_M, 0.0), (-STEP_M, 0.0), (0.0, STEP_M), (0.0, -STEP_M)]
     base_m = np.linspace(0, 4 * h_m, 40)
     all_r_m = np.concatenate([*(r_m + dr_m for dr_m, _ in shifts), base_m])
@@ -299,7 +301,7 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     depths_m = descent(depth_m)
     end = deformation.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
     _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
-    # Axes of `numeric`: displaced r or z; derivative with respect to initial r or z; place.
+    # Axes of `numeric`: displaced coordinate (r, z); initial coordinate of the derivative (r, z); place.
     numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)
     f, hoop = end.f[:inside], end.hoop[:inside]
     gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[:inside] / r_m))
@@ -327,9 +329,9 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that, far from the tip on a slipping base, r^2 grows equally at all heights and distances.
+    """Check that, on a slipping base and far from the tip, r^2 of all material points grows by the same amount.
 
-    This is required by conservation of volume.
+    The amount may depend neither on height nor on distance, because the layer is incompressible.
     """
     h_m = press.thickness_m
     r_m, z_m = (grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
@@ -348,10 +350,11 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 
 
 def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
-    """Return the dipoles of a skin after an indentation in the steps `depths_m` (true depths), and after its slide.
+    """Return the dipoles of a skin that has been indented and has slid on its base.
 
-    Dipoles are followed without tables. Each moment is rotated by R, where F = R U is the polar decomposition of its
-    deformation gradient, from a singular value decomposition. No dipole may be on the tip's axis.
+    The depth increases in the steps `depths_m` (true depths). The motion of the dipoles is computed without tables.
+    Each moment is rotated by R, where F = R U is the polar decomposition of the deformation gradient at the dipole,
+    computed by singular value decomposition. No dipole may be on the tip's axis.
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
@@ -371,10 +374,10 @@ def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[
 
 
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for any quadrature rule
-DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for the errors of tables and steps
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
-REFERENCE_STEPS_N = 16  # steps of an indentation in the reference
-# Errors of this size are not visible in readings: a third of a chip's noise, which increases the rms noise by 5 %.
+REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
+# Errors of this size are not visible in readings: they are a third of a chip's noise, and increase the rms by only 5 %.
 UNSEEN_uT = 1.0
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # no node is on the tip's axis at these places
 Places = Float[np.ndarray, "p 2"]
@@ -383,7 +386,7 @@ Places = Float[np.ndarray, "p 2"]
 def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
-    """Check dB of indentations on a scene's first skin, and the symmetries of dB on a skin without spreads."""
+    """Check dB of indentations on a scene's first skin, and symmetries of dB on a skin that equals its design."""
     first_board, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
@@ -444,7 +447,7 @@ def quadrature(
 
 
 def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Places = PLACES_M) -> Check:
-    """Compare the simulator's dB with dB from magpylib's dipoles, which are followed without tables in fine steps."""
+    """Compare the simulator's dB with dB of magpylib dipoles, whose motion is computed in fine steps without tables."""
     pokes_m = each_depth(places_m, (depth_m,))
     _, found_T = changes_of_field(board, skin, pokes_m)
     before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
@@ -458,9 +461,10 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Check three symmetries of dB on a skin without spreads.
+    """Check three symmetries of dB on a skin that equals its design.
 
-    dB must rotate and mirror together with board, skin and indentations, and must not change if all are shifted.
+    If board, skin and indentations are rotated or mirrored together, dB must be rotated or mirrored in the same way. If
+    they are shifted together, dB must not change.
     """
     sign = -1 if polarity == "checkerboard" else 1  # a quarter turn or mirroring x swaps the poles of a checkerboard
     mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli

@@ -27,9 +27,9 @@ from reskin.physics.magnet import Dipoles, Quadrature, change_of_field, place_no
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 
-NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # range of distances from a box's centre, in units of its side
+NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # range of distances from the centre of a box, in side lengths of the box
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
-MU_0_DIGITS = 1e-8  # tolerance for other values of mu_0, which differ by 1e-10 to 1e-9 between CODATA years
+MU_0_DIGITS = 1e-8  # relative tolerance; values of mu_0 from different CODATA years differ by 1e-10 to 1e-9
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter turn about z
 
 
@@ -160,7 +160,8 @@ def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[n
 
 PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count by GAIN_SEL, for RES 0
 PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # for GAIN_SEL 0 to 7
-RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))  # ranges of the sd on x and y, and on z, in three recorded data sets
+# Ranges of the standard deviation of noise in three recorded data sets: of the x and y axes, and of the z axis.
+RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))
 STILL_FRAMES_N = 20_000  # readings of a board at rest
 
 
@@ -177,7 +178,7 @@ def quiet(gain_sel: int) -> ChipDesign:
 def read_bare(
     b_T: Float[np.ndarray, "f 3"], design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f 3"], Overruns]:
-    """Return the readings of the fields `b_T` by one ideal chip (no rotation, gain one, no offset)."""
+    """Read the fields `b_T` with one chip that is not rotated and has a gain of one and no offset."""
     eye = np.eye(3)[None]
     return read_field(b_T[:, None], Board("bare", np.zeros((1, 3)), eye, eye, np.zeros((1, 3))), design=design, rng=rng)
 
@@ -214,7 +215,7 @@ def conversion(gain_sel: int, seed: int) -> list[Check]:
 def noise(chip: ChipDesign, seed: int) -> list[Check]:
     read_uT, _ = read_bare(np.zeros((STILL_FRAMES_N, 3)), chip, rng_for(seed, "verification", "noise"))
     sd_uT = read_uT.std(axis=0)
-    # The expected sd combines the noise of the chip's design and the rounding to counts.
+    # The expected standard deviation combines the design's noise with the error of rounding to counts.
     design_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     expected_uT = np.sqrt(design_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12)
     low_uT, high_uT = np.array([RECORDED_NOISE_uT[axis == 2] for axis in range(3)]).T
@@ -255,7 +256,7 @@ def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
 
 
 def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Generator) -> Frames:
-    """Return random frames whose fields are whole counts of the chip; the bytes of some temperatures contain CR LF."""
+    """Return random frames whose fields are whole counts of the chip; some temperatures contain the bytes CR LF."""
     counts = rng.integers(-20_000, 20_000, (frames_n, chips_n, 3))
     b_uT = (counts * steps_uT(gain_sel)).reshape(frames_n, -1).astype(np.float32)
     usual_degC = (rng.integers(2000, 4000, (frames_n, chips_n)) / 100).astype(np.float32)
@@ -314,7 +315,8 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
     return float(np.abs(decoded_values - values).max()) if decoded_values.shape == values.shape else np.inf
 
 
-POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations, each lowered and held, in 30 s
+# Number of indentations, time from one to the next, and times of lowering and of holding the tip.
+POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7
 NAME = "relaxation of the force"
 STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest relaxation time / fastest relaxation time, which is 1 ms
@@ -334,7 +336,7 @@ def check_relaxation() -> list[Check]:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return a relaxation with three times: 1 ms, `ratio` times 1 ms, and the geometric mean of these two."""
+    """Return a Prony series with three relaxation times: 1 ms, `ratio` ms, and the geometric mean of these two."""
     return Prony(np.array([1e-3, 1e-3 * np.sqrt(ratio), 1e-3 * ratio]), np.array([0.3, 0.2, 0.1]))
 
 
@@ -355,7 +357,7 @@ def held(time_s: Float[np.ndarray, " t"]) -> Check:
 
 
 def step_error(dt_s: float, prony: Prony) -> float:
-    """Return the relative error of one time step by `aging.advance`, compared with its formula in 50 digits."""
+    """Return the relative error of `aging.advance` in one time step, from its formula evaluated with 50 digits."""
     with mpmath.workdps(50):
         truth = []
         for q, tau, share in zip(STATE.tolist(), prony.tau_s.tolist(), prony.share.tolist(), strict=True):
@@ -371,7 +373,7 @@ def hereditary(
     """Return the relaxed force at each time, from the hereditary integral of Lee & Radok with 50 digits.
 
     The integral of relaxation(t - s) d elastic(s) is summed over all linear pieces of `elastic`. Unlike `aging.relax`,
-    this does not propagate a state from piece to piece.
+    this function does not propagate a state from one piece to the next.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (

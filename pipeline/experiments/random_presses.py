@@ -1,0 +1,321 @@
+"""The universal model on recorded boards, calibrated to presses at random places and tested at other places.
+
+Presses of a held-out board are drawn at random over all places and forces. Their places stay unknown to the model.
+Labels are drawn at random from one part of the places; all tested presses are in the other part. With one known weight,
+the only label is a press in the middle of the skin.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int64
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from pipeline.experiments.known_boards import read_known_boards
+from pipeline.experiments.results import write_results
+from pipeline.report.formatting import show, tabulate
+from pipeline.settings import Settings
+from pipeline.stage import say
+from pipeline.statistics import statistic
+from pipeline.training.universal import WAYS, coverage
+from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
+from reskin.config import Strict
+from reskin.errors import SchemaError
+from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.seeds import rng_for
+from reskin.universal.calibration import (
+    CalibrationData,
+    LabelledPresses,
+    LikelihoodPowers,
+    lower_by_misfit,
+    lower_by_residuals,
+    variance_inflations,
+)
+from reskin.universal.force import NORMAL_90, prior_line
+from reskin.universal.map import FORCES_N, Estimate
+from reskin.universal.model import Evaluation, HeldOutLabels, PriorModel, line_of_labels, load_universal
+
+SPACING_MM = 2.0  # of the places; presses are assigned to the nearest place of a grid with this spacing
+FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
+MIDDLE_MM = 1.0  # presses with |x| and |y| below this are in the middle of the skin
+CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
+WEIGHT = "weight"
+NEAREST = "nearest label"
+
+
+class RandomPresses(Strict):
+    """Section random_presses: numbers of unlabelled presses and of labels, and the number of draws."""
+
+    presses_n: Annotated[tuple[Annotated[int, Field(ge=1, le=65)], ...], Field(min_length=1)]
+    labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    draws_n: Annotated[int, Field(ge=1)]
+
+
+@dataclass(frozen=True)
+class BoardPresses:
+    """The presses of one recorded board in its frame, and all their readings."""
+
+    board: str
+    rest_uT: Float[np.ndarray, " ch"]
+    presses: LabelledPresses  # means over the readings of each press
+    readings: LabelledPresses
+    press_i: Int64[np.ndarray, " f"]  # press of each reading
+
+    @property
+    def middle(self) -> Bool[np.ndarray, " m"]:
+        """Which presses are in the middle of the skin."""
+        return (np.abs(self.presses.place_mm) < MIDDLE_MM).all(axis=1)
+
+    def part(self, split: str, draw_i: int) -> Int64[np.ndarray, " m"]:
+        """Return 1 for presses in the part of the places for labels, -1 in the other part, and 0 between the parts.
+
+        The parts alternate from draw to draw.
+        """
+        if split == CHECKERBOARD:
+            colour = np.rint(self.presses.place_mm / SPACING_MM).astype(int).sum(axis=1) % 2
+            return np.array((-1) ** (colour + draw_i))
+        along_mm = self.presses.place_mm[:, draw_i // 2 % 2] * (-1) ** draw_i
+        return np.where(np.abs(along_mm) < SPACING_MM / 2, 0, np.sign(along_mm)).astype(int)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """Indices of the unlabelled presses, of the labels in random order, of the weight, and of the tested readings."""
+
+    unlabelled: Int64[np.ndarray, " n"]
+    labels: Int64[np.ndarray, " m"]
+    weight: Int64[np.ndarray, "1"]
+    tested: Int64[np.ndarray, " t"]
+
+
+def random_presses(
+    settings: Settings, section: RandomPresses, indentations: Path, folds: Path, models: Path, results: Path
+) -> None:
+    """Score the universal model on every held-out board, with presses and labels at random places."""
+    known = read_known_boards(settings, indentations, folds)
+    variants, powers = read_variants(known, models), load_universal().powers
+    rows: list[dict[str, Any]] = []
+    for board in known.presses:
+        presses = board_presses(known, board)
+        for draw_i in range(section.draws_n):
+            rows += score_draw(presses, variants, powers, section, settings.seed, draw_i)
+        say(f"{settings.scene} random_presses: board {board} done")
+    write_results(results, {"rows": summarise_rows(rows), "draws_n": section.draws_n}, {})
+
+
+def board_presses(known: KnownBoards, board: str) -> BoardPresses:
+    """Return the presses of a board that have a force."""
+    rows, frame = known.data.rows, known.frame
+    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
+    _, press_i, counts = np.unique(rows.indentation[own], return_inverse=True, return_counts=True)
+    place_mm, force_N = frame.place(rows.target[own, :2].astype(float)), rows.target[own, 2].astype(float)
+    readings = LabelledPresses(place_mm, force_N, frame.field(rows.db_uT[own]))
+
+    def mean(values: Float[np.ndarray, "f k"]) -> Float[np.ndarray, "m k"]:
+        return np.stack([np.bincount(press_i, column) for column in values.T], axis=1) / counts[:, None]
+
+    presses = LabelledPresses(mean(place_mm), mean(force_N[:, None])[:, 0], mean(readings.db_uT))
+    return BoardPresses(board, known.presses[board].rest_uT.ravel(), presses, readings, press_i)
+
+
+def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, draw_i: int) -> Draw:
+    """Draw unlabelled presses, labels and the weight at random; all other presses outside the labels' part are tested.
+
+    Raises SchemaError if no press is in the middle of the skin, or if no press is left for the test.
+    """
+    rng = rng_for(seed, "random presses", split, presses_n, draw_i)
+    n, middle = len(board.presses), np.flatnonzero(board.middle)
+    if not len(middle):
+        raise SchemaError(
+            f"random_presses: board {board.board} has no press within {MIDDLE_MM:g} mm of the middle. "
+            "Remove the experiment from the scene."
+        )
+    unlabelled, weight = rng.permutation(n)[:presses_n], rng.choice(middle, 1)
+    part = board.part(split, draw_i)
+    tested = (part == -1) & ~np.isin(np.arange(n), [*unlabelled, *weight])
+    if not tested.any() or not (part == 1).any():
+        raise SchemaError(
+            f"random_presses: board {board.board} has too few presses ({n}) to be split by {split}. "
+            "Remove the experiment from the scene."
+        )
+    return Draw(unlabelled, rng.permutation(np.flatnonzero(part == 1)), weight, np.flatnonzero(tested[board.press_i]))
+
+
+def score_draw(
+    board: BoardPresses, variants: Variants, powers: LikelihoodPowers, section: RandomPresses, seed: int, draw_i: int
+) -> list[dict[str, Any]]:
+    """Score both variants and the reference methods on one draw of each split and number of presses."""
+    rows = []
+    most_n = max(section.presses_n)
+    for split in (CHECKERBOARD, HALVES):
+        for presses_n in section.presses_n if split == CHECKERBOARD else (most_n,):
+            draw = draw_presses(board, split, presses_n, seed, draw_i)
+            tested = board.readings[draw.tested]
+            where = {"board": board.board, "tested": split, "presses_n": presses_n, "draw_i": draw_i}
+            for way, variant in {"rig": variants.rig[board.board], "nominal": variants.nominal}.items():
+                model = calibrate(variant.model, board, draw)
+                for labels, name in label_sets(board, draw, section.labels_n if presses_n == most_n else (0,)):
+                    scored = model.score(labels, tested, powers, presses_n)
+                    rows.append(where | {"method": f"universal, {WAYS[way]}", "labels": name} | scored)
+            for labels, name in label_sets(board, draw, section.labels_n if presses_n == most_n else ()):
+                if len(labels) and name != WEIGHT:
+                    rows.append(where | {"method": NEAREST, "labels": name} | score_nearest(labels, tested))
+    return rows
+
+
+def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
+    """Return the labels of each number, and after no label those of the known weight, with their names."""
+    sets = []
+    for n in labels_n:
+        sets.append((raise_forces(board.presses[draw.labels[:n]]), str(n)))
+        if n == 0:
+            sets.append((raise_forces(board.presses[draw.weight]), WEIGHT))
+    return sets
+
+
+def raise_forces(labels: LabelledPresses) -> LabelledPresses:
+    """Raise forces to the least force of the map."""
+    return replace(labels, force_N=np.maximum(labels.force_N, FORCE_MIN_N))
+
+
+@dataclass(frozen=True)
+class CalibratedBoard:
+    """A variant calibrated to the no-load field and the unlabelled presses of a board, and their median misfit."""
+
+    calibration: Any
+    misfit: float
+
+    def score(
+        self, labels: LabelledPresses, tested: LabelledPresses, powers: LikelihoodPowers, presses_n: int
+    ) -> dict[str, float]:
+        """Calibrate to labels and score the tested readings, also with forces that are not calibrated."""
+        folds = list(self.calibration.held_out(labels))
+        power = lower_by_misfit(powers.power_for(presses_n, len(labels), even=False), self.misfit)
+        held_out = [([fold.evaluation.combined(power)], fold.labels.place_mm) for fold in folds]
+        power = lower_by_residuals(power, *variance_inflations(1, held_out))
+        model = self.calibration.with_labels(labels)
+        lines = {"": line_of_labels(folds), "combined": line_of_combined(folds), "raw": prior_line()}
+
+        def in_each_way(evaluation: Evaluation) -> list[Estimate]:
+            return [replace(evaluation, line=line).combined(power) for line in lines.values()]
+
+        calibrated, by_line, raw = model.estimate_by(in_each_way, tested.db_uT)
+        scores = score_estimate(calibrated, tested)
+        return scores | {"r2_line_f": r2(by_line.force_N, tested.force_N), "r2_raw_f": r2(raw.force_N, tested.force_N)}
+
+
+def line_of_combined(folds: Sequence[HeldOutLabels]) -> Any:
+    """Fit the line without a selection of the estimator."""
+    if not folds:
+        return prior_line()
+    log_N = np.concatenate([fold.evaluation.log_forces()[0] for fold in folds])
+    return prior_line().condition(log_N, np.log(np.concatenate([fold.labels.force_N for fold in folds])))
+
+
+def calibrate(model: PriorModel, board: BoardPresses, draw: Draw) -> CalibratedBoard:
+    """Calibrate a variant to the no-load field and the unlabelled presses."""
+    db_uT = board.presses.db_uT[draw.unlabelled]
+    calibration = model.calibrate(CalibrationData(board.rest_uT, db_uT))
+    return CalibratedBoard(calibration, float(np.median(calibration.skin.evaluator.evaluate(db_uT).misfit())))
+
+
+def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str, float]:
+    """Score the reference method: place and force of the label with the most similar field change.
+
+    Similarity is the Euclidean distance between features: the direction of the field change, and the logarithm of its
+    magnitude. `r2_line_f` is that of a constant, the mean force of the labels.
+    """
+    magnitude_uT = [np.linalg.norm(part.db_uT, axis=1, keepdims=True) for part in (labels, tested)]
+    pairs = zip((labels, tested), magnitude_uT, strict=True)
+    features = [np.hstack([part.db_uT / length_uT, np.log(length_uT)]) for part, length_uT in pairs]
+    nearest = cKDTree(features[0]).query(features[1])[1]
+    error_mm = labels.place_mm[nearest] - tested.place_mm
+    constant = np.full(len(tested), labels.force_N.mean())
+    return place_scores(error_mm) | {
+        "r2_f": r2(labels.force_N[nearest], tested.force_N), "r2_line_f": r2(constant, tested.force_N),
+    }  # fmt: skip
+
+
+def place_scores(error_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
+    """Return scores of places from their errors."""
+    return {
+        "accuracy_pct": 100 * float((np.abs(error_mm) <= ACCURACY_LIMIT_MM).all(axis=1).mean()),
+        "median_mm": float(np.median(np.linalg.norm(error_mm, axis=1))),
+        "mse_xy_mm2": float((error_mm**2).mean()),
+    }
+
+
+def score_estimate(estimate: Estimate, tested: LabelledPresses) -> dict[str, float]:
+    """Score estimates of tested readings, and coverage and score of their 90 % intervals."""
+    error_mm = estimate.place_mm - tested.place_mm
+    error_log = np.log(estimate.force_N / tested.force_N)
+    return place_scores(error_mm) | {
+        "r2_f": r2(estimate.force_N, tested.force_N),
+        "coverage_pct": 100 * coverage(estimate, tested.place_mm),
+        "interval_score_mm": interval_score(error_mm, NORMAL_90 * estimate.sd_mm),
+        "half_width_mm": NORMAL_90 * float(np.median(estimate.sd_mm)),
+        "coverage_f_pct": 100 * float((np.abs(error_log) <= NORMAL_90 * estimate.sd_log_N).mean()),
+        "half_width_f_factor": float(np.exp(NORMAL_90 * np.median(estimate.sd_log_N))),
+    }
+
+
+def interval_score(error: Float[np.ndarray, "..."], half_width: Float[np.ndarray, "..."]) -> float:
+    """Return the mean interval score of 90 % intervals: width plus 20 times the distance of values outside.
+
+    The score is smallest for intervals that are as narrow as their coverage allows (Gneiting & Raftery, JASA 2007).
+    """
+    return float((2 * half_width + 2 / 0.1 * np.maximum(np.abs(error) - half_width, 0)).mean())
+
+
+def r2(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t"]) -> float:
+    """Return the coefficient of determination of forces."""
+    return 1 - float(((force_N - true_N) ** 2).mean() / true_N.var())
+
+
+GROUP = ("tested", "presses_n", "method", "labels")
+
+
+def summarise_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Average the scores over draws, then summarise them over boards."""
+    frame = pd.DataFrame(rows)
+    metrics = [str(name) for name in frame if name not in (*GROUP, "board", "draw_i")]
+    summary: list[dict[str, Any]] = []
+    for key, group in frame.groupby(list(GROUP), sort=False):
+        by_board = group.groupby("board")[metrics].mean()
+        known = [name for name in metrics if by_board[name].notna().all()]
+        scores: dict[str, Any] = {name: statistic(by_board[name].to_numpy(), boards=True) for name in known}
+        summary.append({**dict(zip(GROUP, key, strict=True)), **scores})
+    return summary
+
+
+TITLES = {
+    "accuracy_pct": "within 1 mm, %", "median_mm": "median error, mm", "mse_xy_mm2": "MSE_xy, mm²", "r2_f": "R² of F",
+    "coverage_pct": "place in 90 % interval, %", "half_width_mm": "half-width, mm",
+    "interval_score_mm": "interval score, mm", "coverage_f_pct": "force in 90 % interval, %",
+    "half_width_f_factor": "half-width of force, factor", "r2_line_f": "R² of F, line",
+    "r2_raw_f": "R² of F, uncalibrated",
+}  # fmt: skip
+MEANING = (
+    "Means over {draws_n} draws of presses and labels, then over boards; (a; b) are the values of the boards. The "
+    "model is calibrated to unlabelled presses at random places and forces. Labels are drawn from one part of the "
+    "places; the tested presses are in the other part and were not used in any way. Label `weight`: one press with a "
+    "known force in the middle of the skin. Forces: the estimator and its line are selected by cross-validation over "
+    "the labels. `line` always calibrates the combined force of map and networks; for `nearest label`, it is the mean "
+    "force of the labels."
+)
+
+
+def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
+    """Tabulate the scores for each split, number of presses, method and number of labels."""
+    lines = []
+    for row in numbers["rows"]:
+        line = {"tested places": row["tested"], "presses": row["presses_n"]}
+        line |= {name: row[name] for name in ("method", "labels")}
+        scores = {title: show(row[name]) if name in row else "–" for name, title in TITLES.items()}
+        lines.append(line | scores | {"source": source})
+    return {"random_presses": tabulate(lines, meaning=MEANING.format(draws_n=numbers["draws_n"]))}

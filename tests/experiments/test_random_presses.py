@@ -1,0 +1,127 @@
+"""Tests of experiment random_presses: what is drawn, what is scored, and that labels and tests are apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.experiments.random_presses import (
+    CHECKERBOARD,
+    HALVES,
+    NEAREST,
+    WEIGHT,
+    BoardPresses,
+    RandomPresses,
+    draw_presses,
+    interval_score,
+    score_draw,
+    score_nearest,
+    summarise_rows,
+    tables,
+)
+from pipeline.training.universal_variants import Variant, Variants
+from reskin.errors import SchemaError
+from reskin.seeds import rng_for
+from reskin.universal.calibration import LabelledPresses, LikelihoodPowers
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
+from reskin.universal.model import PriorModel
+from reskin.universal.population import grid
+from reskin.universal.training import SkinPrior, draw_weights
+from tests.universal.skins import SETUP, make_tables, poked_uT
+
+DEPTHS_N, READINGS_N = 3, 2
+POWERS = LikelihoodPowers({12: {0: 0.5, 40: 0.5}, 65: {0: 0.5, 40: 0.5}}, {0: 0.5})
+
+
+def make_board(seed: int = 0) -> BoardPresses:
+    """Return a synthetic board: each place of the grid is pressed with three forces, and read twice."""
+    rng = rng_for(seed, "random presses")
+    place_mm = np.repeat(grid(), DEPTHS_N, axis=0)
+    force_N = np.tile([0.8, 2.0, 5.0], len(grid())) * rng.uniform(0.8, 1.2, len(place_mm))
+    presses = LabelledPresses(place_mm, force_N, poked_uT(place_mm, force_N, np.array([0.5, -0.5, 0.3])))
+    press_i = np.repeat(np.arange(len(place_mm)), READINGS_N)
+    return BoardPresses("b1", np.zeros(15), presses, presses[press_i], press_i)
+
+
+@pytest.fixture(scope="module")
+def board() -> BoardPresses:
+    return make_board()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.sampled_from([CHECKERBOARD, HALVES]), st.integers(0, 11), st.integers(1, 65))
+def test_tested_presses_are_unseen_and_apart_from_labels(split, draw_i, presses_n):
+    board = make_board()
+    draw = draw_presses(board, split, presses_n, 2021, draw_i)
+    tested = np.unique(board.press_i[draw.tested])
+    assert not set(tested) & {*draw.unlabelled, *draw.labels, *draw.weight}
+    assert len(draw.unlabelled) == presses_n == len(set(draw.unlabelled))
+    labelled_mm, tested_mm = board.presses.place_mm[draw.labels], board.presses.place_mm[tested]
+    apart_mm = np.linalg.norm(labelled_mm[:, None] - tested_mm, axis=2)
+    assert apart_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # mm; places are 2 mm apart
+    assert (np.abs(board.presses.place_mm[draw.weight]) < 1).all()
+
+
+def test_parts_alternate_from_draw_to_draw(board):
+    for split in (CHECKERBOARD, HALVES):
+        np.testing.assert_array_equal(board.part(split, 0), -board.part(split, 1))
+    assert len({tuple(board.part(HALVES, i)) for i in range(4)}) == 4
+
+
+def test_board_without_a_press_in_the_middle_is_an_error(board):
+    outside = np.flatnonzero(~board.middle)
+    reduced = replace(board, presses=board.presses[outside])
+    with pytest.raises(SchemaError, match="no press within 1 mm of the middle"):
+        draw_presses(reduced, CHECKERBOARD, 12, 2021, 0)
+
+
+def test_nearest_label_is_exact_for_its_own_reading(board):
+    scores = score_nearest(board.presses, board.presses)
+    assert scores["accuracy_pct"] == 100
+    assert scores["r2_f"] == 1
+    assert scores["r2_line_f"] == pytest.approx(0)  # of the mean force
+
+
+def test_interval_score_is_smallest_for_the_quantiles_of_the_errors():
+    errors = rng_for(0, "interval score").standard_normal(200_000)
+    scores = {width: interval_score(errors, np.full(len(errors), width)) for width in (1.2, 1.645, 2.2)}
+    assert min(scores, key=scores.__getitem__) == 1.645
+    assert interval_score(np.array([3.0]), np.array([1.0])) == pytest.approx(2 + 20 * 2)
+
+
+@pytest.fixture(scope="module")
+def rows(board) -> list[dict]:
+    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "random presses"))])
+    variant = Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
+    section = RandomPresses(presses_n=(12, 65), labels_n=(0, 10), draws_n=1)
+    variants = Variants(variant, {"b1": variant})
+    return score_draw(board, variants, POWERS, section, 2021, 0)
+
+
+def test_each_setting_is_scored(rows):
+    names = {(row["tested"], row["presses_n"], row["method"], row["labels"]) for row in rows}
+    universal = {name for name in names if name[2] != NEAREST}
+    assert {name[3] for name in universal} == {"0", WEIGHT, "10"}
+    assert len(universal) == 2 * (3 + 2 + 3)  # both variants: 65 presses, 12 presses, halves
+    assert {name[:2] for name in names if name[2] == NEAREST} == {(CHECKERBOARD, 65), (HALVES, 65)}
+
+
+def test_labels_improve_place_and_force(rows):
+    def mean(labels: str, metric: str) -> float:
+        values = [row[metric] for row in rows if row["labels"] == labels and row["tested"] == CHECKERBOARD
+                  and row["method"] != NEAREST and row["presses_n"] == 65]  # fmt: skip
+        return float(np.mean(values))
+
+    assert mean("10", "mse_xy_mm2") < mean("0", "mse_xy_mm2")
+    assert mean("10", "r2_f") > 0.9  # the synthetic skin follows its formula
+
+
+def test_table_has_each_row_and_its_source(rows):
+    summary = summarise_rows(rows)
+    (table,) = tables({"rows": summary, "draws_n": 1}, "recorded").values()
+    assert len(table) == len(summary)
+    assert (table["source"] == "recorded").all()
+    best = next(row for row in summary if row["labels"] == "10" and row["method"] != NEAREST)
+    assert best["accuracy_pct"]["n"] == 1  # one board

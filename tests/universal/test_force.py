@@ -1,0 +1,119 @@
+"""Tests of the calibration of forces: a Bayesian line, its intervals, and the selection of the estimator."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pipeline.training.shipping import read_inputs
+from pipeline.training.universal import draw_prior_skins, law_error, split_presses
+from reskin.data.grid import CENTRE_MM
+from reskin.seeds import rng_for
+from reskin.universal.force import (
+    ESTIMATORS,
+    INTERCEPT_SD,
+    LOG_CENTRE_N,
+    NORMAL_90,
+    SCATTER_SD,
+    SLOPE_SD,
+    fit_line,
+    prior_line,
+)
+from reskin.universal.law import to_chips
+from reskin.universal.model import load_universal
+
+SKINS_N, LABELS_N = 5, 20
+
+
+def draw_log_forces(labels_n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return estimated and true log forces of presses on a skin that follows the prior of the line."""
+    rng = rng_for(seed, "force line")
+    log_N = rng.uniform(np.log(0.5), np.log(9), labels_n)
+    line = (
+        LOG_CENTRE_N
+        + INTERCEPT_SD * rng.standard_normal()
+        + (1 + SLOPE_SD * rng.standard_normal()) * (log_N - LOG_CENTRE_N)
+    )
+    return log_N, line + SCATTER_SD * rng.standard_normal(labels_n)
+
+
+def test_no_label_leaves_forces_unchanged():
+    log_N = np.log([0.1, 2.0, 9.0])
+    calibrated, sd_log_N = prior_line().apply(log_N)
+    np.testing.assert_allclose(calibrated, log_N)
+    assert (sd_log_N >= np.hypot(INTERCEPT_SD, SCATTER_SD) - 1e-12).all()
+
+
+@pytest.mark.parametrize("labels_n", [1, 4])
+def test_line_equals_the_regression_of_a_gaussian_process(labels_n):
+    log_N, true_log_N = draw_log_forces(labels_n, 1)
+    line = fit_line([log_N] * 3, true_log_N)
+    asked = np.log([0.3, 1.0, 5.0])
+    off, asked_off = log_N - LOG_CENTRE_N, asked - LOG_CENTRE_N
+    cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.outer(off, off) + line.scatter_var * np.eye(labels_n)
+    shared = INTERCEPT_SD**2 + SLOPE_SD**2 * np.outer(asked_off, off)
+    expected = asked + shared @ np.linalg.solve(cov, true_log_N - log_N)
+    var = INTERCEPT_SD**2 + SLOPE_SD**2 * asked_off**2 - ((shared @ np.linalg.inv(cov)) * shared).sum(axis=1)
+    found, sd_log_N = line.apply(asked)
+    np.testing.assert_allclose(found, expected)
+    np.testing.assert_allclose(sd_log_N, np.sqrt(var + line.scatter_var))
+
+
+def test_intervals_of_the_line_are_calibrated():
+    inside = []
+    for seed in range(200):
+        log_N, true_log_N = draw_log_forces(12, seed)
+        line = prior_line().condition(log_N[:6], true_log_N[:6])
+        found, sd_log_N = line.apply(log_N[6:])
+        inside.append(np.abs(found - true_log_N[6:]) < NORMAL_90 * sd_log_N)
+    assert stats.binomtest(int(np.sum(inside)), np.size(inside), 0.9).pvalue > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"), [((0.1, 1.0), "combined"), ((1.0, 0.1), "map"), ((9.0, 9.0), "constant")]
+)
+def test_best_estimator_is_selected(noise, expected):
+    log_N, true_log_N = draw_log_forces(40, 2)
+    rng = rng_for(3, "force line")
+    by_estimator = [log_N + sd * rng.standard_normal(40) for sd in noise]
+    assert fit_line([*by_estimator, np.full(40, LOG_CENTRE_N)], true_log_N).estimator == expected
+    assert fit_line([part[:3] for part in by_estimator], true_log_N[:3]).estimator == ESTIMATORS[0]
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> list[tuple]:
+    """Calibrate the shipped model to simulated skins with large errors of the law: with 0, 1 and 20 labels."""
+    prior, model, found = read_inputs().prior, load_universal(), []
+    skins = draw_prior_skins(prior, SKINS_N, 5, "force", law_error(1.5))
+    for i in range(SKINS_N):
+        pool, tested = split_presses(skins, i, 5)
+        rest_uT, pool_uT, tested_uT = (to_chips(b) for b in (skins.rest_uT[i][None], pool.db_uT, tested.db_uT))
+        model.zero(rest_uT).see(rest_uT + pool_uT)
+        for n in (0, 1, LABELS_N):
+            if n:
+                labels = np.flatnonzero(pool.force_N > 0.3)[:n]
+                model.label(pool.place_mm[labels] + CENTRE_MM, pool.force_N[labels], rest_uT + pool_uT[labels])
+            estimate, pressed = model.estimate(rest_uT + tested_uT), tested.force_N > 0.3
+            error = np.log(estimate.force_N / tested.force_N)[pressed]
+            found.append((n, error, estimate.sd_log_N[pressed]))
+    return found
+
+
+@pytest.mark.parametrize("labels_n", [0, 1, LABELS_N])
+def test_force_intervals_cover_simulated_skins(calibrated, labels_n):
+    inside = [np.abs(error) < NORMAL_90 * sd for n, error, sd in calibrated if n == labels_n]
+    assert 0.8 < np.concatenate(inside).mean() <= 1  # 90 % if all errors were as large as assumed
+
+
+def test_labels_improve_forces(calibrated):
+    rms = {n: np.sqrt(np.mean([np.mean(error**2) for m, error, _ in calibrated if m == n])) for n in (0, LABELS_N)}
+    assert rms[LABELS_N] < 0.9 * rms[0]
+
+
+def test_estimated_forces_of_labels_do_not_calibrate_forces():
+    model = load_universal()
+    rest_uT = to_chips(model.tables.rest_uT[None])
+    presses_uT = to_chips(model.tables.mean_uT[11:13, 11, 4])
+    model.zero(rest_uT).label([[8.4, 8.4], [9.2, 8.4]], [3.0, 3.0], rest_uT + presses_uT, force_known=False)
+    np.testing.assert_array_equal(model.line.mean, prior_line().mean)
+    model.label([[8.4, 8.4]], [4.0], rest_uT + presses_uT[:1], keep=True)
+    assert model.line.mean[0] != 0
