@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solution:
-    """Motion inside the layer, at its base and at its top, and the load-weighted mean displacement along the load."""
+    """Motion inside the layer, at its base and at its top; mean displacement along the load, weighted by the load."""
 
     inside: Motion
     base: Motion
@@ -45,7 +45,7 @@ def axisymmetric_strains(u, r):
 
 
 def along_x_strains(u, r):
-    """Return the strains of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
+    """Return normal and shear strains of u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f (see `ShearMap`)."""
     (a_r, a_z), (b_r, b_z), (c_r, c_z) = u.grad
     return (a_r + b_r, 2 * u[1] / r, c_z), (b_r - a_r - 2 * u[1] / r, a_z + b_z + c_r, b_z - a_z - u[2] / r)
 
@@ -85,7 +85,10 @@ class Layer:
         return asm(BilinearForm(work), self.basis), coupling
 
     def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solution:
-        """Solve for load(r) on component `part_i` at the top, with fixed components and springs(r) on u_r per edge."""
+        """Solve for a traction load(r) on the top, along component `part_i` of the displacement.
+
+        `held` lists the fixed components of each edge; `drag` has the stiffness springs(r) that acts on u_r at an edge.
+        """
         (work, dilation), basis = self.matrices, self.basis
         load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), basis.boundary("top"))
         for edge, springs in drag.items():

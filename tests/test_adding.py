@@ -88,7 +88,9 @@ def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
     assert not list((root / "data/raw").rglob("*readings*"))
 
 
-@pytest.mark.parametrize("found", ["Against the scene, chips 1 and 2 are exchanged.", None, CaptureError("no places")])
+@pytest.mark.parametrize(
+    "found", ["Compared with the scene, chips 1 and 2 are swapped.", None, CaptureError("no places")]
+)
 def test_difference_from_the_simulated_skin_is_a_warning(root, lab_file, monkeypatch, capsys, found):
     def find_departure(*_: object) -> str | None:
         if isinstance(found, CaptureError):
@@ -116,10 +118,10 @@ def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypat
 
 def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
     columns = table.columns_of(5)
-    for i, exchanged in enumerate((False, True)):
+    for i, swapped in enumerate((False, True)):
         places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
         changes_uT = fields_uT(places_mm - 8, np.full(40, 2.0))
-        labels_mm = places_mm[:, ::-1] if exchanged else places_mm
+        labels_mm = places_mm[:, ::-1] if swapped else places_mm
         noise_uT = rng_for(i, "noise").normal(0, 3, (80, 15))
         rows = pd.DataFrame({"phase": ["noload", "contact"] * 40})
         rows[["x_mm", "y_mm"]] = labels_mm.repeat(2, axis=0)
@@ -127,7 +129,7 @@ def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
         rows.to_csv(tmp_path / f"board{i}.csv", index=False)
         prepared = preparing.foreign(tmp_path / f"board{i}.csv", "table", labels(f"board{i}", f"skin{i}"), {})
         add.add(root, "small", prepared, allow_copy=False)
-        assert ("other captures only with x and y swapped" in capsys.readouterr().err) == exchanged
+        assert ("other captures only with x and y swapped" in capsys.readouterr().err) == swapped
 
 
 def test_duplicates_are_refused_unless_allowed(root, lab_file):

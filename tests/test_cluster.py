@@ -74,8 +74,8 @@ def describe_call(i: int) -> tuple[int, str, int]:
 def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch):
     small_jobs = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=10) for seed_i in (0, 1)]
     results = []
-    for name, place in (("here", "here"), ("there", f"dask:{address}")):
-        monkeypatch.setenv("RESKIN_EXECUTOR", place)
+    for name, executor_name in (("here", "here"), ("there", f"dask:{address}")):
+        monkeypatch.setenv("RESKIN_EXECUTOR", executor_name)
         monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
         prepare_workers("reskin.models.train")
         with make_executor(imports="reskin.models.train") as executor:

@@ -172,7 +172,7 @@ def test_missing_commit_is_an_error(root, example):
 
 
 def test_wrong_checksum_is_an_error(root, example):
-    # without a commit: the newest, in which one file differs
+    # Without a commit, the newest one is fetched, in which one file differs.
     write_source(root, source_of(example.files, example.url, None))
     other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
     assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")

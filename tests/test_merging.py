@@ -15,12 +15,12 @@ from reskin.errors import ReskinError
 from tests.scenes import recorded_scene
 from tests.stages.checkout import ROOT
 
-NOTHING = Registry(captures={})
-PERSON = ["-c", "user.name=Tester", "-c", "user.email=tester@example.org", "-c", "commit.gpgsign=false"]
+EMPTY = Registry(captures={})
+GIT_IDENTITY = ["-c", "user.name=Tester", "-c", "user.email=tester@example.org", "-c", "commit.gpgsign=false"]
 
 
 def git(root: Path, *arguments: str, check: bool = True) -> str:
-    done = subprocess.run(["git", *PERSON, *arguments], cwd=root, capture_output=True, text=True, check=check)
+    done = subprocess.run(["git", *GIT_IDENTITY, *arguments], cwd=root, capture_output=True, text=True, check=check)
     return done.stdout
 
 
@@ -50,7 +50,7 @@ def initial_checkout(tmp_path_factory) -> Path:
     (root / SCENES).mkdir(parents=True)
     with (root / SCENES / "shared.yaml").open("w") as stream:
         YAML().dump(recorded_scene(), stream)
-    write_registry(root, NOTHING)
+    write_registry(root, EMPTY)
     plan.use(root, [])
     (root / "dvc.lock").write_text("schema: '2.0'\nstages:\n  report@quick:\n    cmd: as it was\n")
     git(root, "init", "-qb", "main")
@@ -119,7 +119,7 @@ def test_contradictory_recordings_change_nothing(root):
 def test_merged_registry_is_validated(theirs, message):
     ours = Registry(captures={"shared": {"mine": entry("s1", "b1")}})
     with pytest.raises(ReskinError, match=message):
-        merge.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
+        merge.merge_registries(EMPTY, ours, Registry(captures={"shared": theirs}))
 
 
 def test_added_scenes_are_planned_and_removed_ones_are_not():

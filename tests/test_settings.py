@@ -128,11 +128,11 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 
 FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
-# Stages that read adaptations, recipes or the physics of the skin; stages in `SIMULATING` draw skins themselves.
+# Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
-FINGERPRINTED = {"audit", "report"}  # compare the fingerprint of the physics with that of scene tuning
-SIMULATING = {
+FINGERPRINTED = {"audit", "report"}  # these stages compare the fingerprint of the physics with that of scene tuning
+SIMULATING = {  # experiments that simulate skins themselves
     "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
 }  # fmt: skip
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml.

@@ -99,9 +99,9 @@ class Cluster:
         return self._nodes["user"].popen(command, folder / "said.txt", ROOT)
 
 
-def sweep_here(folder: Path, place: str) -> Sweep:
-    """Run the sweep on this machine with the executor `place` (`here` or `processes:N`)."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "RESKIN_EXECUTOR": place}
+def sweep_here(folder: Path, executor: str) -> Sweep:
+    """Run the sweep on this machine; `executor` is `here` or `processes:N`."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "RESKIN_EXECUTOR": executor}
     subprocess.run([*SWEEP, str(folder)], cwd=ROOT, env=environment, check=True, timeout=SWEEP_MAX_s)
     return Sweep(folder).read()
 

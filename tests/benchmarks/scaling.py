@@ -32,11 +32,11 @@ class Measurements:
     """Times and sizes that the cluster test measured."""
 
     task_s: tuple[float, ...]  # CPU time of each task
-    processes_s: tuple[float, float]  # the whole sweep, in one process and in two
-    call_s: float  # per empty task, when empty tasks are sent one after another
-    connect_s: float  # to connect a stage to a cluster whose workers have already loaded the libraries
-    rows_bytes: float  # of the training rows, which each worker loads once
-    task_bytes: float  # received by a worker per task, in total
+    processes_s: tuple[float, float]  # of the whole sweep: in one process, in two processes
+    call_s: float  # overhead of a task: time per empty task, when empty tasks are sent one after another
+    connect_s: float  # time to connect a stage to a cluster whose workers have already loaded the libraries
+    rows_bytes: float  # size of the training rows, which each worker loads once
+    task_bytes: float  # all bytes that a worker receives for a task, except the training rows
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
 GROWTH_MIN = 1.25  # cost ratio of two successive counts above which growth is distinguished from timing noise
-# Why the cost of each stage has its exponent. A stage that is missing here raises a KeyError.
+# For each stage, the work that explains its exponent (column `why`). A stage that is missing here raises a KeyError.
 CAUSES = {
     "ingest_simulated": "one capture after another, independently: bytes to Parquet",
     "describe": "one skin after another; medians over skins sort them",
@@ -41,7 +41,7 @@ Points = list[tuple[int, float]]
 
 
 def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: str) -> dict[str, Points]:
-    """Return the points (row[count], quantity `what`) of each stage in `row[part]`."""
+    """Return the cost curve of each stage in `row[part]`: for each row, the point (row[count], cost `what`)."""
     found: dict[str, Points] = {}
     for row in rows:
         for name, values in row[part].items():

@@ -34,12 +34,18 @@ SETTINGS = {
     "train_multi": {"recipe": "paper", "steps_n": 100, "seeds_n": 1, "variants": {}},
 }  # fmt: skip
 BUCKET, REMOTE = "reskin-team", "store"
-KEYS = {"AWS_ACCESS_KEY_ID": "team", "AWS_SECRET_ACCESS_KEY": "on loopback", "AWS_DEFAULT_REGION": "us-east-1"}
-PERSON = {"GIT_AUTHOR_NAME": "Tester", "GIT_AUTHOR_EMAIL": "tester@example.org", "GIT_CONFIG_GLOBAL": os.devnull} | {
+ACCESS_KEYS = {"AWS_ACCESS_KEY_ID": "team", "AWS_SECRET_ACCESS_KEY": "on loopback", "AWS_DEFAULT_REGION": "us-east-1"}
+GIT_IDENTITY = {
+    "GIT_AUTHOR_NAME": "Tester", "GIT_AUTHOR_EMAIL": "tester@example.org", "GIT_CONFIG_GLOBAL": os.devnull,
     "GIT_COMMITTER_NAME": "Tester", "GIT_COMMITTER_EMAIL": "tester@example.org",
 }  # fmt: skip
-ALWAYS = {"DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1", "RESKIN_EXECUTOR": "here", "PYTHONDONTWRITEBYTECODE": ""}
-RAN, KEPT = re.compile(r"^Running stage '(.*?)(?:@.*)?'", re.M), re.compile(r"didn't change, skipping")
+ENVIRONMENT = {
+    "DVC_NO_ANALYTICS": "1",
+    "OMP_NUM_THREADS": "1",
+    "RESKIN_EXECUTOR": "here",
+    "PYTHONDONTWRITEBYTECODE": "",
+}
+RAN_STAGE, UNCHANGED_STAGE = re.compile(r"^Running stage '(.*?)(?:@.*)?'", re.M), re.compile(r"didn't change, skipping")
 
 
 class Clone:
@@ -47,7 +53,14 @@ class Clone:
 
     def __init__(self, folder: Path, origin: Path, variables: Mapping[str, str]) -> None:
         self.folder = folder
-        self._variables = {**os.environ, **ALWAYS, **KEYS, **PERSON, **variables, "PYTHONPATH": str(folder)}
+        self._variables = {
+            **os.environ,
+            **ENVIRONMENT,
+            **ACCESS_KEYS,
+            **GIT_IDENTITY,
+            **variables,
+            "PYTHONPATH": str(folder),
+        }
         run(["git", "clone", "--quiet", str(origin), str(folder)], folder.parent, self._variables)
         (folder / ".venv").symlink_to(sys.prefix)
 
@@ -69,7 +82,7 @@ class Clone:
 
     def repro(self) -> Counter[str]:
         """Run `dvc repro`; return how many times each stage ran."""
-        return Counter(RAN.findall(self.dvc("repro")))
+        return Counter(RAN_STAGE.findall(self.dvc("repro")))
 
     def commit(self, sentence: str) -> None:
         self.git("add", "--all")
@@ -233,7 +246,7 @@ def count_rows(database: str) -> int:
 
 def run_steps(steps: Steps, folder: Path) -> None:
     """Run all steps of the workflow in a folder."""
-    os.environ.update(KEYS, MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false")
+    os.environ.update(ACCESS_KEYS, MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false")
     addresses, ports = [], [servers.free_port() for _ in range(3)]
     try:
         with ExitStack() as up:

@@ -27,13 +27,13 @@ INDENTATIONS_N = size(1_000_000, 800)
 TILE_N = size(4_000, 400)  # indentations in the block of bytes that is written repeatedly
 QUIET_N = 400  # no-load frames before the first indentation and after the last
 SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # fraction of the indentation's full field change, frame by frame
-TRAVEL_N = 8  # maximum of the random number of frames between indentations (irregular gaps align the clocks)
+TRAVEL_N = 8  # maximum of the random number of frames between indentations; clocks are matched by these gaps
 RATE_HZ = 400.0
 ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = (
     size(800, 2000),
     size(240_000, 800),
     80,
-)  # the stream has about 1 GB; the memory limit is lower
+)  # the stream has about 1 GB, which exceeds the memory limit
 PEAK_MAX_MB = 1500  # 0.1 GB for the probe log of 2e6 dwells, 0.15 GB for its text, the rest for parsing
 
 

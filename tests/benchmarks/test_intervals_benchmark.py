@@ -40,13 +40,13 @@ SEED, SETTINGS = 2021, TrainingSettings(skins_n=size(500, 4), steps_n=size(1200,
 SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
-def law_error(part: float, over_mm: tuple[float, float] = training.ERROR_MM) -> LawError:
-    """Return a law error like that of training, with another size and another length scale."""
+def law_error(size: float, length_mm: tuple[float, float] = training.ERROR_MM) -> LawError:
+    """Return a law error like that of training, of rms size `size` |dB|; its length scale is drawn from `length_mm`."""
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(training, "ERROR_MM", over_mm)
-            return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (part, part), rng)
+            patch.setattr(training, "ERROR_MM", length_mm)
+            return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (size, size), rng)
 
     return add
 

@@ -37,26 +37,26 @@ def test_errors_by_choice_of_labelled_places():
     for rest_uT, own_uT, place_mm, force_N in zip(
         skins.rest_uT @ to_chips, db_uT @ to_chips, skins.place_mm, skins.force_N, strict=True
     ):
-        for way, choose in ways(place_mm[:PLACES_N].astype(float), rng).items():
+        for strategy, choose in strategies(place_mm[:PLACES_N].astype(float), rng).items():
             skin, taken = load_universal().zero(rest_uT[None]), []
             for n in range(max(LABELS_N) + 1):
                 if n in LABELS_N:
                     off_mm = skin.predict(own_uT[PLACES_N:] + rest_uT)[:, :2] - CENTRE_MM - place_mm[PLACES_N:]
-                    errors.setdefault((way, n), []).append(off_mm)
+                    errors.setdefault((strategy, n), []).append(off_mm)
                 taken.append(choose(skin, taken))
                 skin.zero(rest_uT[None])
                 skin.label(place_mm[taken] + CENTRE_MM, force_N[taken].astype(float), own_uT[taken] + rest_uT)
-    for (way, n), off_mm in errors.items():
+    for (strategy, n), off_mm in errors.items():
         within = 100 * (np.abs(off_mm) <= 1).all(axis=2).mean()
         mse_mm2 = (np.array(off_mm) ** 2).mean(axis=(1, 2))
-        line = f"{way}, {n} labels: {within:.1f} % within 1 mm, MSE_xy {mse_mm2.mean():.3f} mm2"
+        line = f"{strategy}, {n} labels: {within:.1f} % within 1 mm, MSE_xy {mse_mm2.mean():.3f} mm2"
         more = mse_mm2 - (np.array(errors["fixed", n]) ** 2).mean(axis=(1, 2))
         print(f"{line}; minus fixed {more.mean():+.3f} +- {more.std(ddof=1) / SKINS_N**0.5:.3f} (standard error)")
     assert all(np.isfinite(off_mm).all() for off_mm in errors.values())
 
 
-def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
-    """Return functions that choose the next press to label; `fixed` follows the places that `reskin live` shows."""
+def strategies(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
+    """Return functions that choose the next press to label; `fixed` labels the places that `reskin live` shows."""
     live_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
     fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(live_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()

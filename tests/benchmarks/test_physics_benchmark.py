@@ -68,7 +68,7 @@ def move_everything(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
     moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
     moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
     rest = one.nodes_m, one.moments_A_m2
-    # in the memory order of `deformation.move_dipoles`
+    # same memory order as that of the arrays from `deformation.move_dipoles`
     return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))
 
 

@@ -36,7 +36,7 @@ from tests.benchmarks import FULL, size
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
 ROWS_N, CHANNELS_N = size(100_000, 3_600), 15
 STEPS_N, BATCH_N = size(400, 2), 128
-# networks that a plain loop trains, one after another; the time is scaled up to all networks of the grid
+# The plain loops train only this number of networks, one after another; their time is scaled up to the whole grid.
 PLAIN_N = 2
 REPEATS_N = size(3, 1)
 LAYERS = paper_layers(CHANNELS_N)

@@ -25,19 +25,18 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 HEAVIEST_N, BEST_OF_N = 3, 5
 LAYERS = paper_layers(15)
 WEIGHTS_N = sum(layer.in_n * layer.out_n + layer.out_n for layer in LAYERS)
-WIDTHS_N = sum(layer.out_n for layer in LAYERS)
+UNITS_N = sum(layer.out_n for layer in LAYERS)
 # memory accesses per weight and step: read weight, gradient, two moments; write gradient, weight, two moments
 MOVES_N = 8
 # memory accesses per activation: a write and a read in the forward pass, and again in the backward pass
 ACTIVATION_MOVES_N = 4
 # Batches through the first layers in each step, in addition to the labelled batch: triplets, unlabelled lines.
 EXTRA_PASSES_N = {"train_multi": 0, "train_single": 0, "train_triplet": 2, "adapt": 5}
-GROUP = {
-    "train_multi": 1,
-    "train_triplet": 1,
-    "adapt": 3,
-}  # networks that sweep_sensors trains per board and number of skins
-MIXED: dict[str, Mapping[str, int]] = {"sweep_sensors": GROUP, "sweep_pokes": {"adapt": 1}}
+# networks that a sweep trains for each held-out board at each of its points, by the stage that trains such networks
+NETWORKS_BY_SWEEP: dict[str, Mapping[str, int]] = {
+    "sweep_sensors": {"train_multi": 1, "train_triplet": 1, "adapt": 3},
+    "sweep_pokes": {"adapt": 1},
+}
 
 
 def products_flop(kind: str, batch_n: int) -> float:
@@ -51,7 +50,7 @@ def products_flop(kind: str, batch_n: int) -> float:
 
 def moved_bytes(kind: str, batch_n: int) -> float:
     """Count the bytes that one step of one network reads and writes if the processor's cache is never hit."""
-    activations_n = batch_n * (WIDTHS_N + EXTRA_PASSES_N[kind] * sum(one.out_n for one in LAYERS[:FEATURE_LAYERS_N]))
+    activations_n = batch_n * (UNITS_N + EXTRA_PASSES_N[kind] * sum(one.out_n for one in LAYERS[:FEATURE_LAYERS_N]))
     return 4.0 * (MOVES_N * WEIGHTS_N + ACTIVATION_MOVES_N * activations_n)
 
 
@@ -103,7 +102,7 @@ def limits_of(scene: str, row: Mapping[str, Any], rates: Mapping[str, float]) ->
     """Return a stage's lower bounds in s, from products, memory and disk alone; None for stages that do not train."""
     settings, stage = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml"), str(row["stage"])
     shared = read_yaml(ROOT / "params.yaml")
-    group = MIXED.get(stage, {stage: 1} if stage in EXTRA_PASSES_N else None)
+    group = NETWORKS_BY_SWEEP.get(stage, {stage: 1} if stage in EXTRA_PASSES_N else None)
     if group is None:
         return None
     flop = moved = 0.0

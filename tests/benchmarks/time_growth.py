@@ -3,9 +3,10 @@
 `python -m tests.benchmarks.time_growth skins 18 60 180 600 1800` runs the whole pipeline on scenes with these numbers
 of simulated skins and 65 pokes per skin. Only 18 skins are simulated; the others are copies under other labels, which
 cost the same in all later stages. `python -m tests.benchmarks.time_growth captures 10 30 100` creates these numbers of
-recorded captures and times three commands: `reskin add` of one more capture, the first `dvc repro`, and a `dvc repro`
-that has nothing to do. The results are added to docs/measured/growth.json, from which show_growth.py writes
-docs/growth.md. Costs are CPU seconds because other work on the machine changes them least.
+recorded captures and times four commands: `reskin add` of one more capture, the first `dvc repro`, a `dvc repro` that
+has nothing to do, and the `dvc repro` after another `reskin add`. The results are added to docs/measured/growth.json,
+from which show_growth.py writes docs/growth.md. Costs are CPU seconds because other work on the machine changes them
+least.
 """
 
 import argparse

@@ -27,8 +27,8 @@ from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 SCENE = "repeat"
 SKINS_N = 6  # one skin on each board
 EXPERIMENTS = ("single_random", "lobo", "triplet")
-TRAINED = ("train_single", "train_multi", "train_triplet")
-AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
+TRAINING_SECTIONS = ("train_single", "train_multi", "train_triplet")
+RERUN_CODE = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
 # Variables that undo the settings of reskin/numerics.py, so that libraries choose instructions by the processor.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
@@ -49,7 +49,7 @@ FIRST = "two processes"
 def scene_settings() -> dict[str, Any]:
     """Return the settings of scene quick that the three experiments need, with SKINS_N skins."""
     quick = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
-    kept = {key: quick[key] for key in ("source", "seed", "selection", *TRAINED)}
+    kept = {key: quick[key] for key in ("source", "seed", "selection", *TRAINING_SECTIONS)}
     split = {key: quick["split"][key] for key in ("random_test_fraction", "random_repeats_n")}
     simulate = quick["simulate"]
     boards, grid = {"rigid": simulate["boards"]["rigid"]}, simulate["protocols"]["grid"] | {"skins_n": SKINS_N}
@@ -70,13 +70,13 @@ def make_checkout(folder: Path) -> None:
 def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any]:
     """Run the scene without cached results; return the numbers of its report."""
     environment = {**os.environ, **setting, "PYTHONPATH": str(folder)}
-    subprocess.run([str(python), "-c", AGAIN], cwd=folder, env=environment, check=True, stderr=subprocess.DEVNULL)
+    subprocess.run([str(python), "-c", RERUN_CODE], cwd=folder, env=environment, check=True, stderr=subprocess.DEVNULL)
     numbers: dict[str, Any] = io.read_json(folder / f".reskin/verified/{SCENE}/numbers.json")
     return numbers
 
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the counts of equal and differing values, and the largest relative difference with its name."""
+    """Return the counts of equal and differing values, the largest relative difference, and the name of its value."""
     done = compare(first, other)
     found = {
         "equal_n": done.equal.total(),

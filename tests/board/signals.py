@@ -27,7 +27,7 @@ def make_frames(frames_n: int, chips_n: int, seed: int, *, crlf_share: float = 0
 
 def frames_of(b_uT: np.ndarray, temperature_degC: np.ndarray) -> Frames:
     frames_n = len(b_uT)
-    clock_s = (np.arange(frames_n) / 512).astype(np.float64)  # multiples of 1/512 s, without rounding in float32
+    clock_s = (np.arange(frames_n) / 512).astype(np.float64)  # multiples of 1/512 s are exact in float32
     return Frames(b_uT.astype(np.float32), temperature_degC.astype(np.float32), clock_s, np.zeros(frames_n, np.int64))
 
 

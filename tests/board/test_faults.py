@@ -29,13 +29,13 @@ def load_ini(shared_data, name: str, rows: slice = slice(None)) -> tuple[np.ndar
 
 
 class TestFailedReads:
-    def test_failed_read_needs_its_temperature_and_all_three_fields(self):
+    def test_read_failed_only_if_temperature_and_all_three_fields_are_error_values(self):
         b_uT = np.tile([8028.16, 5194.00, 12943.36], 3)[None]
         temperature_degC = np.array([[-880.49, -880.49, 25.0]])
         b_uT[0, 4] = 5194.2
         assert faults.failed_reads(b_uT, temperature_degC).tolist() == [[True, False, False]]
 
-    def test_without_temperature_the_fields_decide(self):
+    def test_unknown_temperature_is_ignored(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
 

@@ -118,8 +118,8 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_shar
     data = encode(frames, wire)
     missing_n = 1 + int(missing_share * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
-    # What remains of two damaged frames is taken for a frame only if a payload has CR LF one frame length before the
-    # end.
+    # The decoder mistakes the remains of two damaged frames for a frame only if a payload has CR LF one frame length
+    # before their end.
     false_n = int(data.count(b"\r\n") > len(frames))
     check_damage(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
@@ -160,7 +160,7 @@ def test_remains_of_two_frames_are_not_a_frame():
     frames = make_frames(6, 1, 3)
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
-    # 8 bytes of frame 2 and 13 of frame 3 remain: after the CR LF in the temperature, exactly as many as in a frame.
+    # Of frames 2 and 3, 8 and 13 bytes remain. After the CR LF in the temperature, they are as long as a frame.
     kept, _ = decode_portions([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
     assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
 

@@ -16,7 +16,7 @@ def test_change_equals_nested_loops():
 
 @given(st.floats(-3000, 3000, width=32))
 def test_constant_field_cancels(ambient_uT):
-    # the fields are a few thousand uT, which float32 rounds to about 1e-4
+    # tolerance in uT: float32 rounds fields of a few thousand uT by about 1e-4 uT
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
 

@@ -184,9 +184,9 @@ def test_simulated_hand_pokes_are_indexed_from_0():
 def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
     chosen = take_pokes(table, all_rows(table), indentations_n, rng_for(seed, "pokes"))
-    taken = set(table.indentation[chosen].tolist())
-    assert len(taken) == indentations_n
-    assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in taken]
+    indentations = set(table.indentation[chosen].tolist())
+    assert len(indentations) == indentations_n
+    assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in indentations]
     counts = Counter(map(tuple, table.target[chosen, :2].tolist()))
     visits_n = [counts[tuple(place_mm)] // READINGS_N for place_mm in points_mm().tolist()]
     assert max(visits_n) - min(visits_n) <= 1
@@ -195,10 +195,10 @@ def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
 @given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
 def test_smaller_choice_is_a_subset_of_a_larger_one(one_n, other_n, seed):
     table = grid(depths_n=3, passes_n=2)
-    few, many = (
+    smaller, larger = (
         set(take_pokes(table, all_rows(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
     )
-    assert few <= many
+    assert smaller <= larger
 
 
 @given(st.integers(0, 2**32))
@@ -221,10 +221,10 @@ def test_places_and_visits_are_equally_likely():
     # Place 0 has 8 visits, place 1 has one. A poke is at either place with equal probability; at place 0, all visits
     # are equally likely.
     table = rows_at([(0, 0)] * 8 + [(2, 0)])
-    taken = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
+    draws_n = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
     # four standard deviations of a binomial distribution with p = 1/2
-    assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)
-    assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
+    assert abs(draws_n[8] - 800) < 4 * np.sqrt(1600 / 4)
+    assert all(abs(draws_n[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
 def test_too_many_pokes_are_refused():
@@ -238,7 +238,7 @@ def test_pokes_are_chosen_on_one_skin():
         take_pokes(rows_at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
 
-EVERY = Selection(force_min_N=0.0)
+ALL_READINGS = Selection(force_min_N=0.0)
 UNKNOWN = np.full(6, np.nan, np.float32)
 
 
@@ -250,7 +250,10 @@ def hand_readings(skin: str = "s0", **changes: object):
 
 @given(st.integers(2, 12), st.integers(2, 12))
 def test_stacking_keeps_rows_and_renumbers_indentations(above_n, below_n):
-    above, below = gather([readings("c0", f=above_n)], EVERY), gather([readings("c1", skin="s1", f=below_n)], EVERY)
+    above, below = (
+        gather([readings("c0", f=above_n)], ALL_READINGS),
+        gather([readings("c1", skin="s1", f=below_n)], ALL_READINGS),
+    )
     both = stack(above, below)
     assert len(both) == above_n + below_n
     for name in ("capture", "board", "skin", "db_uT", "target", "pass_i", "indentation"):
@@ -276,15 +279,15 @@ def test_lines_of_a_skin_contain_only_its_rows():
         alone = hand_lines(one.pass_i, one.indentation)
         assert lines[one.skin].order_i.tolist() == alone.order_i.tolist() == [0, 0, 1, 1, 2, 2]
         assert set(rows.skin[lines[one.skin].row]) == {one.skin}
-    above = gather([readings("c0", f=4)], EVERY)
+    above = gather([readings("c0", f=4)], ALL_READINGS)
     below = shift_rows(lines["s1"], len(above))
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
 def test_stacking_other_channels_or_the_same_skin_is_refused():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
-    other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
+    other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], ALL_READINGS)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
-        stack(gather([readings("c0")], EVERY), other)
+        stack(gather([readings("c0")], ALL_READINGS), other)
     with pytest.raises(ParamsError, match="skin s0 has manual pokes in another capture too"):
         hand_rows([hand_readings("s0"), hand_readings("s0")])

@@ -12,7 +12,7 @@ from reskin.data.splits import Split, draw_folds, draw_sides
 from reskin.errors import ParamsError
 from tests.data.tables import rows
 
-TOGETHER = {"single_indentation": "indentation", "single_pass": "pass_i"}
+UNSPLIT_BY = {"single_indentation": "indentation", "single_pass": "pass_i"}
 splits = st.builds(
     lambda fraction, repeats_n: Split(random_test_fraction=fraction, random_repeats_n=repeats_n),
     st.floats(0.05, 0.6), st.integers(1, 4),
@@ -26,11 +26,11 @@ def make_passes(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int =
     return replace(table, indentation=np.arange(len(labels)) // readings_n)
 
 
-@pytest.mark.parametrize("experiment", TOGETHER)
+@pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
 def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, split, seed):
     table = make_passes(passes_n, pokes_n)
-    group = getattr(table, TOGETHER[experiment])
+    group = getattr(table, UNSPLIT_BY[experiment])
     folds = draw_folds(table, [experiment], split, seed)
     assert [fold.name for fold in folds] == [f"repeat{i}" for i in range(split.random_repeats_n)]
     for fold in folds:
@@ -41,14 +41,14 @@ def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, sp
         assert len(fold.pool) == 0
 
 
-@pytest.mark.parametrize("experiment", TOGETHER)
+@pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(order=st.permutations(range(24)))
 def test_split_does_not_depend_on_row_order(experiment, order):
     table = make_passes(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
     split = Split(random_test_fraction=0.3, random_repeats_n=2)
-    group = TOGETHER[experiment]
+    group = UNSPLIT_BY[experiment]
     for one, other in zip(*(draw_folds(t, [experiment], split, 3) for t in (table, shuffled)), strict=True):
         assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
 

@@ -50,7 +50,7 @@ def test_test_units_are_tested_once_and_never_trained_on(sizes):
 def test_windows_end_with_the_shortest_capture():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    # all units from the first window on that the shorter capture does not reach
+    # units of the longer capture after the last window, which ends with the shorter capture
     assert windows.left_out_units_n == 24 - 15
 
 

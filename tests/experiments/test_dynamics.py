@@ -71,7 +71,7 @@ def test_single_readings_have_no_lag_and_running_means_do():
     assert numbers["all"]["one"]["mse_f_N2"]["mean"] < 1e-12  # zero, except for rounding to float32
     # tolerance: half the step of the search for the lag
     assert numbers["lag_ms"]["one"]["mean"] == pytest.approx(0.0, abs=0.051)
-    # the lag is less exact where the force is curved, at both ends
+    # larger tolerance: the lag is less exact where the force is curved, at both ends of a press
     assert numbers["lag_ms"]["mean5"]["mean"] == pytest.approx(5.0, abs=0.15)
     assert numbers["all"]["mean5"]["mse_f_N2"]["mean"] > 100 * numbers["all"]["mean5_of_middle"]["mse_f_N2"]["mean"]
 
@@ -82,7 +82,7 @@ def test_running_mean_has_larger_errors_for_faster_presses():
         for one in score_presses(linear_presses(), [inverse], board="b0")["by_duration"]
     ]
     assert errors == sorted(errors, reverse=True)
-    # A lag of 5 ms in a press of 2 N sin^1.5 and 0.1 s: error of at most 5e-3 * 2 * 1.5 * pi / 0.1 * 0.62 = 0.29 N
+    # In a press of 2 N sin^1.5(pi t / 0.1 s), the slope is at most 2 * 1.5 * pi / 0.1 * 0.62 N/s: 5 ms late is 0.29 N.
     assert 0.02 < np.sqrt(errors[0]) < 0.29
 
 
@@ -96,8 +96,8 @@ def test_delay_is_estimated_for_any_scale_of_the_force(delay_ms, factor):
     t_s = np.arange(200) / RATE_HZ
     force_N = np.sin(np.pi * t_s / 0.5) ** 2
     late_N = factor * np.interp(t_s - delay_ms / 1e3, t_s, force_N)
-    inner = slice(20, 180)  # without both ends, beyond which interpolation is constant
-    # search step and curvature
+    inner = slice(20, 180)  # excludes both ends, where `np.interp` extrapolates by a constant
+    # tolerance in ms: step of the search, and curvature of the force
     assert lag_ms(t_s[inner], late_N[inner], t_s, force_N) == pytest.approx(delay_ms, abs=0.16)
 
 

@@ -106,7 +106,7 @@ def test_bonded_base_is_an_included_effect(rows, not_inside):
 
 def test_self_field_error_is_proportional_to_powder(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
-    # 10 %: the magnetising field is half as strong, and the magnetisation is not quite linear in this field
+    # tolerance of 10 %: the magnetisation is not quite linear in the magnetising field, which is half as strong
     assert half["the powder's own field"].field_pct == pytest.approx(
         rows["the powder's own field"].field_pct / 2, rel=0.1
     )

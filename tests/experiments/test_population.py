@@ -199,20 +199,20 @@ def test_weight_is_estimated_last(model, skins):
     assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
-def test_result_with_known_weight_is_that_of_the_chosen_power(skins, monkeypatch):
+def test_weight_share_belongs_to_the_calibrated_power(skins, monkeypatch):
     # In this test, force errors grow with the power, and only one power has intervals that cover 90 %.
-    def estimate_made_up(model, skin, size, powers):
+    def fake_estimate(model, skin, size, powers):
         found = []
         for one in powers:
             power = one["map"]
             reach = 10.0 if power == BOARD_POWERS[1] else 0.0
             true_mm = np.vstack([skin.true[:, :2], [[0, 0]]])
             force_N = np.append(skin.true[:, 2] * np.exp(power), skin.weight.force_N * np.exp(0.1))
-            of = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, *np.full((2, len(force_N)), np.nan))
-            found.append(dict.fromkeys(WAYS, of))
+            fake = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, *np.full((2, len(force_N)), np.nan))
+            found.append(dict.fromkeys(WAYS, fake))
         return found
 
-    monkeypatch.setattr(population, "estimate", estimate_made_up)
+    monkeypatch.setattr(population, "estimate", fake_estimate)
     calibration = calibrate_ways(None, skins, CalibrationSize(0, 0))
     assert set(calibration.power.values()) == {BOARD_POWERS[1]}
     assert calibration.weight_share == pytest.approx(dict.fromkeys(WAYS, BOARD_POWERS[1] / 0.1))

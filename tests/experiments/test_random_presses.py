@@ -1,4 +1,4 @@
-"""Tests of experiment random_presses: what is drawn, what is scored, and that labels and tests are apart."""
+"""Tests of experiment random_presses: drawn presses, their distance from tested presses, scores and tables."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ POWERS = LikelihoodPowers({12: {0: 0.5, 40: 0.5}, 65: {0: 0.5, 40: 0.5}}, {0: 0.
 
 
 def make_board(seed: int = 0) -> BoardPresses:
-    """Return a synthetic board: each place of the grid is pressed with three forces, and read twice."""
+    """Return presses on a synthetic board: three forces at each place of the grid, two readings per press."""
     rng = rng_for(seed, "random presses")
     place_mm = np.repeat(grid(), DEPTHS_N, axis=0)
     force_N = np.tile([0.8, 2.0, 5.0], len(grid())) * rng.uniform(0.8, 1.2, len(place_mm))
@@ -52,15 +52,15 @@ def board() -> BoardPresses:
 
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from([CHECKERBOARD, HALVES]), st.integers(0, 11), st.integers(1, 65))
-def test_tested_presses_are_unseen_and_apart_from_labels(split, draw_i, presses_n):
+def test_tested_presses_are_not_drawn_and_far_from_labels(split, draw_i, presses_n):
     board = make_board()
     draw = draw_presses(board, split, presses_n, 2021, draw_i)
     tested = np.unique(board.press_i[draw.tested])
     assert not set(tested) & {*draw.unlabelled, *draw.labels, *draw.weight}
     assert len(draw.unlabelled) == presses_n == len(set(draw.unlabelled))
     labelled_mm, tested_mm = board.presses.place_mm[draw.labels], board.presses.place_mm[tested]
-    apart_mm = np.linalg.norm(labelled_mm[:, None] - tested_mm, axis=2)
-    assert apart_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # mm; places are 2 mm apart
+    distance_mm = np.linalg.norm(labelled_mm[:, None] - tested_mm, axis=2)
+    assert distance_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # grid places are 2 mm apart
     assert (np.abs(board.presses.place_mm[draw.weight]) < 1).all()
 
 
@@ -81,7 +81,7 @@ def test_nearest_label_is_exact_for_its_own_reading(board):
     scores = score_nearest(board.presses, board.presses)
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1
-    assert scores["r2_line_f"] == pytest.approx(0)  # of the mean force
+    assert scores["r2_line_f"] == pytest.approx(0)  # score of a constant estimate, the mean force
 
 
 def test_interval_score_is_smallest_for_the_quantiles_of_the_errors():

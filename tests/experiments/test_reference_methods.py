@@ -102,7 +102,7 @@ def test_collapsed_network_is_retrained(monkeypatch):
     assert record == {"collapsed": False, "collapsed_before_n": 1}
 
 
-def test_control_pokes_are_those_of_the_next_board():
+def test_control_is_calibrated_with_pokes_of_the_next_board():
     names = "b0-draw0", "b0-draw1", "b1-draw0", "b1-draw1"
     folds = [fold(name, range(1), range(1), range(1)) for name in names]
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
@@ -115,8 +115,8 @@ def test_foreign_fields_have_equal_length_and_another_direction():
         assert not np.allclose(change(chips), chips), name
     np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER_TURN, 4), chips)
     this_board = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
-    exchanged = this_board.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
-    np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
+    swapped = this_board.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
+    np.testing.assert_array_equal(swapped, chips[:, [0, 2, 1, 3, 4]])
 
 
 def test_readings_above_the_limit_of_their_board_are_flagged():

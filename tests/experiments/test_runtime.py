@@ -132,8 +132,8 @@ def test_boxes_fill_the_volume_of_the_lattice():
 
 
 def test_lifted_box_equals_charged_faces(monkeypatch):
-    # A single box fills the skin; the dipole approximation would be wrong. Between equal poles, it is magnetised along
-    # z.
+    # The skin is a single box, for which the dipole approximation would be wrong. The box is magnetised along
+    # z, because it is between equal poles.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -182,7 +182,9 @@ def test_path_of_material_follows_the_flow():
     # 2 um: error of the spline between the nodes of the flow, while the material moves by up to 1 mm
     np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
     np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
-    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
+    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[
+        :, :2
+    ]  # components of the rotation from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 

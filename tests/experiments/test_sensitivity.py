@@ -71,9 +71,9 @@ def test_gain_and_noise_are_recovered():
 def test_direction_is_fitted_to_the_first_half_of_fillings():
     uT = fillings(noise_uT=0.0)
     np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # rounding to float32
-    turned = uT.copy()
-    turned[20:] = turned[20:, :, :, [1, 0, 2]]  # in the second half, the field changes in another direction
-    assert analyse_levels(turned, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
+    swapped_uT = uT.copy()
+    swapped_uT[20:] = swapped_uT[20:, :, :, [1, 0, 2]]  # in the second half, the field changes in another direction
+    assert analyse_levels(swapped_uT, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
 @given(st.floats(0.1, 10.0))

@@ -118,7 +118,7 @@ def test_fixed_stiffening_thickness_is_detected(monkeypatch):
     assert failed(extremes()) == {"a skin of 0.2 mm", "a skin of 20 mm"}
 
 
-def test_skin_without_springs_has_no_such_case():
+def test_skin_without_springs_has_no_sliding_cases():
     assert sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin.model_copy(update={"hold": None}), seed=SEED) == []
 
 

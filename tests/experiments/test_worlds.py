@@ -18,28 +18,31 @@ from tests.report.synthetic import texts_of
 ROOT = Path(__file__).resolve().parents[2]
 RESIDUAL = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
 GRID_MM = np.stack(np.meshgrid(np.linspace(-8, 8, 33), np.linspace(-8, 8, 33)), axis=-1).reshape(-1, 2)
-AT = np.column_stack([GRID_MM, np.zeros(len(GRID_MM))])
+PRESSES = np.column_stack([GRID_MM, np.zeros(len(GRID_MM))])
 CHANGE_uT = 100 * np.sin(np.arange(15.0) + GRID_MM[:, :1])
 
 
 def law_error(skin: str = "b0_s0", residual: Residual = RESIDUAL, size: float = 0.4) -> np.ndarray:
-    return with_residual(CHANGE_uT, AT, size, residual, 1, skin) - CHANGE_uT
+    return with_residual(CHANGE_uT, PRESSES, size, residual, 1, skin) - CHANGE_uT
 
 
 def test_law_error_has_size_and_smoothness_and_is_reproducible():
-    parts = [np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)]
-    assert np.sqrt(np.mean(np.square(parts))) == pytest.approx(0.4, rel=0.1)
-    unit = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # between places 0.5 mm apart
-    assert step.mean() < 0.25 * np.linalg.norm(unit, axis=1).mean()
+    relative_errors = [
+        np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)
+    ]
+    assert np.sqrt(np.mean(np.square(relative_errors))) == pytest.approx(0.4, rel=0.1)
+    relative_error = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
+    # differences between places 0.5 mm apart
+    step = np.linalg.norm(np.diff(relative_error.reshape(33, 33, 15), axis=1), axis=2)
+    assert step.mean() < 0.25 * np.linalg.norm(relative_error, axis=1).mean()
     np.testing.assert_array_equal(law_error(), law_error())
     assert not np.allclose(law_error(), law_error("b1_s0"))
-    assert with_residual(CHANGE_uT, AT, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
+    assert with_residual(CHANGE_uT, PRESSES, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
 
 
 def test_law_error_shares_variance_between_skins():
-    alike = RESIDUAL.model_copy(update={"own_share": 0.0})
-    np.testing.assert_array_equal(law_error("b0_s0", alike), law_error("b1_s0", alike))
+    fully_shared = RESIDUAL.model_copy(update={"own_share": 0.0})
+    np.testing.assert_array_equal(law_error("b0_s0", fully_shared), law_error("b1_s0", fully_shared))
     pairs = [np.corrcoef(law_error(f"b{i}_s0").ravel(), law_error(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
     assert np.mean(pairs) == pytest.approx(0.5, abs=0.15)
 

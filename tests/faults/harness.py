@@ -88,7 +88,7 @@ class Checkout:
                 if (process.info["cmdline"] or [])[1:4] == command and _cwd(process) == self.folder:
                     return process
             time.sleep(0.05)
-        raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.output()[-2000:]}")
+        raise AssertionError(f"stage {name} did not start within {find_s:.0f} s:\n{self.output()[-2000:]}")
 
     def until(self, condition: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
         """Wait until `condition` returns true; return False if the process ends or the time limit is reached first."""

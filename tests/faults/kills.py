@@ -8,10 +8,10 @@ import psutil
 from reskin import io
 from tests.faults.harness import SCENE, Checkout, Result, Row, alive, fault, judge
 
-TRAINS = ("train_single", "train_multi", "train_triplet", "adapt")
+TRAINING_STAGES = ("train_single", "train_multi", "train_triplet", "adapt")
 STAGES = (
-    "code", "simulate", "ingest_simulated", "describe", "split", *TRAINS, "train_classical", "table2", "sensitivity",
-    "audit", "report", "publish",
+    "code", "simulate", "ingest_simulated", "describe", "split", *TRAINING_STAGES, "train_classical", "table2",
+    "sensitivity", "audit", "report", "publish",
 )  # fmt: skip
 ATTEMPTS_N = 4
 ADDRESS_SPACE_MAX = 100 * 2**20  # bytes of address space
@@ -31,7 +31,7 @@ def run_and_kill(checkout: Checkout, stage: str, part: float) -> Result | None:
     start_s = time.monotonic()
     repro = checkout.start("dvc", "repro", address(stage))
     process = checkout.stage(stage)
-    if stage in TRAINS:
+    if stage in TRAINING_STAGES:
         checkout.until(lambda: bool(checkout.trainings()), process)
     else:
         checkout.until(lambda: f"{stage}: stage " in checkout.output() or stage == "code", process)
@@ -49,7 +49,7 @@ def add_kill(stage: str) -> None:
     @fault(
         f"kill -9 in `{stage}`",
         "SIGKILL to the stage's process in mid-run"
-        + ("" if stage not in TRAINS else ", as soon as a training run is finished"),
+        + ("" if stage not in TRAINING_STAGES else ", as soon as a training run is finished"),
     )
     def case(checkout: Checkout) -> Row:
         for i in range(ATTEMPTS_N):
@@ -58,7 +58,7 @@ def add_kill(stage: str) -> None:
                 break
         else:
             raise AssertionError(f"{stage} ended before it could be killed")
-        finished = checkout.trainings() if stage in TRAINS else None
+        finished = checkout.trainings() if stage in TRAINING_STAGES else None
         return judge(checkout, result, checkout.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
 
 

@@ -18,7 +18,7 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import make_header
 
 RATE_HZ = 400.0
-QUIET_S, POKED_S = 1.5, 1.0
+QUIET_S, POKE_S = 1.5, 1.0
 PAUSE_S = 2.0
 PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x (mm), y (mm), force (N) of the two pokes that alternate
 INPUT_SCALE_uT = 300.0
@@ -28,10 +28,10 @@ def make_script(
     *, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ, quiet_s: float = QUIET_S
 ) -> Script:
     """Return a script: no contact at first, then pokes with pauses; noise 3 uT, LSB 0.15 (x, y) and 0.242 uT (z)."""
-    frames_n = round((quiet_s + pokes_n * (POKED_S + PAUSE_S)) * rate_hz)
+    frames_n = round((quiet_s + pokes_n * (POKE_S + PAUSE_S)) * rate_hz)
     t_s, rng = np.arange(frames_n) / rate_hz, rng_for(0, "board")
-    poke_i, since_s = np.divmod(t_s - quiet_s, POKED_S + PAUSE_S)
-    poked = (t_s >= quiet_s) & (since_s < POKED_S)
+    poke_i, since_s = np.divmod(t_s - quiet_s, POKE_S + PAUSE_S)
+    poked = (t_s >= quiet_s) & (since_s < POKE_S)
     b_uT = 500.0 * rng.standard_normal((chips_n, 3)) + 3 * rng.standard_normal((frames_n, chips_n, 3))
     b_uT[poked] += changes_uT(chips_n)[poke_i[poked].astype(int) % 2].reshape(-1, chips_n, 3)
     step_uT = np.array([0.15, 0.15, 0.242])
@@ -51,7 +51,7 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
     # weights of the linear model [3 ch]
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # of a value and its negative, a ReLU passes one
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # ReLUs pass either a value or its negative
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
     weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])

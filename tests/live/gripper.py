@@ -1,6 +1,6 @@
 """A gripper with a simulated skin on its finger that closes on a spring and controls the estimated force.
 
-Frames are encoded, decoded, zeroed and estimated as those of a real board.
+Frames of the skin are encoded, decoded and evaluated like those of a real board.
 """
 
 import warnings
@@ -19,7 +19,7 @@ from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1
-PERIOD_S, SETTLED_S = 6.0, 1.0  # period with which the object's stiffness varies; start of the evaluation of the force
+PERIOD_S, SETTLED_S = 6.0, 1.0  # period of the object's stiffness; time from which the force is evaluated
 SOFT_N_MM, HARD_N_MM = 0.3, 3.0
 NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
 DEPTHS_MM = np.linspace(0.02, 1.5, 60)

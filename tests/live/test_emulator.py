@@ -20,7 +20,7 @@ from tests.recordings.headers import make_header
 from tests.stages.checkout import ROOT
 
 LONG_S = 120.0
-SCRIPT, POKED = make_script(pokes_n=0), make_script(pokes_n=1)
+SCRIPT, POKE_SCRIPT = make_script(pokes_n=0), make_script(pokes_n=1)
 
 
 class SimulatedClock:
@@ -40,7 +40,7 @@ class SimulatedClock:
 
 
 class FakeReader:
-    """A reader that records the arrival time of each frame; once, at frame `late_i`, it is late by `late_s`."""
+    """A reader that records the arrival time of each frame, and once pauses for `late_s`, after frame `late_i`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
@@ -212,18 +212,18 @@ def test_script_of_a_capture_has_its_bytes_and_times(tmp_path, wire):
     write_script(sent, tmp_path / "c0")
     script = read_script(str(tmp_path / "c0"))
     assert script.pieces == sent.pieces
-    np.testing.assert_allclose(script.t_s, POKED.t_s, atol=1e-6)
+    np.testing.assert_allclose(script.t_s, POKE_SCRIPT.t_s, atol=1e-6)
     assert script.duration_s == pytest.approx(len(script) / 400)
 
 
 def test_script_of_an_sd_card_log_has_its_frames(tmp_path):
-    frames = POKED.frames
-    log = render(1 + POKED.t_s, frames.b_uT, frames.temperature_degC)
+    frames = POKE_SCRIPT.frames
+    log = render(1 + POKE_SCRIPT.t_s, frames.b_uT, frames.temperature_degC)
     header = make_header(capture="c0", layout="sd-card", clock=Clock(kind="recording", rate_hz=None, marks=()))
     write_capture(tmp_path / "c0", header, {LOG_FILE: log.encode()})
     script = read_script(str(tmp_path / "c0"))
     np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # the log has two decimals
-    np.testing.assert_allclose(script.t_s, POKED.t_s, atol=1e-4)
+    np.testing.assert_allclose(script.t_s, POKE_SCRIPT.t_s, atol=1e-4)
 
 
 @pytest.mark.parametrize("source", ["nominal", str(ROOT / "pipeline/scenes/ci.yaml")])

@@ -135,7 +135,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
-    # only for the labels; the stream is still written
+    # Only the label log meets a full disk; the stream is still written.
     monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))
     with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
         reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)

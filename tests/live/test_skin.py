@@ -44,7 +44,8 @@ def test_every_reading_has_time_place_and_force(tmp_path):
     found = np.array([contact[1:4] for contact in contacts if contact.F_N > 0])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
-    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)  # error by noise of 3 uT in fifteen channels
+    # tolerance in mm and N: noise of 3 uT in fifteen channels
+    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
     assert all(math.isnan(contact.x_mm) for contact in contacts if contact.F_N == 0)
     assert 300 < len(found) < len(contacts)
     assert {alarm for contact in contacts for alarm in contact.alarms} <= LATE
@@ -57,7 +58,7 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # either poke: on a busy machine, the first may be missed
+    # The first touch may be either poke, because a busy machine may miss the first one.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
@@ -71,7 +72,7 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        # without "no data", which a busy machine may cause
+        # excludes readings with alarm "no data" (NaN), which a busy machine may cause
         readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())
         before, before_n = next(readings), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # the caller is slow

@@ -18,7 +18,7 @@ from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe
 from reskin.seeds import rng_for
 
 ROWS_N = 48  # twelve rows on each of four skins
-TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
+TRAIN, TEST, POKED, LABELLED = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
 
@@ -102,5 +102,5 @@ def adaptation(*, unlabelled_weight: float = 0.5, along: Lines | None = None) ->
 
 
 def fine_tuning(*, own_weight: float = 0.5) -> TrainingJob:
-    tuning = FineTuning(start(), FineTuningRecipe(own_weight=own_weight, **SETTINGS), OWN)
+    tuning = FineTuning(start(), FineTuningRecipe(own_weight=own_weight, **SETTINGS), LABELLED)
     return replace(pooled(), experiment="labels", skin="b1_s1", tuning=tuning)

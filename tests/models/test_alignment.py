@@ -14,48 +14,50 @@ def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
 
-OF, TO = draw_inputs("of"), draw_inputs("to", n=70)
+SOURCE, TARGET = draw_inputs("of"), draw_inputs("to", n=70)
 
 
 def test_matched_channels_have_the_means_and_deviations():
-    moved = match_channels(OF, TO)(OF)
-    np.testing.assert_allclose(moved.mean(axis=0), TO.mean(axis=0))
-    np.testing.assert_allclose(moved.std(axis=0, ddof=1), TO.std(axis=0, ddof=1))
+    moved = match_channels(SOURCE, TARGET)(SOURCE)
+    np.testing.assert_allclose(moved.mean(axis=0), TARGET.mean(axis=0))
+    np.testing.assert_allclose(moved.std(axis=0, ddof=1), TARGET.std(axis=0, ddof=1))
 
 
 def test_gains_and_offsets_are_removed():
     gains, offsets = np.array([0.5, 2.0, 1.3, 0.9]), np.array([3.0, -7.0, 0.0, 40.0])
-    np.testing.assert_allclose(match_channels(OF, OF * gains + offsets)(OF), OF * gains + offsets)
+    np.testing.assert_allclose(match_channels(SOURCE, SOURCE * gains + offsets)(SOURCE), SOURCE * gains + offsets)
 
 
 def test_coral_matches_the_covariance():
-    moved = coral(OF, TO, ridge=0.0)(OF)
-    np.testing.assert_allclose(np.cov(moved, rowvar=False), np.cov(TO, rowvar=False))
-    np.testing.assert_allclose(moved.mean(axis=0), TO.mean(axis=0))
+    moved = coral(SOURCE, TARGET, ridge=0.0)(SOURCE)
+    np.testing.assert_allclose(np.cov(moved, rowvar=False), np.cov(TARGET, rowvar=False))
+    np.testing.assert_allclose(moved.mean(axis=0), TARGET.mean(axis=0))
 
 
 def test_coral_uses_square_roots_of_covariances():
-    scale = OF.std(axis=0, ddof=1)
-    source, target = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (OF, TO))
-    expected = (OF - OF.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(source)) @ sqrtm(target) * scale + TO.mean(axis=0)
-    np.testing.assert_allclose(coral(OF, TO)(OF), expected)
+    scale = SOURCE.std(axis=0, ddof=1)
+    source, target = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (SOURCE, TARGET))
+    expected = (SOURCE - SOURCE.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(source)) @ sqrtm(
+        target
+    ) * scale + TARGET.mean(axis=0)
+    np.testing.assert_allclose(coral(SOURCE, TARGET)(SOURCE), expected)
 
 
 @pytest.mark.parametrize("align", [match_channels, coral])
 def test_alignment_with_itself_is_the_identity(align):
-    np.testing.assert_allclose(align(OF, OF)(OF), OF)
+    np.testing.assert_allclose(align(SOURCE, SOURCE)(SOURCE), SOURCE)
 
 
 def test_constant_channel_is_moved_but_not_scaled():
-    source, target = OF.copy(), TO.copy()
+    source, target = SOURCE.copy(), TARGET.copy()
     source[:, 1], target[:, 1] = 3.0, 5.0
     np.testing.assert_allclose(match_channels(source, target)(source)[:, 1], 5.0)
 
 
 def test_direct_standardisation_recovers_a_linear_map():
     known = np.eye(4) + 0.3 * rng_for(0, "known map").standard_normal((4, 4))
-    np.testing.assert_allclose(direct(OF, OF @ known, 1e-12).matrix, known, rtol=1e-6)
-    np.testing.assert_allclose(direct(OF, OF @ known, 1e12).matrix, np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(direct(SOURCE, SOURCE @ known, 1e-12).matrix, known, rtol=1e-6)
+    np.testing.assert_allclose(direct(SOURCE, SOURCE @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
 def test_undetermined_directions_are_unchanged():

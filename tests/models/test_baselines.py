@@ -23,8 +23,8 @@ SETTINGS = {
     "boosting": {"method": "boosting", "rounds_n": 5, "rate": 0.2, "leaves_n": 7},
 }
 ROWS_N, CH_N = 90, 5
-TRAIN, OWN, TEST = np.arange(0, 60, 2), np.arange(60, 66), np.arange(70, 90)
-NONE = np.zeros(0, np.int64)
+TRAIN, NEW_SKIN_ROWS, TEST = np.arange(0, 60, 2), np.arange(60, 66), np.arange(70, 90)
+NO_ROWS = np.zeros(0, np.int64)
 
 
 class PicklingExecutor(Executor):
@@ -52,7 +52,7 @@ def method(name: str = "ridge", inputs: str = "raw") -> Classical:
 
 
 def task(one: Classical | None = None, **changes: Any) -> ClassicalJob:
-    values = {"name": "one", "method": one or method(), "train": TRAIN, "test": TEST, "few_labels": NONE}
+    values = {"name": "one", "method": one or method(), "train": TRAIN, "test": TEST, "few_labels": NO_ROWS}
     return ClassicalJob(**values | {"rows_max_n": 1000, "seed": 3} | changes)
 
 
@@ -84,27 +84,27 @@ def expected_inputs(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", SETTINGS)
 def test_job_equals_direct_call(name, inputs):
     one = method(name, inputs)
-    (got,) = results_of(task(one))
+    (found,) = results_of(task(one))
     train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
     # Inputs of 1 uT to 200 uT may differ in the last bit of float32; predictions then differ by at most 1e-5.
-    np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
-    assert got.rows_n == 30
-    assert got.seconds > 0
-    assert got.one_reading_s > 0
+    np.testing.assert_allclose(found.predicted, by_hand.predict(test), atol=1e-5)
+    assert found.rows_n == 30
+    assert found.seconds > 0
+    assert found.one_reading_s > 0
 
 
 def test_labels_of_a_new_skin_weigh_as_much_as_all_others():
-    (got,) = results_of(task(few_labels=OWN))
-    train = np.concatenate([TRAIN, OWN])
+    (found,) = results_of(task(few_labels=NEW_SKIN_ROWS))
+    train = np.concatenate([TRAIN, NEW_SKIN_ROWS])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
     weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 weigh as much as 30 rows
     plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
-    wanted = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
-    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # rounding to float32
-    assert got.rows_n == 36
-    assert np.abs(got.predicted - results_of(task())[0].predicted).max() > 1e-3
+    expected = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
+    np.testing.assert_allclose(found.predicted, expected, atol=1e-5)  # rounding to float32
+    assert found.rows_n == 36
+    assert np.abs(found.predicted - results_of(task())[0].predicted).max() > 1e-3
 
 
 @settings(max_examples=20, deadline=None)
@@ -137,11 +137,11 @@ def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
 
 
 def test_thinning_keeps_the_given_number_of_rows(fits):
-    done = results_of(task(rows_max_n=12), task(rows_max_n=12, few_labels=OWN), task(rows_max_n=30))
+    done = results_of(task(rows_max_n=12), task(rows_max_n=12, few_labels=NEW_SKIN_ROWS), task(rows_max_n=30))
     thinned, with_own, whole = rows_of(fits)
     assert len(set(thinned)) == len(thinned) == 12
     assert set(thinned) < set(TRAIN)
-    assert with_own == [*thinned, *OWN]  # labelled rows of a new skin are never dropped
+    assert with_own == [*thinned, *NEW_SKIN_ROWS]  # labelled rows of a new skin are never dropped
     assert whole == TRAIN.tolist()
     assert [one.rows_n for one in done] == [12, 18, 30]
     for one, numbers in zip(fits, (thinned, with_own, whole), strict=True):
@@ -168,11 +168,11 @@ def test_results_are_in_the_order_of_jobs_and_logged():
 
 @pytest.mark.parametrize("name", SETTINGS)
 def test_targets_of_test_rows_do_not_matter(name):
-    used = np.concatenate([TRAIN, OWN])
+    used = np.concatenate([TRAIN, NEW_SKIN_ROWS])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
-    (got,), (other,) = (
-        results_of(task(method(name), few_labels=OWN), rows=rows)
+    (found,), (other,) = (
+        results_of(task(method(name), few_labels=NEW_SKIN_ROWS), rows=rows)
         for rows in (ROWS, TrainingData(ROWS.db_uT, others, ROWS.skin))
     )
-    assert (got.predicted == other.predicted).all()
+    assert (found.predicted == other.predicted).all()

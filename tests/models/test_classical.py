@@ -48,8 +48,8 @@ def standardise(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return inputs, targets and queries standardised by the mean and deviation of the training rows."""
     mean, sd = db_uT.mean(axis=0, dtype=float), db_uT.std(axis=0, dtype=float)
-    wanted = (target - target.mean(axis=0, dtype=float)) / target.std(axis=0, dtype=float)
-    return (db_uT - mean) / sd, wanted, (query_uT - mean) / sd
+    expected = (target - target.mean(axis=0, dtype=float)) / target.std(axis=0, dtype=float)
+    return (db_uT - mean) / sd, expected, (query_uT - mean) / sd
 
 
 def unstandardise(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -65,9 +65,9 @@ def test_ridge_equals_closed_form(weighted):
     w = np.ones(len(a)) if weight is None else weight.astype(float)
     a1, q1 = np.c_[a, np.ones(len(a))], np.c_[q, np.ones(len(q))]
     penalty = np.diag([3.0] * 5 + [0.0])  # the intercept is not penalised
-    wanted = q1 @ np.linalg.solve(a1.T @ (w[:, None] * a1) + penalty, a1.T @ (w[:, None] * t))
-    got = fit_to("ridge", db_uT, target, weight, alpha=3.0).predict(query_uT)
-    np.testing.assert_allclose(got, unstandardise(wanted, target), atol=PREDICTION_ATOL_MM)
+    expected = q1 @ np.linalg.solve(a1.T @ (w[:, None] * a1) + penalty, a1.T @ (w[:, None] * t))
+    found = fit_to("ridge", db_uT, target, weight, alpha=3.0).predict(query_uT)
+    np.testing.assert_allclose(found, unstandardise(expected, target), atol=PREDICTION_ATOL_MM)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -76,14 +76,14 @@ def test_knn_weights_neighbours_by_inverse_distance(weighted):
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1, n=20)
     a, _, q = standardise(db_uT, target, query_uT)
-    got = fit_to("knn", db_uT, target, weight).predict(query_uT)
+    found = fit_to("knn", db_uT, target, weight).predict(query_uT)
     for i in range(len(q)):
         distances = [math.sqrt(sum((q[i, c] - a[j, c]) ** 2 for c in range(5))) for j in range(len(a))]
         nearest = sorted(range(len(a)), key=lambda j, distances=distances: distances[j])[:4]
         votes = [(1.0 if weight is None else float(weight[j])) / distances[j] for j in nearest]
         for column in range(3):
-            wanted = sum(v * float(target[j, column]) for v, j in zip(votes, nearest, strict=True)) / sum(votes)
-            assert got[i, column] == pytest.approx(wanted, abs=PREDICTION_ATOL_MM)
+            expected = sum(v * float(target[j, column]) for v, j in zip(votes, nearest, strict=True)) / sum(votes)
+            assert found[i, column] == pytest.approx(expected, abs=PREDICTION_ATOL_MM)
 
 
 @every_method
@@ -91,9 +91,9 @@ def test_prediction_does_not_depend_on_blocks(method):
     db_uT, target = rows()
     fitted = fit_to(method, db_uT, target)
     query_uT, _ = rows(1, n=BLOCK_ROWS_N + 2)
-    got = fitted.predict(query_uT)
+    found = fitted.predict(query_uT)
     for i in (0, BLOCK_ROWS_N - 1, BLOCK_ROWS_N, BLOCK_ROWS_N + 1):
-        np.testing.assert_allclose(got[i : i + 1], fitted.predict(query_uT[i : i + 1]), atol=PREDICTION_ATOL_MM)
+        np.testing.assert_allclose(found[i : i + 1], fitted.predict(query_uT[i : i + 1]), atol=PREDICTION_ATOL_MM)
 
 
 def test_knn_returns_the_target_at_distance_0():
@@ -113,9 +113,9 @@ def test_rbf_equals_kernel_solve(weighted):
     def kernel(u, v):
         return np.array([[math.exp(-0.1 * sum((x - y) ** 2)) for y in v] for x in u])
 
-    wanted = kernel(q, a) @ np.linalg.solve(kernel(a, a) + np.diag(0.1 / w), t)
-    got = fit_to("rbf_ridge", db_uT, target, weight).predict(query_uT)
-    np.testing.assert_allclose(got, unstandardise(wanted, target), atol=PREDICTION_ATOL_MM)
+    expected = kernel(q, a) @ np.linalg.solve(kernel(a, a) + np.diag(0.1 / w), t)
+    found = fit_to("rbf_ridge", db_uT, target, weight).predict(query_uT)
+    np.testing.assert_allclose(found, unstandardise(expected, target), atol=PREDICTION_ATOL_MM)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
@@ -125,9 +125,9 @@ def test_cubic_ridge_equals_scikit_learn(weighted):
     query_uT, _ = rows(1)
     a, t, q = standardise(db_uT, target, query_uT)
     lift = PolynomialFeatures(3, include_bias=False)
-    wanted = Ridge(3.0).fit(lift.fit_transform(a), t, weight).predict(lift.transform(q))
-    got = fit_to("cubic_ridge", db_uT, target, weight, alpha=3.0).predict(query_uT)
-    np.testing.assert_allclose(got, unstandardise(wanted, target), atol=PREDICTION_ATOL_MM)
+    expected = Ridge(3.0).fit(lift.fit_transform(a), t, weight).predict(lift.transform(q))
+    found = fit_to("cubic_ridge", db_uT, target, weight, alpha=3.0).predict(query_uT)
+    np.testing.assert_allclose(found, unstandardise(expected, target), atol=PREDICTION_ATOL_MM)
 
 
 def test_cubic_function_is_recovered():
@@ -139,9 +139,9 @@ def test_cubic_function_is_recovered():
         return np.c_[a * b * c - d**3, 1 + a - b**2 * d, c * d + a**3].astype(np.float32)
 
     query_uT = rng.uniform(-30, 30, (50, 4)).astype(np.float32)
-    got = fit_to("cubic_ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
+    found = fit_to("cubic_ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
     # predictions up to 54, in float32 (relative rounding 6e-8)
-    np.testing.assert_allclose(got, cubic(query_uT), atol=1e-4)
+    np.testing.assert_allclose(found, cubic(query_uT), atol=1e-4)
     plane = fit_to("ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
     assert np.abs(plane - cubic(query_uT)).max() > 1
 
@@ -157,8 +157,8 @@ def test_boosting_is_deterministic():
 @every_method
 def test_predictions_are_better_than_the_mean_target(method):
     db_uT, target = rows(n=600)
-    got = fit_to(method, db_uT[:400], target[:400]).predict(db_uT[400:])
-    error, spread = ((got - target[400:]) ** 2).mean(axis=0), target[400:].var(axis=0)
+    found = fit_to(method, db_uT[:400], target[:400]).predict(db_uT[400:])
+    error, spread = ((found - target[400:]) ** 2).mean(axis=0), target[400:].var(axis=0)
     assert (error < 0.7 * spread).all()
 
 
@@ -170,9 +170,9 @@ def test_other_units_of_targets_scale_the_predictions(method, seed, power):
     db_uT, target = rows(seed, n=60)
     query_uT, _ = rows(seed + 1, n=20)
     factor = np.float32(2.0**power)
-    got = fit_to(method, db_uT, target).predict(query_uT)
+    found = fit_to(method, db_uT, target).predict(query_uT)
     other = fit_to(method, db_uT, target * factor).predict(query_uT)
-    np.testing.assert_allclose(other / factor, got, atol=PREDICTION_ATOL_MM)
+    np.testing.assert_allclose(other / factor, found, atol=PREDICTION_ATOL_MM)
 
 
 @every_method
@@ -180,11 +180,11 @@ def test_other_units_of_targets_scale_the_predictions(method, seed, power):
 def test_shifted_places_shift_the_predictions(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    target = np.round(target * 64) / 64  # so that the shift causes no rounding
-    got = fit_to(method, db_uT, target).predict(query_uT)
+    target = np.round(target * 64) / 64  # multiples of 1/64 mm, which are still exact after the shift
+    found = fit_to(method, db_uT, target).predict(query_uT)
     other = fit_to(method, db_uT, target + np.float32(shift_mm)).predict(query_uT)
     # additional tolerance: shifted predictions of up to 500 mm are rounded to float32 (6e-8)
-    np.testing.assert_allclose(other - shift_mm, got, atol=PREDICTION_ATOL_MM + 6e-8 * abs(shift_mm))
+    np.testing.assert_allclose(other - shift_mm, found, atol=PREDICTION_ATOL_MM + 6e-8 * abs(shift_mm))
 
 
 @every_method
@@ -192,8 +192,8 @@ def test_constant_channel_is_ignored(method):
     db_uT, target = rows()
     query_uT, _ = rows(1)
     constant = np.full((len(db_uT), 1), 0.1, np.float32)
-    got = fit_to(method, np.hstack([db_uT, constant]), target).predict(np.hstack([query_uT, constant + 5]))
-    np.testing.assert_allclose(got, fit_to(method, db_uT, target).predict(query_uT), atol=PREDICTION_ATOL_MM)
+    found = fit_to(method, np.hstack([db_uT, constant]), target).predict(np.hstack([query_uT, constant + 5]))
+    np.testing.assert_allclose(found, fit_to(method, db_uT, target).predict(query_uT), atol=PREDICTION_ATOL_MM)
 
 
 @every_method
@@ -202,10 +202,10 @@ def test_unknown_force_leaves_places_unchanged(method):
     query_uT, _ = rows(1)
     placed = target.copy()
     placed[:, 2] = np.nan
-    got = fit_to(method, db_uT, placed).predict(query_uT)
-    assert np.isnan(got[:, 2]).all()
+    found = fit_to(method, db_uT, placed).predict(query_uT)
+    assert np.isnan(found[:, 2]).all()
     np.testing.assert_allclose(
-        got[:, :2], fit_to(method, db_uT, target).predict(query_uT)[:, :2], atol=PREDICTION_ATOL_MM
+        found[:, :2], fit_to(method, db_uT, target).predict(query_uT)[:, :2], atol=PREDICTION_ATOL_MM
     )
 
 
@@ -216,13 +216,13 @@ def test_force_that_is_known_for_some_rows_is_learned(method):
     query_uT, _ = rows(1)
     both = np.vstack([target, target])
     both[80:, 2] = np.nan
-    got = fit_to(method, np.vstack([db_uT, db_uT]), both).predict(query_uT)
+    found = fit_to(method, np.vstack([db_uT, db_uT]), both).predict(query_uT)
     np.testing.assert_allclose(
-        got[:, 2], fit_to(method, db_uT, target).predict(query_uT)[:, 2], atol=PREDICTION_ATOL_MM
+        found[:, 2], fit_to(method, db_uT, target).predict(query_uT)[:, 2], atol=PREDICTION_ATOL_MM
     )
     whole = fit_to(method, np.vstack([db_uT, db_uT]), np.vstack([target, target])).predict(query_uT)
     if method != "rbf_ridge":  # excluded, because rbf_ridge uses a random 100 of the 160 rows
-        np.testing.assert_allclose(got[:, :2], whole[:, :2], atol=PREDICTION_ATOL_MM)
+        np.testing.assert_allclose(found[:, :2], whole[:, :2], atol=PREDICTION_ATOL_MM)
 
 
 @every_method
@@ -231,13 +231,13 @@ def test_rows_of_large_weight_dominate_the_prediction(method):
     db_uT, target = rows(n=400)
     further = np.arange(400) < 40
     target[further, 0] += 8
-    query_uT, wanted = rows(1)
+    query_uT, expected = rows(1)
     most = {"rows_max_n": 400} if method == "rbf_ridge" else {}
     errors_mm = []
     for weight_of_one in (1e-3, 20.0):
         weight = np.where(further, weight_of_one, 1).astype(np.float32)
         predicted = fit_to(method, db_uT, target, weight, **most).predict(query_uT)
-        errors_mm.append((predicted[:, 0] - wanted[:, 0] - 8).mean())
+        errors_mm.append((predicted[:, 0] - expected[:, 0] - 8).mean())
     assert errors_mm[0] == pytest.approx(-8, abs=1)  # the other rows have a third of the total weight
     assert errors_mm[1] > -6
 
@@ -257,11 +257,11 @@ def test_rbf_keeps_rows_of_greater_weight():
     db_uT, target = rows(n=300)
     db_uT[:5] += 1e5 * np.arange(1, 6)[:, None]
     weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)  # together, half the weight of the others
-    got = fit_to("rbf_ridge", db_uT, target, weight, gamma=300.0, rows_max_n=64).predict(db_uT[:5])
+    found = fit_to("rbf_ridge", db_uT, target, weight, gamma=300.0, rows_max_n=64).predict(db_uT[:5])
     lowered = 59 * 59 / 295  # 59 of the 295 other rows are kept, each standing for five
     mean = target.mean(axis=0, dtype=float)
-    wanted = mean + (target[:5] - mean) / (1 + 0.1 / lowered)
-    np.testing.assert_allclose(got, wanted, atol=PREDICTION_ATOL_MM)
+    expected = mean + (target[:5] - mean) / (1 + 0.1 / lowered)
+    np.testing.assert_allclose(found, expected, atol=PREDICTION_ATOL_MM)
 
 
 def test_rbf_refuses_too_many_weighted_rows():

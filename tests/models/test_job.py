@@ -12,7 +12,7 @@ from reskin.models.job import CODE_MODULES, JobKeys, LossWeights, TrainingData, 
 from reskin.models.recipe import AugmentedRecipe
 from reskin.models.train import train_stack
 from tests.models.example_jobs import (
-    OWN,
+    LABELLED,
     POKED,
     ROWS_N,
     TEST,
@@ -47,11 +47,11 @@ def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
 
 
 @pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
-@pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
-def test_adaptation_ignores_places_and_forces_of_the_new_skin(at, new):
+@pytest.mark.parametrize("rows", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
+def test_adaptation_ignores_places_and_forces_of_the_new_skin(rows, new):
     once, blind = (
         train_job(adaptation(), example_data()),
-        train_job(adaptation(), with_values(example_data(), "target", at, new)),
+        train_job(adaptation(), with_values(example_data(), "target", rows, new)),
     )
     assert equal_results(once, blind)
     assert (once.predicted == blind.predicted).all()
@@ -93,20 +93,20 @@ def test_pokes_use_the_scaler_of_the_pretrained_network():
     assert len(prepared.unlabelled.inputs) == 4
 
 
-@pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
-def test_control_uses_no_data_of_the_new_skin(at):
+@pytest.mark.parametrize("rows", [POKED, NEW], ids=["poked", "all"])
+def test_control_uses_no_data_of_the_new_skin(rows):
     control = adaptation(unlabelled_weight=0.0)
     once = train_job(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
-        assert equal_results(once, train_job(control, with_values(example_data(), part, at, new)))
+        assert equal_results(once, train_job(control, with_values(example_data(), part, rows, new)))
     assert not equal_results(once, train_job(adaptation(), example_data()))
 
 
 def test_fine_tuning_uses_only_the_given_labels_of_the_new_skin():
     once = train_job(fine_tuning(), example_data())
-    others = np.setdiff1d(NEW, OWN)
+    others = np.setdiff1d(NEW, LABELLED)
     assert equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", others, np.nan)))
-    assert not equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", OWN, 0)))
+    assert not equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", LABELLED, 0)))
     assert not equal_results(once, train_job(fine_tuning(own_weight=0.0), example_data()))
 
 
@@ -211,8 +211,8 @@ INFLUENTIAL_ROWS = {
     "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
     "a tested field": ("pooled", with_row("db_uT", TEST[3], 1.0)),
     "a poked field": ("adapting", with_row("db_uT", POKED[3], 1.0)),
-    "an own field": ("few labels", with_row("db_uT", OWN[1], 1.0)),
-    "an own label": ("few labels", with_row("target", OWN[1], 1.0)),
+    "an own field": ("few labels", with_row("db_uT", LABELLED[1], 1.0)),
+    "an own label": ("few labels", with_row("target", LABELLED[1], 1.0)),
 }
 OTHER_ROWS = {
     "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
@@ -256,7 +256,7 @@ def test_different_settings_have_different_keys():
         adaptation(along=replace(along, order_i=along.order_i[::-1].copy())),
         adaptation(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
         adaptation(along=replace(along, row=along.row[::-1].copy())),
-        with_tuning(fine_tuning(), row=OWN[:2]), with_tuning_settings(fine_tuning(), own_weight=0.25),
+        with_tuning(fine_tuning(), row=LABELLED[:2]), with_tuning_settings(fine_tuning(), own_weight=0.25),
     ]  # fmt: skip
     assert len({key(job) for job in jobs}) == len(jobs)
 

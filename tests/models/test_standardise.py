@@ -59,9 +59,9 @@ def test_decode_inverts_encode(seed):
     rng = rng_for(seed, "round trip")
     db_uT, target = rows()
     scaler = fit_standard(db_uT, target)
-    wanted = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
+    expected = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
     # tolerance: two float32 roundings
-    np.testing.assert_allclose(scaler.decode(scaler.encode_target(wanted)), wanted, atol=1e-4)
+    np.testing.assert_allclose(scaler.decode(scaler.encode_target(expected)), expected, atol=1e-4)
 
 
 def test_scaler_round_trip():

@@ -20,7 +20,7 @@ NO_TERMS = LossWeights(0.0)
 # Tolerances. Sums differ by 6e-8 of a term if the order, the processor or the memory alignment changes. AdamW divides a
 # gradient by its size: if rounding makes a ReLU positive for one row, all weights of this unit move by a whole step.
 # One unit of 200 changes the distance from the start by at most 7 %; a missing loss term changes it by more.
-WAY = 2e-2
+DISTANCE_MAX = 2e-2
 
 
 def run(jobs: list[PreparedJob], schedule: Recipe, terms: LossWeights = NO_TERMS) -> list[Outcome]:
@@ -89,7 +89,10 @@ def test_stack_equals_single_training(terms, batch_n):
     together = run([some_job(i, terms=True) for i in range(3)], schedule, terms)
     for i in range(3):
         (alone,) = run([some_job(i, terms=True)], schedule, terms)
-        assert relative_distance(together[i].weights, alone.weights, some_job(i, terms=True).initial_weights) < WAY
+        assert (
+            relative_distance(together[i].weights, alone.weights, some_job(i, terms=True).initial_weights)
+            < DISTANCE_MAX
+        )
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
@@ -110,7 +113,7 @@ def test_stack_equals_plain_pytorch_loop(terms, decay):
     feed = BatchSampler([some_job(terms=True)], schedule.batch_n, "cpu")
     batches = chain.from_iterable(feed.sample(n) for n in block_sizes(steps_n))
     truth = plain_train(some_job().initial_weights, batches, schedule, terms)
-    assert relative_distance(outcome.weights, truth, some_job(terms=True).initial_weights) < WAY
+    assert relative_distance(outcome.weights, truth, some_job(terms=True).initial_weights) < DISTANCE_MAX
 
 
 def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float:
@@ -143,7 +146,8 @@ def test_data_of_each_loss_term_changes_the_weights(name):
 
 
 def test_unlabelled_pokes_train_the_feature_layers_only():
-    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # no clipping, which would scale all layers
+    # one large step without clipping, which would scale the gradients of all layers
+    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
@@ -153,7 +157,7 @@ def test_unlabelled_pokes_train_the_feature_layers_only():
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
 def test_curve_is_the_mean_loss_of_each_block(steps_n):
-    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # so that the weights hardly change
+    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # a rate with which the weights hardly change
     job = some_job()
     (outcome,) = run([job], schedule)
     feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []

@@ -98,11 +98,11 @@ def test_force_at_a_reading_follows_approach_and_hold():
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 
 
-REMEMBERED = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
+MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 
 
 def test_field_memory_equals_integration_in_small_steps():
-    stops_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 3, 2, 3)), REMEMBERED, 20_000
+    stops_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 3, 2, 3)), MEMORY, 20_000
     change_T = stops_T.mean(axis=1)
     q_T = np.zeros((2, *change_T.shape[1:]))
     before_T, added_T = field_memory(stops_T, how)
@@ -120,7 +120,7 @@ def test_field_memory_equals_integration_in_small_steps():
 def test_memory_of_a_press_is_5_to_8_percent():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
-    before_T, _ = field_memory(once_T, REMEMBERED)
+    before_T, _ = field_memory(once_T, MEMORY)
     left = before_T[:, 0, 0] / 1e-3
     assert left[0] == 0
     assert 0.05 < left[1] < 0.08
@@ -130,21 +130,19 @@ def test_memory_of_a_press_is_5_to_8_percent():
 def test_hovering_tip_leaves_no_memory():
     stops_T = np.zeros((2, 4, 1, 3))
     stops_T[:, 2] = 1e-3  # field changes at the stops: none, none, a press, none
-    _, added_T = field_memory(stops_T, REMEMBERED)
+    _, added_T = field_memory(stops_T, MEMORY)
     assert not added_T[0, :2].any()
     assert (added_T[0, 2:] > 0).all()
     one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press with the same mean field change
-    np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, REMEMBERED)[1][0, 0])
+    np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, MEMORY)[1][0, 0])
 
 
 @given(st.floats(-3, 3))
 def test_memory_is_linear_and_needs_time(factor):
     change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
-    for once, times in zip(
-        field_memory(change_T, REMEMBERED), field_memory(factor * change_T, REMEMBERED), strict=True
-    ):
+    for once, times in zip(field_memory(change_T, MEMORY), field_memory(factor * change_T, MEMORY), strict=True):
         np.testing.assert_allclose(times, factor * once, atol=1e-18)
-    at_once = REMEMBERED.model_copy(update={"contact_s": 0.0, "rest_s": 0.0})
+    at_once = MEMORY.model_copy(update={"contact_s": 0.0, "rest_s": 0.0})
     assert not any(part.any() for part in field_memory(change_T, at_once))
 
 
@@ -216,7 +214,7 @@ def test_wear_without_remaining_stiffness_is_refused():
         softening(np.array([10_000]), settling=0.99, ageing=0.1)
 
 
-HOW = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
+TEMPERATURE = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
 
 
 def test_magnetisation_loses_3_6_uT_of_3_mT_per_kelvin():
@@ -226,16 +224,18 @@ def test_magnetisation_loses_3_6_uT_of_3_mT_per_kelvin():
 
 
 def test_board_warms_up_exponentially():
-    np.testing.assert_allclose(temperature_rise_K(np.array([0.0, 100.0, 1e5]), HOW), [0.0, 4 * (1 - np.exp(-1)), 4.0])
+    np.testing.assert_allclose(
+        temperature_rise_K(np.array([0.0, 100.0, 1e5]), TEMPERATURE), [0.0, 4 * (1 - np.exp(-1)), 4.0]
+    )
 
 
 @given(st.floats(0, 1e5))
 def test_room_temperature_oscillates_about_the_warming(time_s):
-    room = HOW.model_copy(update={"swing_K": 2.0})
+    room = TEMPERATURE.model_copy(update={"swing_K": 2.0})
     assert temperature_rise_K(np.zeros(1), room) == 0  # rises are relative to the start
     # The oscillation starts with a rise.
-    assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), HOW)
+    assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), TEMPERATURE)
     time = np.array([time_s, time_s + 300.0])  # times that are half a period apart
-    swing_K = temperature_rise_K(time, room) - temperature_rise_K(time, HOW)
+    swing_K = temperature_rise_K(time, room) - temperature_rise_K(time, TEMPERATURE)
     assert swing_K.sum() == pytest.approx(0.0, abs=1e-9)
     assert np.abs(swing_K).max() <= 2.0

@@ -8,11 +8,11 @@ from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
-# greatest depth of a drag in the scenes; contact radius / thickness of the layer in finite elements
-DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75
-TAKEN_M = np.array([4e-5, 7e-5])
+DRAG_M = 0.9e-3  # greatest depth of a drag in the scenes
+DEEPEST_RADIUS_H = 0.75  # at least the contact radius of the deepest drag, divided by the thickness of the layer
+DISPLACEMENT_M = np.array([4e-5, 7e-5])
 HELD = {
-    # condition at the outer edge: u_r falls as 1 / r
+    # at the outer edge, u_r falls as 1 / r, which springs of stiffness 2 / r imitate
     "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},
     "bonded": {"held": {"axis": [0], "base": [0, 1], "far": [0]}, "drag": {}},
 }
@@ -80,11 +80,11 @@ def half_curl(motion):
 
 def test_finite_elements_cover_the_deepest_drag():
     contact = layer.contact_of_depth(DRAG_M, thickness_m=H_M, tip_radius_m=TIP_M, base="slipping")
-    assert 0.7 < contact.radius_m / H_M < AS_ON_THE_SKIN
+    assert 0.7 < contact.radius_m / H_M < DEEPEST_RADIUS_H
 
 
-# A contact as on the skin, and one on a thin layer, which covers many cells. Measured errors: 0.8 % and 0.05 %.
-@pytest.mark.parametrize(("radius_h", "tolerance"), [(AS_ON_THE_SKIN, 0.012), (2.5, 1e-3)])
+# The deepest drag on the skin, and a contact on a thin layer, which covers many cells. Measured errors: 0.8 %, 0.05 %.
+@pytest.mark.parametrize(("radius_h", "tolerance"), [(DEEPEST_RADIUS_H, 0.012), (2.5, 1e-3)])
 def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
     traction = shear.Traction(radius_m, radius_m * layer.CONTACT_X, chi / chi.sum())
@@ -101,10 +101,10 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     found = [*motion.parts_m[:, near], *half_curl(motion)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]
     assert max(errors[:3]) < tolerance
-    assert max(errors[3:]) < 4 * tolerance  # gradients converge with one order less
+    assert max(errors[3:]) < 4 * tolerance  # the order of convergence of gradients is lower by one
     assert 1 / solved.under_load_m == pytest.approx(table.stiffness_m, rel=5e-4)
     d, e, s = half_curl(solved.top)
-    # 5 %: finite elements give 4 % and 0.4 % less beside the edge of the contact
+    # 5 %: beside the edge of the contact, finite elements give 4 % and 0.4 % less for the two contacts
     assert max(np.abs(d + e).max(), np.hypot(d - e, s).max()) == pytest.approx(table.steepest_per_m2, rel=0.05)
 
 
@@ -112,12 +112,12 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
 def test_stiff_plate_under_uniform_drag_moves_rigidly(sides_m):
     misses_m = []
     for stiffness in (1e3, 1e4):
-        middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), TAKEN_M, stiffness)
-        rigid = slide.rigid_motion(middle_m[None], TAKEN_M[None], sides_m)
+        middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), DISPLACEMENT_M, stiffness)
+        rigid = slide.rigid_motion(middle_m[None], DISPLACEMENT_M[None], sides_m)
         misses_m.append(np.append(move_m - rigid.move_m[0], (spin_rad - rigid.spin_rad[0]) * sides_m[0] / 2))
-    assert np.abs(misses_m[1]).max() < 1e-4 * TAKEN_M.max()
+    assert np.abs(misses_m[1]).max() < 1e-4 * DISPLACEMENT_M.max()
     # the deviation from a rigid motion is inversely proportional to the stiffness
-    np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * TAKEN_M.max())
+    np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * DISPLACEMENT_M.max())
 
 
 def test_base_friction_interpolates_between_slipping_and_bonded():

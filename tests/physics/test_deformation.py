@@ -35,7 +35,7 @@ def det_f(deformed):
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
 def test_surface_follows_the_tip(depth_m, base):
-    # If the deformation was computed in one step, the surface would miss the tip by 27 % of the depth at 1.2 mm.
+    # If the deformation were computed in one step, the surface would miss the tip by 27 % of the depth at 1.2 mm.
     assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
 
@@ -77,7 +77,7 @@ def test_steps_converge_quadratically(monkeypatch):
     for step in (0.1, 0.05, 0.025):
         ladder = np.array([0.0, step / 4, step / 2, *np.arange(step, 1.01, step)])
         monkeypatch.setattr(deformation, "LADDER", ladder)
-        # a depth of a whole number of steps
+        # this depth is a whole number of steps
         found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))
     loss = [np.abs(det_f(deformed) - 1).max() for deformed in found]
     assert loss[1] < loss[0] / 2.5

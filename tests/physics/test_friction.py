@@ -106,11 +106,11 @@ def test_friction_opposes_slip(path_m, mu):
 @given(paths_m, frictions, st.floats(-np.pi, np.pi))
 def test_rotating_the_path_rotates_the_force(path_m, mu, angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
-    unrotated, turned = (
+    unrotated, rotated = (
         drag_force(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
     )
     # rounding of 40 steps of up to 30 N (before limiting by friction)
-    np.testing.assert_allclose(turned, unrotated @ turn.T, atol=1e-10)
+    np.testing.assert_allclose(rotated, unrotated @ turn.T, atol=1e-10)
 
 
 def test_force_turns_within_a_few_spring_lengths():

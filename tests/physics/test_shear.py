@@ -38,7 +38,7 @@ def sliding(depth_m=0.6e-3):
 
 
 def displacement_m(traction, places_m, thickness_m=H_M):
-    """Return the displacement for a force along x, in units of Q / G, computed from the definition of `ShearMap`."""
+    """Return the displacement in m for a force Q along x that equals the shear modulus G in value (Q / G = 1 m^2)."""
     found = []
     for x, y, z in np.atleast_2d(places_m):
         r, f = np.hypot(x, y), np.arctan2(y, x)
@@ -48,7 +48,10 @@ def displacement_m(traction, places_m, thickness_m=H_M):
 
 
 def gradients(traction, places_m, step_m=2e-6):
-    """Return u_i,j by central differences; relative error of 3e-4 for the shortest wavelength, 0.3 mm."""
+    """Return the displacement gradient u_i,j by central differences, with a relative error of at most 3e-4.
+
+    The error is largest for the shortest wavelength, 0.3 mm.
+    """
     steps = step_m * np.eye(3)
     pairs = [(displacement_m(traction, places_m + e) - displacement_m(traction, places_m - e)) for e in steps]
     return np.stack(pairs, axis=-1) / (2 * step_m)
@@ -128,7 +131,7 @@ def test_boundary_conditions_of_short_waves():
 
 
 def test_bettis_reciprocity_with_pressure():
-    """Betti: each of two loads (pressure, traction) does the same work on the displacement by the other load."""
+    """Betti's theorem: pressure does the same work on the displacement by traction as traction on that by pressure."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
@@ -279,13 +282,13 @@ def test_displacement_is_linear(one_N, other_N, times):
 def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
     nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    unrotated, turned = (
+    unrotated, rotated = (
         displace(force_N, nodes_m, centre_m=(0, 0)),
         displace(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
     # rounding may move a node at the edge of a table cell to the next cell, which has the same value there
-    np.testing.assert_allclose(turned.displacement_m, unrotated.displacement_m @ turn.T, atol=1e-10)
-    np.testing.assert_allclose(turned.half_curl, unrotated.half_curl @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(rotated.displacement_m, unrotated.displacement_m @ turn.T, atol=1e-10)
+    np.testing.assert_allclose(rotated.half_curl, unrotated.half_curl @ turn.T, atol=1e-9)
 
 
 def test_mirror_symmetry_along_the_force():
@@ -385,7 +388,7 @@ def test_midpoint_steps_equal_many_small_steps():
         assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
     assert over[0] < 0.02
     assert over[2] < 0.05
-    assert over[1] < over[0] / 3  # second order would give a factor of 4; less, because of the corners of the table
+    assert over[1] < over[0] / 3  # below the factor of 4 of second order, because the interpolated table has kinks
 
 
 def test_small_force_needs_no_midpoint_step():
@@ -394,7 +397,7 @@ def test_small_force_needs_no_midpoint_step():
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
     )
     size_m = np.abs(once.displacement_m).max()
-    # tolerance: half of the displacement of 0.1 um, in a field that varies over 1 mm
+    # tolerance: midpoints are displaced by half of 0.1 um, and the displacement field varies over 1 mm
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
 
 
@@ -413,7 +416,8 @@ def test_steepest_gradient_of_the_table(traction):
     r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
     largest = np.linalg.norm(displace(force_N, places_m, table, (0, 0)).half_curl, axis=1).max()
-    assert table.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a point of the table
+    # tolerance: rounding moves places off the points of the table
+    assert table.steepest_per_m2 == pytest.approx(largest, rel=1e-6)
 
 
 def test_nodes_above_the_surface_move_with_it():

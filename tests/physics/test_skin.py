@@ -20,7 +20,7 @@ EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
 PEAK_T = 1e-3  # magnitude of the fields; tolerances for rounding are relative to this value
-# COARSE for laws that hold for any quadrature, SPARSE for random draws
+# COARSE is for tests of laws that hold with any quadrature; SPARSE is for tests that draw many skins.
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
 DEPTH_M = 0.6e-3  # the tested laws hold at any depth; a single depth needs only one table
 places_m = st.floats(-8e-3, 8e-3)
@@ -180,10 +180,10 @@ def test_shifting_skin_or_poke_and_board_is_equivalent():
     # Shifting the skin is equivalent to shifting poke and chips in the opposite direction.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
-    there_m = np.append(seated.seat_m, 0.0)
-    board = Board("moved", BOARD.chips_m - there_m, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
+    shift_m = np.append(seated.seat_m, 0.0)
+    board = Board("moved", BOARD.chips_m - shift_m, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
     found = change((2e-3, 1e-3, DEPTH_M), seated)
-    expected = change(np.array([2e-3, 1e-3, DEPTH_M]) - there_m, exact, board)
+    expected = change(np.array([2e-3, 1e-3, DEPTH_M]) - shift_m, exact, board)
     np.testing.assert_allclose(found, expected, atol=1e-10 * PEAK_T)
     assert np.abs(found - change((2e-3, 1e-3, DEPTH_M))).max() > 1e-3 * PEAK_T
 
@@ -228,9 +228,9 @@ def test_many_pokes_equal_single_pokes():
     ],
 )
 def test_tables_equal_following_nodes(thickness_mm, at, error, base):
-    # A thickness of 1.82 mm is halfway between two tables. At tabulated depths, this is the error of interpolation in
-    # R/h and r. Between them, the error is 0.6 %: following a node ends with half a step, which changes dB as much
-    # (flow.STEP).
+    # A thickness of 1.82 mm is halfway between two tables. At tabulated depths, the error is that of interpolation in
+    # R/h and r. Between tabulated depths, the error is 0.6 %: the reference then ends with half a step of
+    # `deformation.STEP`, which changes dB by this much.
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
@@ -270,7 +270,8 @@ def test_filler_and_amplitude_scale_the_moments():
 
 
 def test_field_at_rest_has_the_magnitude_of_recordings():
-    # Recorded in-plane fields at rest are up to 3.6 mT. Factor of two, because all skins have the same amplitude.
+    # Recorded in-plane fields at rest are up to 3.6 mT. The tolerance is a factor of two, because the simulated skin
+    # has the nominal amplitude.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
@@ -332,8 +333,8 @@ def test_held_skin_slides_rigidly():
     assert np.abs(apart_m[:, 2]).max() == 0
     distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
     np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
-    # At the poke, the skin moves by give - away (1 - load) p, where p is the place relative to the middle; friction
-    # limits the move.
+    # Without the limit by friction, the skin at the poke would move by `taken_m`: give - away (1 - load) p, as in
+    # `press_displacement_m`. Friction allows the fraction `share`.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
@@ -361,12 +362,12 @@ def test_bonded_skin_is_not_held():
 
 
 def test_rotated_skin_equals_rotated_board():
-    turned = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
+    rotated = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
     first = skin(base="slipping").nodes_m
-    angle = np.arctan2(turned.nodes_m[0, 1], turned.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])
+    angle = np.arctan2(rotated.nodes_m[0, 1], rotated.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])
     assert angle != 0
-    back = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    board = Board("turned", BOARD.chips_m @ back, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
+    rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    board = Board("turned", BOARD.chips_m @ rotation, BOARD.turn, BOARD.sensitivity, BOARD.offset_T)
     poke_m = np.array([2e-3, 1e-3, DEPTH_M])
-    found, expected = change(poke_m, turned), change(poke_m @ back, skin(base="slipping"), board) @ back.T
+    found, expected = change(poke_m, rotated), change(poke_m @ rotation, skin(base="slipping"), board) @ rotation.T
     np.testing.assert_allclose(found, expected, atol=1e-9 * PEAK_T)

@@ -11,9 +11,9 @@ from reskin.physics.magnet import change_of_field
 
 SIDE_M, H_M = 20e-3, 2e-3
 SQUARE = (SIDE_M, SIDE_M)
-place = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
-taken = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
-STILL = {"give_m": (0.0, 0.0), "away": 0.0}
+places_m = st.tuples(st.floats(-9e-3, 9e-3), st.floats(-9e-3, 9e-3))
+displacements_m = st.tuples(st.floats(-1e-4, 1e-4), st.floats(-1e-4, 1e-4))
+NO_SLIDE = {"give_m": (0.0, 0.0), "away": 0.0}
 HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
@@ -53,14 +53,14 @@ def test_pull_at_the_edge_of_a_square():
     assert spin_rad == pytest.approx(3 * 1e-4 / 2.5 / SIDE_M, rel=1e-12)
 
 
-@given(place, taken)
+@given(places_m, displacements_m)
 def test_place_moves_by_the_given_displacement(place_m, taken_m):
     move_m, spin_rad = one(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
-@given(place, taken)
+@given(places_m, displacements_m)
 def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
     (move_m, spin_rad), quarter = one(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = one(quarter @ place_m, quarter @ taken_m)
@@ -77,7 +77,7 @@ def test_displacement_follows_force_and_distance():
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
-@given(place, st.floats(1e3, 1e5))
+@given(places_m, st.floats(1e3, 1e5))
 def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
     # Uniform springs of stiffness k: a force moves the skin by f / k and rotates the skin by moment / (k rho^2).
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
@@ -88,7 +88,7 @@ def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
     np.testing.assert_allclose(spin_rad, moment_m / (2 * SIDE_M**2 / 12), rtol=1e-9, atol=1e-15)
 
 
-@given(place, taken, st.floats(1e-6, 20.0))
+@given(places_m, displacements_m, st.floats(1e-6, 20.0))
 @example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # dividing a force by this displacement overflows
 def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
@@ -121,7 +121,9 @@ def test_zero_slide_leaves_the_flow_on_a_slipping_base():
     table = deformation.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
     moved = deformation.move_dipoles(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
-    without_slide = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
+    without_slide = slide.rigid_motion(
+        place_m, slide.press_displacement_m(place_m, np.array([0.2]), **NO_SLIDE), SQUARE
+    )
     after = slide.apply(without_slide, 0, moved.after)
     for found, expected in zip(after, moved.after, strict=True):
         assert np.array_equal(found, expected)
@@ -135,11 +137,11 @@ def test_dipoles_rotate_about_the_middle():
     rng = np.random.default_rng(1)
     nodes_m, moments = rng.normal(0, 5e-3, (7, 3)), rng.normal(0, 1e-6, (7, 3))
     motion = slide.RigidMotion(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
-    there_m, turned = slide.apply(motion, 1, (nodes_m, moments))
+    moved_m, rotated = slide.apply(motion, 1, (nodes_m, moments))
     turn = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
     for i in range(7):
-        np.testing.assert_allclose(there_m[i], turn @ nodes_m[i] + (3e-5, -2e-5, 0), rtol=1e-13, atol=1e-18)
-        np.testing.assert_allclose(turned[i], turn @ moments[i], rtol=1e-13, atol=1e-20)
+        np.testing.assert_allclose(moved_m[i], turn @ nodes_m[i] + (3e-5, -2e-5, 0), rtol=1e-13, atol=1e-18)
+        np.testing.assert_allclose(rotated[i], turn @ moments[i], rtol=1e-13, atol=1e-20)
     middle_m = np.array([2e-3, -1e-3])
     about_m, _ = slide.apply(motion, 1, (nodes_m, moments), middle_m)
     shift_m = np.append(middle_m, 0.0)

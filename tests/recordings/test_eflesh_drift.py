@@ -12,9 +12,10 @@ from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Reference accuracies in % of another network, trained on pass 1 and tested on passes 2 to 5.
+# Accuracies in % of a reference network, trained on pass 1 and tested on passes 2 to 5, with no-load readings before
+# each contact (FRESH) or only at the start (INITIAL).
 FRESH_PCT, INITIAL_PCT = (89, 88, 86, 84), (55, 19, 13, 10)
-# Tolerance in percentage points for each pass: network and number of training steps differ.
+# Tolerance in percentage points: the tested network and its number of training steps differ from the reference.
 TOLERANCE_PCT = 15
 
 
@@ -41,4 +42,4 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
     of_trainings = [one["of_trainings"] for one in numbers["findings"]]
     assert of_trainings == ["supported", "supported"]  # verdicts over three networks per policy
-    assert numbers["contact_every_s"] > 1  # of a real rig
+    assert numbers["contact_every_s"] > 1  # in s; a real rig takes more than a second per contact

@@ -24,7 +24,7 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
 DEPTH_M = 0.8e-3  # the recordings have no depth; at 0.6 and 1 mm, the field directions are the same
-TURNED = np.diag([1.0, -1.0])  # from label axes to board axes
+LABEL_TO_BOARD = np.diag([1.0, -1.0])  # from label axes to board axes
 MIDDLE_MM = 8.0
 
 
@@ -46,7 +46,7 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     """Return simulated field changes in the axes of the board: [place, chip, axis]."""
     readings = _readings(LAB[0], shared_data, tmp_path_factory)
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
-    pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
+    pokes_m = np.column_stack([labels_mm @ LABEL_TO_BOARD * milli, np.full(65, DEPTH_M)])
     no_spread = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
     values = nominal("skin") | {"hold": None}  # without `hold`, which was fitted to these recordings
     skin = draw_skin(parse(SkinDesign, values, "test"), no_spread, seed=0, name="nominal")

@@ -264,10 +264,10 @@ def test_growing_table_is_followed(context, tmp_path, exists):
 
 
 @pytest.mark.parametrize(
-    ("how", "problem"),
+    ("interruption", "problem"),
     [("replaced", "replaced"), ("cut", r"shortened to 10 bytes, but \d+ were read"), ("removed", "removed")],
 )
-def test_interrupted_table_ends_the_labels(context, tmp_path, how, problem):
+def test_interrupted_table_ends_the_labels(context, tmp_path, interruption, problem):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
     label_thread = LabelThread(from_table(file), context)
@@ -277,10 +277,10 @@ def test_interrupted_table_ends_the_labels(context, tmp_path, how, problem):
         time.sleep(0.02)
         if context.marks:  # the source is ready: it has skipped existing rows
             break
-    if how == "replaced":
+    if interruption == "replaced":
         (tmp_path / "new.csv").write_text(header)
         (tmp_path / "new.csv").replace(file)
-    elif how == "cut":
+    elif interruption == "cut":
         file.write_text(header)
     else:
         file.unlink()

@@ -122,12 +122,12 @@ def expected_readings() -> dict[str, np.ndarray]:
 def test_indentations_are_recovered(
     tmp_path: Path, wire: Wire, kind: str, marks: tuple[tuple[float, float], ...]
 ) -> None:
-    got, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
+    found, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
     for name, column in expected_readings().items():
         # Tolerances: the mean is float32; times of text frames are off by up to half a frame, because lines differ in
         # length.
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
-        np.testing.assert_allclose(got[name], column, rtol=0, atol=atol, err_msg=name)
+        np.testing.assert_allclose(found[name], column, rtol=0, atol=atol, err_msg=name)
     assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N
     assert account["frames_n"] == len(FRAMES)
 

@@ -289,7 +289,7 @@ def test_socket_is_recorded_like_a_port(tmp_path):
 
 FULL_DISK = """
 import resource
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # writing more fails, as on a full disk
 """
 
 

@@ -29,11 +29,11 @@ from tests.report.synthetic import cost, texts_of
 
 RULES = [("Gauss in z", "0.5 mm x 6", 10584, 0.004), ("Gauss in z", "0.7 mm x 5", 5120, 0.015)]
 RULES += [("Gauss in z", "1 mm x 4", 1936, 0.08), ("midpoint", "0.5 mm x 4", 6400, 0.4)]
-SUMS = [
+QUADRATURES = [
     Precision("dB", REFERENCE, "0.5 mm x 8", 127008, 3e-4),
     *(Precision("dB", method, setting, nodes_n, error) for method, setting, nodes_n, error in RULES),
 ]
-STIFF = [
+INTEGRATORS = [
     Precision(study, method, setting, 100, error, failure)
     for study in ("relaxation, stiffness 1e+03", "relaxation, stiffness 1e+08")
     for method, setting, error, failure in (
@@ -54,11 +54,11 @@ def with_times(rows: list[Precision]) -> list[dict]:
     return [asdict(row) | times.get(row.key, {}) for row in rows]
 
 
-def draw_quadratures(rows=SUMS, **limits) -> str:
+def draw_quadratures(rows=QUADRATURES, **limits) -> str:
     return quadratures(with_times(rows), asdict(choose(rows, used=DEFAULT_QUADRATURE, **limits)), "simulated")
 
 
-def draw_integrators(rows=STIFF) -> str:
+def draw_integrators(rows=INTEGRATORS) -> str:
     return integrators(with_times(rows))
 
 
@@ -88,35 +88,37 @@ def test_integrator_figure_labels():
     text = texts_of(draw_integrators())
     for label in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
         assert label in text
-    for line in failures(with_times(STIFF)):
+    for line in failures(with_times(INTEGRATORS)):
         for label in line.split():
             assert label in text
 
 
 def test_failures_are_grouped_by_method_and_kind():
-    diverged, stopped = failures(with_times(STIFF))
+    diverged, stopped = failures(with_times(INTEGRATORS))
     assert diverged == (
         "Failed: explicit Euler, diverged: relaxation, stiffness 1e+03 (1e-02 s, 1e-03 s);"
         " relaxation, stiffness 1e+08 (1e-02 s, 1e-03 s)"
     )
     assert stopped.startswith("Failed: explicit Euler, stopped after 20000 right-hand sides: ")
-    assert failures(with_times(SUMS)) == []
+    assert failures(with_times(QUADRATURES)) == []
 
 
 def test_failed_and_untimed_rows_are_not_drawn():
     # Each point is a <use> element that refers to a marker.
-    done = [row for row in STIFF if row.failure is None]
+    done = [row for row in INTEGRATORS if row.failure is None]
     assert count_marks(draw_integrators()) == count_marks(draw_integrators(done))
-    last = {key: value for key, value in with_times(SUMS)[-1].items() if key != "median_s"}
-    choice = asdict(choose(SUMS, used=DEFAULT_QUADRATURE))
-    untimed, without = (quadratures([*with_times(SUMS)[:-1], *more], choice, "simulated") for more in ([last], []))
+    last = {key: value for key, value in with_times(QUADRATURES)[-1].items() if key != "median_s"}
+    choice = asdict(choose(QUADRATURES, used=DEFAULT_QUADRATURE))
+    untimed, without = (
+        quadratures([*with_times(QUADRATURES)[:-1], *more], choice, "simulated") for more in ([last], [])
+    )
     assert count_marks(untimed) == count_marks(without)
 
 
 def test_pages_match_the_studies_of_the_scene():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
-    assert set(cost_pages(stages | {"integrators": with_times(STIFF)}, "simulated")) == {
+    assert set(cost_pages(stages | {"integrators": with_times(INTEGRATORS)}, "simulated")) == {
         "integrators.svg", "integrators.md", "stages.md",
     }  # fmt: skip
 
@@ -133,7 +135,9 @@ def test_figure_bytes_depend_only_on_rows():
     assert draw_quadratures() == draw_quadratures()
     stiff = draw_integrators()
     assert draw_integrators() == stiff
-    slower = [row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in with_times(STIFF)]
+    slower = [
+        row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in with_times(INTEGRATORS)
+    ]
     assert integrators(slower) != stiff
 
 

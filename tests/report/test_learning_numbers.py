@@ -161,13 +161,18 @@ def test_learning_times_are_medians():
         {"method": "network", "inputs": "raw", "name": "paper"},
     ]
 
-    def took(name: str, seconds: float) -> dict:
+    def timed_model(name: str, seconds: float) -> dict:
         return {"name": name, "train_s": seconds, "one_reading_s": 1e-6 * seconds}
 
     seconds = {
-        "train_classical": [took("ridge.b0", 1), took("ridge.b1", 2), took("ridge.b2", 9), took("ridge-shape.b0", 100)],
-        "train_triplet": [took("triplet.paper.b0.seed0", 30), took("triplet.other.b0.seed0", 999)],
-        "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
+        "train_classical": [
+            timed_model("ridge.b0", 1),
+            timed_model("ridge.b1", 2),
+            timed_model("ridge.b2", 9),
+            timed_model("ridge-shape.b0", 100),
+        ],
+        "train_triplet": [timed_model("triplet.paper.b0.seed0", 30), timed_model("triplet.other.b0.seed0", 999)],
+        "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
     assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # median times; the last method was not timed

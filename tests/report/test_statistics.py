@@ -191,7 +191,7 @@ def test_paired_equals_naive_loops():
             "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
-    assert found["mse_xy_mm2"]["mean"] < 0  # the first side has the smaller error
+    assert found["mse_xy_mm2"]["mean"] < 0  # the first method has the smaller error
 
 
 def test_paired_with_itself_is_zero():
@@ -220,14 +220,14 @@ def test_order_of_rows_does_not_matter(values, seed):
 
 @FEW
 @given(VALUES)
-def test_swapping_the_sides_negates_the_difference(values):
+def test_swapping_the_methods_negates_the_difference(values):
     first, second = board_scores(values), board_scores([1.0] * len(values))
-    ahead, back = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
-    turned = negate(ahead)
-    assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
-    assert back["mean"] == pytest.approx(turned["mean"], abs=DOUBLE)
+    forward, backward = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
+    negated = negate(forward)
+    assert backward["ci95"] == pytest.approx(negated["ci95"], abs=DOUBLE)
+    assert backward["mean"] == pytest.approx(negated["mean"], abs=DOUBLE)
     opposite = {SUPPORTED: CONTRADICTED, CONTRADICTED: SUPPORTED, UNDECIDED: UNDECIDED}
-    assert verdict(turned) == opposite[verdict(ahead)]
+    assert verdict(negated) == opposite[verdict(forward)]
 
 
 @FEW
@@ -296,24 +296,26 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
 
 def test_paired_with_single_counts_training_skins():
     boards = [f"b{i}" for i in range(4)]
-    alike = transfer_scores({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
-    differing = transfer_scores(
+    equal_gains = transfer_scores(
+        {fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")}
+    )
+    different_gains = transfer_scores(
         {f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)}
     )
     many = board_scores([80.0, 81.0, 82.0, 83.0])
-    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, differing))
-    assert sure["mean"] == pytest.approx(60.0)
-    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
+    certain, uncertain = (paired_with_single(many, one)["accuracy_pct"] for one in (equal_gains, different_gains))
+    assert certain["mean"] == pytest.approx(60.0)
+    assert certain["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
     # The mean gains are 50 on every board and 60, 50, 40 for the training skins: variance 100 / 3, two degrees of
     # freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
-    assert unsure["ci95"] == pytest.approx([low, high])
-    assert unsure["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
+    assert uncertain["ci95"] == pytest.approx([low, high])
+    assert uncertain["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
     assert paired_with_single(board_scores([80.0] * 4), transfer_scores({"t0": {"b1": 79.0}}))["by_board"] == {
         "b1": {"accuracy_pct": 1.0}
     }
     with pytest.raises(SchemaError, match="the same held-out skins"):
-        paired_with_single(board_scores([80.0]), alike)
+        paired_with_single(board_scores([80.0]), equal_gains)
 
 
 @FEW

@@ -94,8 +94,10 @@ def test_missing_experiment_has_no_table():
 
 
 def test_splits_of_one_skin_start_with_the_papers():
-    ways = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
-    shown = numbers([card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in ways.items()])
+    accuracy_by_split = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
+    shown = numbers(
+        [card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in accuracy_by_split.items()]
+    )
     single = shown["single_sensor"]
     assert single["split"] == "single_random"
     means = [one["accuracy_pct"]["mean"] for one in (single, single["by_indentation"], single["by_pass"])]

@@ -11,9 +11,11 @@ from reskin.seeds import rng_for
 from reskin.simulation.contact import Terms, simulate_response
 from tests.simulation.scene import synthesis
 
-OF = synthesis()
-BOARD = draw_board(OF.boards["rigid"].design, OF.spreads, seed=1, name="b0")
-SKIN = draw_skin(OF.skin, OF.spreads, seed=1, name="b0_s0", rule=OF.boards["rigid"].quadrature.in_si())
+SETTINGS = synthesis()
+BOARD = draw_board(SETTINGS.boards["rigid"].design, SETTINGS.spreads, seed=1, name="b0")
+SKIN = draw_skin(
+    SETTINGS.skin, SETTINGS.spreads, seed=1, name="b0_s0", rule=SETTINGS.boards["rigid"].quadrature.in_si()
+)
 TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 
 

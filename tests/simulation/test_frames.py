@@ -13,8 +13,8 @@ from reskin.simulation.rig import Readout, Rig, read_frames, timeline
 from tests.simulation.scene import SECTIONS
 
 N, CHIPS_N = 40, 2
-EYES = np.tile(np.eye(3), (CHIPS_N, 1, 1))
-BOARD = Board("b0", np.zeros((CHIPS_N, 3)), EYES, EYES, np.zeros((CHIPS_N, 3)))
+IDENTITIES = np.tile(np.eye(3), (CHIPS_N, 1, 1))
+BOARD = Board("b0", np.zeros((CHIPS_N, 3)), IDENTITIES, IDENTITIES, np.zeros((CHIPS_N, 3)))
 LOUD = ChipDesign(gain_sel=7, noise_xy_uT=3.0, noise_z_uT=5.0, noise_temperature_degC=0.1)
 QUIET = ChipDesign(gain_sel=7, noise_xy_uT=0.0, noise_z_uT=0.0, noise_temperature_degC=0.0)
 WARMING = Temperature(warming_K=10.0, warming_s=1.0, swing_K=2.0, swing_s=3.0, chip_sensitivity_per_K=0.0)

@@ -26,10 +26,12 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # stops of a path, which is compared with a path of twice as many stops
-HALVED = 0.75  # limit on the ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if dB jumps
+STOPS_N = 48  # number of stops of a path; twice as many for the finer path
+# Limit on the ratio of the largest change of dB between two stops, on the finer path, to that on the coarse path. The
+# ratio is 0.5 if dB is smooth, and 1 if dB jumps.
+HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags so short that the tip sticks
+short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # so short that the tip sticks
 FEW = settings(max_examples=8, deadline=None)
 
 
@@ -116,7 +118,7 @@ def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
 
 
 @settings(max_examples=4, deadline=None)
-@given(places, ways, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
+@given(places, short_drags_m, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
 def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forces_N, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
     end_m = tuple(np.add(start_m, drag_m))

@@ -18,7 +18,7 @@ TERMS = {
     "relaxation": (RELAXATION, {"relax"}),
     "temperature": (TEMPERATURE, {"temperature_rise_K", "relative_remanence"}),
 }
-OF_TERMS = set().union(*(names for _, names in TERMS.values()))
+TERM_FUNCTIONS = set().union(*(names for _, names in TERMS.values()))
 FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
 
 
@@ -47,11 +47,11 @@ def scene_with(*terms):
 def test_protocol_without_terms_computes_none():
     run = functions_run(scene_with())
     assert {"simulate_capture", "read_field"} <= run  # checks that the profiler works
-    assert not run & OF_TERMS
+    assert not run & TERM_FUNCTIONS
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
 def test_each_term_computes_only_what_it_needs(term):
-    run = functions_run(scene_with(term)) & OF_TERMS
+    run = functions_run(scene_with(term)) & TERM_FUNCTIONS
     assert run
     assert run <= TERMS[term][1]

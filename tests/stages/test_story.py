@@ -37,7 +37,7 @@ LEARNING = (
 )  # fmt: skip
 RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
 # Experiments that scene ci does not run: those on recordings and those on many skins.
-OF_CI = set(ANALYSES) - {"compare", "reference_methods", "touches", "population", "worlds"}
+EXPERIMENTS_OF_CI = set(ANALYSES) - {"compare", "reference_methods", "touches", "population", "worlds"}
 OUTPUT = "output.txt"  # file with the output of the first run
 # time limit for tests that hang; long, because a busy machine needs four times as long
 pytestmark = pytest.mark.timeout(1800)
@@ -166,7 +166,7 @@ def test_experiments_on_many_skins_share_test_rows(story, numbers):
 
 
 def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
-    assert OF_CI <= set(numbers)
+    assert EXPERIMENTS_OF_CI <= set(numbers)
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers["drift"][policy]] == [100, 200]
         assert all({"accuracy_pct", "mse_f_N2"} <= set(row) for row in numbers["drift"][policy])
@@ -175,11 +175,11 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert all("mean" in numbers[experiment][part]["accuracy_pct"] for part in parts)
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
-    assert {file.stem for file in tables.glob("*.md")} >= OF_CI | {"table1", "checklist", "single_sensor"}
+    assert {file.stem for file in tables.glob("*.md")} >= EXPERIMENTS_OF_CI | {"table1", "checklist", "single_sensor"}
     assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= OF_CI - {"bound", "drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"bound", "drift", "variation", "manual"}
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 

@@ -17,7 +17,7 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
-CHANCE_MAX_PCT = 15.0  # chance level is 1 of 64 places, and a little more for means of neighbouring places
+CHANCE_MAX_PCT = 15.0  # chance level is 1 in 64; predictions between neighbouring places score a little more
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:

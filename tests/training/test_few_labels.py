@@ -184,11 +184,11 @@ def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
 
 
 def test_labels_depend_on_the_seed_but_not_on_order():
-    first, again, other, turned = (
+    first, repeated, other, reordered = (
         [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(tested_study) if entry.labels_n == 5]
         for tested_study in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
-    assert first == again == turned
+    assert first == repeated == reordered
     assert all(one != changed for one, changed in zip(first, other, strict=True))
 
 

@@ -12,13 +12,13 @@ from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(NOMINAL)
-TODAY = fingerprint(PARAMS)
+CURRENT = fingerprint(PARAMS)
 
 
 def test_order_of_settings_does_not_matter():
-    turned = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
-    assert fingerprint(turned) == TODAY
-    assert len(TODAY) == 16
+    reordered = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
+    assert fingerprint(reordered) == CURRENT
+    assert len(CURRENT) == 16
 
 
 @pytest.mark.parametrize(
@@ -31,17 +31,17 @@ def test_order_of_settings_does_not_matter():
 def test_every_setting_changes_the_fingerprint(section, name, value):
     changed = deepcopy({name: dict(PARAMS[name]) for name in ("skin", "rig", "chip", "spreads")})
     changed[section][name] = value
-    assert fingerprint(changed) != TODAY
+    assert fingerprint(changed) != CURRENT
 
 
 def test_fingerprint_depends_on_physics_but_not_rounding(monkeypatch):
     rigid = slide.press_displacement_m
     monkeypatch.setattr(slide, "press_displacement_m", lambda *args, **kwargs: rigid(*args, **kwargs) * (1 + 1e-12))
-    assert fingerprint(PARAMS) == TODAY
+    assert fingerprint(PARAMS) == CURRENT
     monkeypatch.setattr(slide, "press_displacement_m", lambda *args, **kwargs: rigid(*args, **kwargs) * 1.02)
-    assert fingerprint(PARAMS) != TODAY
+    assert fingerprint(PARAMS) != CURRENT
 
 
 def test_tuned_settings_match_the_current_skin():
     record = read_yaml(ROOT / "reports/tuning/choice.json")
-    assert record["physics"] == TODAY, "run scene tuning again and commit reports/tuning/choice.json"
+    assert record["physics"] == CURRENT, "run scene tuning again and commit reports/tuning/choice.json"

@@ -7,7 +7,17 @@ from pipeline.training.jobs import model_card
 from reskin.data.rows import Rows
 from reskin.models.job import TrainingJob, TrainingResult
 from reskin.models.train import train_stack
-from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adaptation, example_data, fine_tuning, pooled
+from tests.models.example_jobs import (
+    LABELLED,
+    POKED,
+    ROWS_N,
+    TEST,
+    TRAIN,
+    adaptation,
+    example_data,
+    fine_tuning,
+    pooled,
+)
 
 
 def rows() -> Rows:
@@ -65,7 +75,7 @@ def test_card_states_an_early_stop():
 
 @pytest.mark.parametrize(
     ("job", "kind", "used"),
-    [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", OWN)],
+    [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", LABELLED)],
     ids=["unlabelled", "labelled"],
 )
 def test_card_of_a_tuned_network_describes_the_tuning(job, kind, used):

@@ -29,14 +29,14 @@ def model() -> Universal:
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
     """Return simulated skins near the nominal one: presses on the lattice, law errors proportional to the field."""
     tables, rng = model.tables, rng_for(0, "shipping")
-    at = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
+    place_i = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
     force_i = rng.integers(1, len(tables.force_N), (skins_n, PRESSES_N))
     number = 0.5 * rng.standard_normal((skins_n, len(tables.names)))
-    db_uT = tables.mean_uT[*at, force_i] + np.einsum("smct,st->smc", tables.slope_uT[*at, force_i], number)
+    db_uT = tables.mean_uT[*place_i, force_i] + np.einsum("smct,st->smc", tables.slope_uT[*place_i, force_i], number)
     size_uT = np.linalg.norm(db_uT, axis=2, keepdims=True) / np.sqrt(db_uT.shape[2])
     db_uT = db_uT + error * size_uT * rng.standard_normal(db_uT.shape)
     rest_uT = tables.rest_uT + number @ tables.rest_slope_uT.T
-    parts = db_uT, rest_uT, np.moveaxis(tables.axis_mm[at], 0, -1), tables.force_N[force_i]
+    parts = db_uT, rest_uT, np.moveaxis(tables.axis_mm[place_i], 0, -1), tables.force_N[force_i]
     return Population(*(part.astype(np.float32) for part in parts))
 
 

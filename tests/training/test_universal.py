@@ -82,7 +82,7 @@ def test_saved_networks_predict_the_same(tmp_path):
 
 
 @pytest.fixture(autouse=True)
-def made(monkeypatch):
+def _synthetic_skins(monkeypatch):
     draw = lambda centre, spreads, setup, n, rng: make_population(n, rng)  # noqa: E731
     monkeypatch.setattr(universal, "draw_population", draw)
 
@@ -124,27 +124,27 @@ def test_larger_misfit_widens_intervals_without_changing_estimates(nominal):
 
 
 @pytest.fixture
-def fits_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
+def exact_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
     """Return the calibration of a skin with exact labels, and with labels that have independent errors of 3 mm."""
-    fits, _ = calibrate_to_errors(nominal, unchanged)
-    off_mm = 3 * rng_for(1, "labels").standard_normal(fits.pool.place_mm.shape)
-    return fits, replace(fits, pool=replace(fits.pool, place_mm=fits.pool.place_mm + off_mm))
+    exact, _ = calibrate_to_errors(nominal, unchanged)
+    off_mm = 3 * rng_for(1, "labels").standard_normal(exact.pool.place_mm.shape)
+    return exact, replace(exact, pool=replace(exact.pool, place_mm=exact.pool.place_mm + off_mm))
 
 
-def test_errors_of_held_out_labels_widen_intervals(fits_and_misled):
+def test_errors_of_held_out_labels_widen_intervals(exact_and_misled):
     powers = [Powers(0.3, 0.3), Powers(0.1, 0.1)]
-    fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in fits_and_misled)
-    _, misled = fits_and_misled
+    fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in exact_and_misled)
+    _, misled = exact_and_misled
     assert (misled_powers < fitting_powers / 2).all()
     assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
-    # Forty wrong labels lower the powers more than three.
+    # Forty wrong labels lower the powers more than three wrong labels do.
     assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 
-def test_single_label_is_held_out(fits_and_misled):
-    fits, misled = fits_and_misled
+def test_single_label_is_held_out(exact_and_misled):
+    exact, misled = exact_and_misled
     (found,) = lower_by_labels(misled, 1, [Powers(0.3, 0.3)])
-    (without,) = estimate(fits.with_labels(0), fits.pool.db_uT[:1], [Powers(0.3, 0.3)])
+    (without,) = estimate(exact.with_labels(0), exact.pool.db_uT[:1], [Powers(0.3, 0.3)])
     errors = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in without]
     assert found == pytest.approx([0.3 / variance_inflation(one) for one in errors])
 

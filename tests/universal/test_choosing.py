@@ -17,19 +17,19 @@ def skin() -> SkinMap:
 
 
 def test_gain_equals_removed_variance(skin):
-    of, some = skin.hypotheses, np.arange(3, len(skin.hypotheses.mean_uT), len(skin.hypotheses.log_N))
-    i = int(np.linalg.norm(of.place_mm - PLACE_mm[1], axis=1).argmin())
-    slope = (of.slope_uT / np.linalg.norm(of.mean_uT, axis=1)[:, None, None])[some].astype(float)
-    at_mm, at_log_N = (part[some] for part in of.at)
-    force_N = np.exp(of.log_N[3:4])
-    press_uT = np.linalg.norm(of.mean_uT[some[i]])
+    hypotheses, at_force = skin.hypotheses, np.arange(3, len(skin.hypotheses.mean_uT), len(skin.hypotheses.log_N))
+    i = int(np.linalg.norm(hypotheses.place_mm - PLACE_mm[1], axis=1).argmin())
+    slope = (hypotheses.slope_uT / np.linalg.norm(hypotheses.mean_uT, axis=1)[:, None, None])[at_force].astype(float)
+    at_mm, at_log_N = (part[at_force] for part in hypotheses.at)
+    force_N = np.exp(hypotheses.log_N[3:4])
+    press_uT = np.linalg.norm(hypotheses.mean_uT[at_force[i]])
     # Covariance of all channels at all places; the press is at one of these places.
-    alike = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
-    beside = slope @ skin.cov @ slope[i].T + alike[:, None, None] * skin.error_cov
-    read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)
-    taken = [np.trace(one @ np.linalg.solve(read, one.T)) for one in beside]
-    found = expected_gain(skin, of.place_mm[i : i + 1], force_N)
-    assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # tables are in single precision
+    correlation = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
+    covariance = slope @ skin.cov @ slope[i].T + correlation[:, None, None] * skin.error_cov
+    press_covariance = covariance[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)
+    removed = [np.trace(cross @ np.linalg.solve(press_covariance, cross.T)) for cross in covariance]
+    found = expected_gain(skin, hypotheses.place_mm[i : i + 1], force_N)
+    assert found[0] == pytest.approx(np.mean(removed), rel=1e-5)  # tables are in single precision
 
 
 def test_labelled_place_gains_less_than_a_far_one(skin):

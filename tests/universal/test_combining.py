@@ -58,8 +58,8 @@ def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
 
 def test_lower_power_widens_intervals_without_changing_estimates(skin):
     place_mm = np.array([[3.0, 2.0]])
-    of = evaluation(skin, fields_uT(place_mm, np.array([2.0])), place_mm)
-    full, lower = of.combined(1.0), of.combined(0.25)
+    evaluated = evaluation(skin, fields_uT(place_mm, np.array([2.0])), place_mm)
+    full, lower = evaluated.combined(1.0), evaluated.combined(0.25)
     np.testing.assert_array_equal(full.place_mm, lower.place_mm)
     assert (lower.sd_mm > full.sd_mm).all()
 

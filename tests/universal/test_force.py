@@ -25,7 +25,7 @@ SKINS_N, LABELS_N = 5, 20
 
 
 def draw_log_forces(labels_n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return estimated and true log forces of presses on a skin that follows the prior of the line."""
+    """Return estimated and true log forces of presses on a skin whose calibration line is drawn from the prior."""
     rng = rng_for(seed, "force line")
     log_N = rng.uniform(np.log(0.5), np.log(9), labels_n)
     line = (
@@ -47,13 +47,13 @@ def test_no_label_leaves_forces_unchanged():
 def test_line_equals_the_regression_of_a_gaussian_process(labels_n):
     log_N, true_log_N = draw_log_forces(labels_n, 1)
     line = fit_line([log_N] * 3, true_log_N)
-    asked = np.log([0.3, 1.0, 5.0])
-    off, asked_off = log_N - LOG_CENTRE_N, asked - LOG_CENTRE_N
+    query_log_N = np.log([0.3, 1.0, 5.0])
+    off, query_off = log_N - LOG_CENTRE_N, query_log_N - LOG_CENTRE_N
     cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.outer(off, off) + line.scatter_var * np.eye(labels_n)
-    shared = INTERCEPT_SD**2 + SLOPE_SD**2 * np.outer(asked_off, off)
-    expected = asked + shared @ np.linalg.solve(cov, true_log_N - log_N)
-    var = INTERCEPT_SD**2 + SLOPE_SD**2 * asked_off**2 - ((shared @ np.linalg.inv(cov)) * shared).sum(axis=1)
-    found, sd_log_N = line.apply(asked)
+    shared = INTERCEPT_SD**2 + SLOPE_SD**2 * np.outer(query_off, off)
+    expected = query_log_N + shared @ np.linalg.solve(cov, true_log_N - log_N)
+    var = INTERCEPT_SD**2 + SLOPE_SD**2 * query_off**2 - ((shared @ np.linalg.inv(cov)) * shared).sum(axis=1)
+    found, sd_log_N = line.apply(query_log_N)
     np.testing.assert_allclose(found, expected)
     np.testing.assert_allclose(sd_log_N, np.sqrt(var + line.scatter_var))
 
@@ -81,7 +81,10 @@ def test_best_estimator_is_selected(noise, expected):
 
 @pytest.fixture(scope="module")
 def calibrated() -> list[tuple]:
-    """Calibrate the shipped model to simulated skins with large errors of the law: with 0, 1 and 20 labels."""
+    """Calibrate the shipped model to simulated skins with large law errors; return (labels, log errors, sd) per skin.
+
+    Each skin is calibrated with 0, 1 and 20 labels.
+    """
     prior, model, found = read_inputs().prior, load_universal(), []
     skins = draw_prior_skins(prior, SKINS_N, 5, "force", law_error(1.5))
     for i in range(SKINS_N):
@@ -101,7 +104,7 @@ def calibrated() -> list[tuple]:
 @pytest.mark.parametrize("labels_n", [0, 1, LABELS_N])
 def test_force_intervals_cover_simulated_skins(calibrated, labels_n):
     inside = [np.abs(error) < NORMAL_90 * sd for n, error, sd in calibrated if n == labels_n]
-    assert 0.8 < np.concatenate(inside).mean() <= 1  # 90 % if all errors were as large as assumed
+    assert 0.8 < np.concatenate(inside).mean() <= 1  # it would be 90 % if errors were as large as assumed
 
 
 def test_labels_improve_forces(calibrated):

@@ -13,7 +13,7 @@ from reskin.universal.map import NOMINAL, lattice_mm
 from reskin.universal.population import COARSE
 from tests.universal.skins import SETUP
 
-CHEAP = replace(SETUP, rule=COARSE)
+COARSE_SETUP = replace(SETUP, rule=COARSE)
 TRUE = replace(NOMINAL, seat_x_mm=0.5, seat_y_mm=-0.4, amplitude=1.8, gap_mm=1.75, give_x_um=40.0)
 PLACE_MM = np.stack(np.meshgrid([-2.0, -0.5, 1.1, 2.4], [-2.2, -0.7, 0.6, 2.1]), axis=-1).reshape(-1, 2)
 FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(PLACE_MM)))
@@ -25,11 +25,11 @@ def small(monkeypatch):
 
 
 def fields_uT() -> np.ndarray:
-    return simulate_uT(TRUE, CHEAP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
+    return simulate_uT(TRUE, COARSE_SETUP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
 
 
 def test_search_recovers_places_and_forces():
-    found = search(chart(TRUE, CHEAP), fields_uT())
+    found = search(chart(TRUE, COARSE_SETUP), fields_uT())
     np.testing.assert_allclose(
         found.place_mm, PLACE_MM, atol=0.2
     )  # tolerance: a quarter of the pitch, because the search takes a single step with the slopes at the lattice point
@@ -38,7 +38,7 @@ def test_search_recovers_places_and_forces():
 
 
 def test_residuals_are_zero_on_the_lattice_only():
-    known = chart(TRUE, CHEAP)
+    known = chart(TRUE, COARSE_SETUP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
     np.testing.assert_allclose(found.residual, 0.0, atol=1e-9)
@@ -46,25 +46,25 @@ def test_residuals_are_zero_on_the_lattice_only():
 
 
 def test_slopes_equal_finite_differences():
-    two = _JointFit(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
-    at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
-    values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], at.ravel()])
+    two = _JointFit(TRUE, COARSE_SETUP, fields_uT()[:2], at_rest_uT(TRUE, COARSE_SETUP).ravel())
+    presses = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
+    values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], presses.ravel()])
     columns = two.slopes(values)
     for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter of the law, x of the first press, y of the second
-        by = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
-        expected = (two.residuals(values + by) - two.residuals(values)) / by.max()
+        change = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
+        expected = (two.residuals(values + change) - two.residuals(values)) / change.max()
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
 
 
 def test_unlabelled_presses_determine_parameters(monkeypatch):
     monkeypatch.setattr(inversion, "ROUNDS_N", 1)
-    rest_uT, presses_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
-    found = fit_unlabelled(presses_uT, rest_uT, CHEAP)
-    left = [np.median(search(chart(law, CHEAP), presses_uT).residual) for law in (NOMINAL, found)]
+    rest_uT, presses_uT = at_rest_uT(TRUE, COARSE_SETUP).ravel(), fields_uT()[::2]
+    found = fit_unlabelled(presses_uT, rest_uT, COARSE_SETUP)
+    left = [np.median(search(chart(law, COARSE_SETUP), presses_uT).residual) for law in (NOMINAL, found)]
     assert left[1] < 0.3 * left[0]
     for name, near in {"seat_x_mm": 0.15, "seat_y_mm": 0.15, "give_x_um": 15.0}.items():
         assert abs(asdict(found)[name] - asdict(TRUE)[name]) < near
     assert all(asdict(found)[name] > least for name, least in LEAST.items())
-    noload_only = fit_unlabelled(presses_uT[:0], rest_uT, CHEAP)
+    noload_only = fit_unlabelled(presses_uT[:0], rest_uT, COARSE_SETUP)
     assert noload_only.seat_x_mm == pytest.approx(TRUE.seat_x_mm, abs=0.15)
     assert noload_only.give_x_um == NOMINAL.give_x_um

@@ -41,8 +41,8 @@ def skin() -> Universal:
 def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
     """Return readings of the nominal skin at the lattice points nearest to `PLACES_MM`, in the axes of the chips."""
     tables = skin.tables
-    at = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
-    return to_chips(tables.mean_uT[at[:, 0], at[:, 1], force_i])
+    lattice_i = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
+    return to_chips(tables.mean_uT[lattice_i[:, 0], lattice_i[:, 1], force_i])
 
 
 def test_nominal_skin_is_estimated_within_the_lattice(skin):
@@ -63,10 +63,10 @@ def test_labels_move_estimates_towards_them(skin):
 
 def test_misfit_of_signals_that_are_not_pokes_is_large(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
-    own = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
-    alien = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
-    assert own.max() < 1
-    assert alien.min() > 10 * own.max()
+    of_pokes = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
+    of_noise = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
+    assert of_pokes.max() < 1
+    assert of_noise.min() > 10 * of_pokes.max()
 
 
 def test_card_describes_the_model(skin):
@@ -345,8 +345,8 @@ def test_light_touches_on_unseen_skins(force_N):
     for name in ("b0", "b1", "b2", "b3"):
         board = draw_board(RIGID, SPREADS, seed=5, name=name)
         skin = draw_skin(PARAMS_SKIN, SPREADS, seed=5, name=f"{name}_s0", rule=Quadrature(0.8e-3, 5))
-        of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
-        depth_m = slide.depth_at(np.full(10, force_N), **of) - skin.depth_zero_m
+        layer = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
+        depth_m = slide.depth_at(np.full(10, force_N), **layer) - skin.depth_zero_m
         rest_T, change_T = changes_of_field(board, skin, np.column_stack([rng.uniform(-7e-3, 7e-3, (10, 2)), depth_m]))
         noload_uT, _ = read_field(np.repeat(rest_T[None], 50, axis=0), board, design=CHIP, rng=rng)
         touch_uT, _ = read_field(rest_T + change_T, board, design=CHIP, rng=rng)

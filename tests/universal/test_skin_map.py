@@ -71,9 +71,11 @@ def test_presses_of_the_tabulated_skin_are_located(skin):
 def test_labelled_place_overrides_the_law(skin):
     place_mm, force_N, db_uT = presses()
     wrong_uT = db_uT[::-1] * 0.9  # each place has the field of the opposite place
-    some = [12, 32, 50]
-    found = condition_on_labels(skin, place_mm[some], force_N[some], wrong_uT[some]).evaluator.estimate(wrong_uT[some])
-    assert np.abs(found.place_mm - place_mm[some]).max() < 0.5
+    labelled = [12, 32, 50]
+    found = condition_on_labels(skin, place_mm[labelled], force_N[labelled], wrong_uT[labelled]).evaluator.estimate(
+        wrong_uT[labelled]
+    )
+    assert np.abs(found.place_mm - place_mm[labelled]).max() < 0.5
     before = skin.evaluator.estimate(wrong_uT[[12, 50]])
     assert np.abs(before.place_mm - place_mm[[12, 50]]).max() > 3
 

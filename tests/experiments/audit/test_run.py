@@ -48,8 +48,8 @@ NOT_CHOSEN = {"steps_n", "base"}
 CHOICE = {
     "scene": "tuning", "source": "simulated", "seed": 777, "boards": ["b0", "b1"], "skins": ["b0_s0", "b1_s0"],
     "chosen": {
-        arm: {name: value for name, value in words.items() if name not in NOT_CHOSEN}
-        for arm, words in (("train_multi", RECIPE), ("train_triplet", TRIPLET), ("adapt", ADAPTATION))
+        stage: {name: value for name, value in words.items() if name not in NOT_CHOSEN}
+        for stage, words in (("train_multi", RECIPE), ("train_triplet", TRIPLET), ("adapt", ADAPTATION))
     },
 }  # fmt: skip
 
@@ -85,11 +85,11 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     folds = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, folds))
     data = load_scene_data(folder)
-    for arm, section, experiment in (
+    for stage, section, experiment in (
         ("train_single", parsed.section(Training, "train_single"), "single_random"),
         ("train_multi", parsed.section(Training, "train_multi"), "lobo"),
     ):
-        write(folder, arm, data, make_jobs(data, section, data.folds_of(experiment)))
+        write(folder, stage, data, make_jobs(data, section, data.folds_of(experiment)))
     write(
         folder,
         "train_triplet",
@@ -112,8 +112,8 @@ def load_scene_data(folder: Path) -> SceneData:
     return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
 
 
-def write(folder: Path, arm: str, data: SceneData, jobs: list[TrainingJob]) -> None:
-    write_models(folder / "models" / arm, data, jobs, [initial_result(job, data) for job in jobs], arm)
+def write(folder: Path, stage: str, data: SceneData, jobs: list[TrainingJob]) -> None:
+    write_models(folder / "models" / stage, data, jobs, [initial_result(job, data) for job in jobs], stage)
 
 
 def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
@@ -171,7 +171,7 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
         "lobo/b0", "lobo/b1", "lobo/b2"
     }  # fmt: skip
     trained = {"single_random.paper.repeat0.seed0"}
-    trained |= {f"{arm}.b{i}.seed0" for arm in ("lobo.paper", "lobo.shape", "triplet.paper") for i in range(3)}
+    trained |= {f"{variant}.b{i}.seed0" for variant in ("lobo.paper", "lobo.shape", "triplet.paper") for i in range(3)}
     trained |= {f"adapt.paper.{skin}.8pokes.seed0" for skin in ("b0.b0_s0", "b0.b0_s1", "b1.b1_s0", "b2.b2_s0")}
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
     variants = {check["where"] for check in checks if check["what"] == "settings: recipe"}
@@ -189,15 +189,15 @@ def test_settings_that_affect_only_speed_need_no_tuning(scene):
 
 @pytest.mark.parametrize("seen_n", [1, 32])
 @pytest.mark.parametrize(
-    ("arm", "name"),
+    ("stage", "name"),
     [
         ("train_multi", "lobo.paper.b1.seed0"),
         ("train_multi", "lobo.shape.b1.seed0"),
         ("train_triplet", "triplet.paper.b1.seed0"),
     ],
 )
-def test_scaler_fitted_to_test_rows_is_detected(scene, arm, name, seen_n):
-    file, data = scene / f"models/{arm}/{name}.safetensors", load_scene_data(scene)
+def test_scaler_fitted_to_test_rows_is_detected(scene, stage, name, seen_n):
+    file, data = scene / f"models/{stage}/{name}.safetensors", load_scene_data(scene)
     (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
     view = VIEW["shape" if ".shape." in name else "raw"](data.rows.db_uT[seen])
@@ -274,7 +274,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
 
 
 @pytest.mark.parametrize(
-    ("chosen", "arm", "found"),
+    ("chosen", "stage", "found"),
     [
         (
             CHOICE["chosen"] | {"adapt": CHOICE["chosen"]["adapt"] | {"rate_max": 3e-3}},
@@ -287,10 +287,10 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
     ],
     ids=["another rate", "no choice"],
 )  # fmt: skip
-def test_setting_that_differs_from_the_choice_is_reported(scene, chosen, arm, found):
+def test_setting_that_differs_from_the_choice_is_reported(scene, chosen, stage, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
     rows = {check["where"]: check for check in run_audit(scene) if check["what"] == "settings: recipe"}
-    assert (rows[arm]["found"], rows[arm]["holds"]) == (found, True)
+    assert (rows[stage]["found"], rows[stage]["holds"]) == (found, True)
     assert rows["train_multi"]["found"] == "equal"
 
 

@@ -190,8 +190,8 @@ def test_equal_directions_with_other_magnitudes_are_not_a_copy():
 
 
 def test_response_rotated_by_ten_degrees_is_not_a_copy():
-    # Re-seating a skin rotates the fields by more than 10 degrees. Here each row is 0.17 |dB|, at least 39 uT, from its
-    # ray.
+    # Re-seating a skin rotates the fields by more than 10 degrees. Here, each rotated field differs from the nearest
+    # multiple of the original field by 0.17 |dB|, which is at least 39 uT.
     planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
     one, other = source[:, :14:2], source[:, 1:14:2]
     cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))

@@ -37,8 +37,8 @@ DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yam
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 # Tolerances: errors of a fit to 50 pokes with 3 uT of noise; errors of gap and amplitude are correlated.
-NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
-TURN = chip_rotations(SECTION)
+TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
+ROTATIONS = chip_rotations(SECTION)
 
 
 def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
@@ -46,8 +46,8 @@ def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> Reco
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
-    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(parameters, SETUP, place_mm, force_N))
-    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(parameters, SETUP))
+    db_uT = np.einsum("kij,nki->nkj", ROTATIONS, law.simulate_uT(parameters, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", ROTATIONS, law.at_rest_uT(parameters, SETUP))
     return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
         place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
@@ -66,7 +66,7 @@ def sentence(pokes: RecordedPresses) -> str:
 
 
 def test_fit_recovers_the_true_parameters(recorded):
-    fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
+    fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(TOLERANCES)
     assert {
         name: (fitted[name], true) for name, true in asdict(TRUE).items() if abs(fitted[name] - true) > near[name]
     } == {}
@@ -146,7 +146,7 @@ def test_law_without_slide_and_offsets_equals_the_nominal_skin():
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
     lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
-               np.geomspace(0.2, 8, 30)]  # one of these forces gives the same depth  # fmt: skip
+               np.geomspace(0.2, 8, 30)]  # one of these forces gives nearly the depth of `nominal_uT`  # fmt: skip
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
@@ -156,7 +156,8 @@ def test_pokes_beyond_the_greatest_depth_are_counted_and_clamped():
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    without_slide = replace(TRUE, away_um_mm=0.0)  # no slide, because it would grow with the force
+    # With a slide, the field would change with the force even at a constant depth.
+    without_slide = replace(TRUE, away_um_mm=0.0)
     held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
     # a skin with half the modulus is indented as deeply by half the force
     soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)

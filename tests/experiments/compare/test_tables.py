@@ -25,9 +25,13 @@ BOARD = AGREEMENT | {
     "noise_uT": {"x": 3.3, "y": 3.3, "z": 5.0}, "pokes_n": 4, "left_out_n": 1,
 }  # fmt: skip
 STAT = {"mean": 0.91, "n": 2, "ci95": [0.905, 0.915]}
-OVER = {"cosine_mean": STAT, "explained_median": STAT, "growth_difference": {"mean": 0.0, "n": 2, "ci95": [-0.2, 0.2]}}
+OVER_BOARDS = {
+    "cosine_mean": STAT,
+    "explained_median": STAT,
+    "growth_difference": {"mean": 0.0, "n": 2, "ci95": [-0.2, 0.2]},
+}
 NUMBERS = {
-    "by_board": {"b1": BOARD}, "over_boards": {"fitted": OVER}, "memory_put_in": 0.065, "light_N": 0.001,
+    "by_board": {"b1": BOARD}, "over_boards": {"fitted": OVER_BOARDS}, "memory_put_in": 0.065, "light_N": 0.001,
     "grip_N_mm": 8.75,
 }  # fmt: skip
 FIELDS = {"recorded": [[[100.0, 20.0, 5.0], [0.0, -40.0, 5.0]]], "simulated": [[[90.0, 10.0, 5.0], [0.0, -20.0, 5.0]]]}

@@ -34,10 +34,10 @@ def grid_rows(force=True):
 
 
 ROWS = grid_rows()
-OWN = np.flatnonzero(ROWS.board == "b0")
+B0_ROWS = np.flatnonzero(ROWS.board == "b0")
 
 
-def pairs_at(separation_mm, rows=ROWS, tested=OWN, pairs_n=80):
+def pairs_at(separation_mm, rows=ROWS, tested=B0_ROWS, pairs_n=80):
     return draw_pairs(rows, tested, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reskin.recordings.readers import READERS
 from tests.recordings.readers import test_eflash7, test_eflesh, test_ini, test_lab, test_plain
 
-WHOLE: dict[str, Callable[[Path], Path]] = {
+WRITERS: dict[str, Callable[[Path], Path]] = {
     "table": test_plain.write,
     "lab": lambda folder: test_lab.write(folder, *test_lab.PRESSES),
     "ini": lambda folder: test_ini.write(folder, test_ini.ONE_PASS),
@@ -19,17 +19,17 @@ WHOLE: dict[str, Callable[[Path], Path]] = {
 }
 TESTS = {"table": test_plain, "lab": test_lab, "ini": test_ini, "eflesh": test_eflesh, "eflash7": test_eflash7}
 FILES = [(layout, name) for layout, reader in READERS.items() for name in reader.FILES]  # type: ignore[attr-defined]
-ROWLESS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f"{test_lab.NAMES}\n".encode()]
+WITHOUT_ROWS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f"{test_lab.NAMES}\n".encode()]
 
 
 def refuse(folder: Path, layout: str, name: str, change: Callable[[bytes], bytes]) -> str:
-    file = WHOLE[layout](folder) / name
+    file = WRITERS[layout](folder) / name
     file.write_bytes(change(file.read_bytes()))
     return TESTS[layout].error_of(folder)
 
 
 @pytest.mark.parametrize(("layout", "name"), FILES)
-@pytest.mark.parametrize("content", ROWLESS, ids=repr)
+@pytest.mark.parametrize("content", WITHOUT_ROWS, ids=repr)
 def test_file_without_rows_is_refused(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
     assert name in refuse(tmp_path, layout, name, lambda _: content)
 
