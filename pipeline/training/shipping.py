@@ -44,12 +44,15 @@ CARD = {
     "centre": asdict(NOMINAL),
     "map": "presses of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
     "network": "trained on presses of simulated skins, errors of the law drawn at every step; no recorded row",
-    "answers": "places: the map's probabilities times the network's normal; misfit: the map's",
+    "answers": "places: the map's probabilities times the network's normal distribution; forces: by map and network or "
+    "by the map alone, corrected by a line that is fitted to presses of known force; misfit: the map's",
     "standard_deviations": "of a power of that product. The power: `sureness`, by number of unlabelled presses "
     "(anywhere, or evenly over the skin) and of labels, over the median misfit of the presses (of 12 or more) and over "
     "the variance inflation of cross-validated labels. Calibrated on simulated skins: 1.645 to either side cover 90 %",
     "made_in_s_of": "one core's processor time; other machines take others",
-    "recorded_knowledge": "the form of the law and the middle of its slide, from two recorded boards",
+    "recorded_knowledge": "from two recorded boards: the form of the law, its slide, the force at which the slide ends "
+    "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), and the direction of the "
+    "magnetisation",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
     "presses that lie evenly (see(presses, even=True)) and by labels; intervals with fewer presses are calibrated on "
     "simulated skins alone",

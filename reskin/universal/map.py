@@ -32,9 +32,10 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# Nominal parameters. Only the form of the law and `away_um_mm` come from recorded boards; `away_um_mm` is the slide of
-# the skin towards its centre under a press, in um per mm of distance from the centre. The modulus is that of Dragon
-# Skin 10 with filler (150 to 230 kPa).
+# Nominal parameters. The form of the law, `away_um_mm` and `lets_go_N` come from the recorded boards of scene lab, as
+# does the pair of gap and amplitude: many such pairs fit a board about equally well, and this one is among them.
+# `away_um_mm` is the slide of the skin towards its centre under a press, in um per mm of distance from the centre. The
+# modulus is that of Dragon Skin 10 with filler (150 to 230 kPa).
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
 STEP = 0.4  # step of the finite differences that give the slopes, in units of the parameters' spreads
 

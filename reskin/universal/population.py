@@ -26,7 +26,8 @@ ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere o
 # are assumed.
 THICKNESSES_MM = {1.8: 0.07, 1.9: 0.24, 2.0: 0.38, 2.1: 0.24, 2.2: 0.07}  # mm: probability
 TIPS_MM = {1.75: 0.25, 2.0: 0.5, 2.5: 0.25}  # radius, mm: probability
-LOG_AMPLITUDE_PER_MM = 0.95  # in fits, a larger gap comes with a larger amplitude, because their effects compensate
+# In fits to the boards of scene lab, a larger gap comes with a larger amplitude, because their effects compensate.
+LOG_AMPLITUDE_PER_MM = 0.95
 # Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
