@@ -334,8 +334,8 @@ DASHES = ("-", "--", "-.")  # line styles of the methods, so that overlapping li
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores of every method in every field.
 
-    There are rows for the mean over all held-out boards, and rows for the last board alone. Only the last board has
-    networks of all methods.
+    There are rows for the mean over all held-out boards, and rows for the last board alone: networks of all
+    methods were trained for that board only.
     """
     last = numbers["last_board"]
     summaries = (("all held out", numbers), (str(last["board"]), last))

@@ -36,9 +36,16 @@ from reskin.universal.calibration import (
     lower_by_residuals,
     variance_inflations,
 )
-from reskin.universal.force import NORMAL_90, prior_line
+from reskin.universal.force import NORMAL_90, ForceLine, prior_line
 from reskin.universal.map import FORCES_N, Estimate
-from reskin.universal.model import Evaluation, HeldOutLabels, PriorModel, line_of_labels, load_universal
+from reskin.universal.model import (
+    Evaluation,
+    HeldOutLabels,
+    PressCalibration,
+    PriorModel,
+    line_of_labels,
+    load_universal,
+)
 
 SPACING_MM = 2.0  # of the places; presses are assigned to the nearest place of a grid with this spacing
 FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
@@ -187,7 +194,7 @@ def raise_forces(labels: LabelledPresses) -> LabelledPresses:
 class CalibratedBoard:
     """A variant calibrated to the no-load field and the unlabelled presses of a board, and their median misfit."""
 
-    calibration: Any
+    calibration: PressCalibration
     misfit: float
 
     def score(
@@ -199,17 +206,18 @@ class CalibratedBoard:
         held_out = [([fold.evaluation.combined(power)], fold.labels.place_mm) for fold in folds]
         power = lower_by_residuals(power, *variance_inflations(1, held_out))
         model = self.calibration.with_labels(labels)
-        lines = {"": line_of_labels(folds), "combined": line_of_combined(folds), "raw": prior_line()}
+        line = line_of_labels(folds)
 
-        def in_each_way(evaluation: Evaluation) -> list[Estimate]:
-            return [replace(evaluation, line=line).combined(power) for line in lines.values()]
+        def with_and_without_line(evaluation: Evaluation) -> list[Estimate]:
+            return [replace(evaluation, line=each).combined(power) for each in (line, prior_line())]
 
-        calibrated, by_line, raw = model.estimate_by(in_each_way, tested.db_uT)
+        calibrated, raw = model.estimate_by(with_and_without_line, tested.db_uT)
+        log_N, _ = line_of_combined(folds).apply(np.log(raw.force_N))
         scores = score_estimate(calibrated, tested)
-        return scores | {"r2_line_f": r2(by_line.force_N, tested.force_N), "r2_raw_f": r2(raw.force_N, tested.force_N)}
+        return scores | {"r2_line_f": r2(np.exp(log_N), tested.force_N), "r2_raw_f": r2(raw.force_N, tested.force_N)}
 
 
-def line_of_combined(folds: Sequence[HeldOutLabels]) -> Any:
+def line_of_combined(folds: Sequence[HeldOutLabels]) -> ForceLine:
     """Fit the line without a selection of the estimator."""
     if not folds:
         return prior_line()

@@ -150,8 +150,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         lines.append(line | {"n": str(scores["accuracy_pct"]["n"])})
     rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
     meaning = (
-        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: the "
-        f"path of a held-out line is also dragged along in {numbers['passes_n'] - 1} other passes. Our forces are "
+        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: "
+        f"each held-out line has the same path as a line in {numbers['passes_n'] - 1} other passes. Our forces are "
         f"{rms_N} rms. The paper does not state its forces, and an MSE grows with the square of the force; explained "
         "variance, 1 - MSE / variance, does not. Our MSE_Fxy is a mean over two axes; the paper does not say whether "
         "it sums or averages over axes."

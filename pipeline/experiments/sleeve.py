@@ -160,8 +160,10 @@ def rate_hz(captures: Sequence[Readings]) -> float:
         steps_n += int(same.sum())
         steps_s += float(np.diff(capture.t_s)[same].sum())
     if not steps_s > 0:
-        what = "the frame rate needs two or more readings of an indentation, with times"
-        raise ParamsError(f"experiment sleeve: {what}; got {steps_n} such pairs. Record more readings per indentation.")
+        what = "the frame rate needs successive readings of the same indentation with increasing times"
+        raise ParamsError(
+            f"experiment sleeve: {what}; got {steps_n} pairs of them. Record more readings per indentation."
+        )
     return steps_n / steps_s
 
 

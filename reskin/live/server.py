@@ -118,7 +118,7 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a JSON message from a page: the name of a pressed button, or the number of a message that was drawn."""
+    """Handle a JSON message from a page: the name of a pressed button, or the number of the data that it has shown."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):

@@ -89,9 +89,9 @@ def _check_drag(
 
 REACH = 5.0  # tables extend this far beyond the contact, in thicknesses; material farther away does not move
 WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` is too coarse for larger contacts
-RIM_MAX = 1.2  # largest height of the rim in thicknesses, as in `deformation`; nodes above 1 move like the surface
-STEP = 0.75  # largest half curl per step; with mu = 0.8, one step suffices on the nominal skin for depths up to 0.6 mm
-STEEPEST = 1.5  # largest half curl for which the step size was verified (mu = 0.8 at a depth of 1.2 mm)
+RIM_MAX = 1.2  # largest height of the rim in thicknesses, as in `deformation`; nodes in the rim move like the surface
+STEP = 0.75  # largest rotation (half the curl) per integration step; at mu = 0.8, one step is enough down to 0.6 mm
+STEEPEST = 1.5  # largest rotation for which the step size was verified (mu = 0.8 at a depth of 1.2 mm)
 TABLE_R_N, TABLE_Z_N = 512, 80  # numbers of radii and heights in a table; fine enough for linear interpolation
 DEPTH_STEP_M = 10e-6  # step between tabulated depths, over which the stiffness changes by 1 % and dB by 0.1 uT
 

@@ -154,8 +154,8 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
         where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
         difference_s = states_s[disagreeing[0]] - sensor_s[disagreeing[0]]
         raise CaptureError(
-            f"{where}: time is {difference_s:.3f} s from that of {SENSOR}, not within {CLOCKS_APART_MAX_s} s. Is a row "
-            "missing in one of the files?"
+            f"{where}: its time differs by {difference_s:.3f} s from the time in {SENSOR}; less than "
+            f"{CLOCKS_APART_MAX_s} s is allowed. Is a row missing in one of the files?"
         )
     back = np.flatnonzero(np.diff(sensor_s) <= 0)
     if len(back):

@@ -221,7 +221,9 @@ def _number_presses(
             twice = firsts[counts > 1][0]
             line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
             problem = f"indentation {twice:g} begins again in line {line_n}"
-            raise CaptureError(f"{where}: {problem}; its rows must be one block. Was the file joined twice?")
+            raise CaptureError(
+                f"{where}: {problem}; its rows must be one block. Was the same recording appended twice?"
+            )
         begins_at = np.zeros(len(contact), bool)
         begins_at[rows[begins]] = True
         return np.maximum(np.cumsum(begins_at) - 1, 0)

@@ -166,7 +166,7 @@ def test_unequal_row_counts_are_refused(tmp_path: Path, name: str) -> None:
     ("name", "cell", "expected"),
     [
         (eflesh.CHANGES, f"{START_s + 8.6}", "line 3: time differs from that of sensor.csv"),
-        (eflesh.STATES, f"{START_s + 8.6}", "line 3: time is 0.100 s from that of sensor.csv"),
+        (eflesh.STATES, f"{START_s + 8.6}", "line 3: its time differs by 0.100 s from the time in sensor.csv"),
     ],
 )
 def test_disagreeing_clocks_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
