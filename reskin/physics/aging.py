@@ -104,7 +104,8 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
     """Integrate q' = -q / tau + share e' over a step of `dt_s`, in which the elastic force e changes by `change`.
 
     `state` is q for each term of the Prony series. The solution is exact if e changes linearly:
-    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). A jump of e has dt = 0.
+    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). For a jump
+    of e, dt is 0.
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"

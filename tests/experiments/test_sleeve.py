@@ -103,7 +103,7 @@ def test_rate_is_measured_within_indentations(rate, pause_s):
 
 
 def test_rate_of_single_readings_is_an_error():
-    with pytest.raises(ParamsError, match="needs two or more readings of an indentation"):
+    with pytest.raises(ParamsError, match="needs successive readings of the same indentation"):
         rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
 
