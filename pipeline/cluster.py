@@ -100,7 +100,7 @@ def describe_process() -> dict[str, str]:
         "the project's code": str(Path(pipeline.__file__).resolve()),
         DEVICE_VARIABLE: device(),
         "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "unset"),
-        "variables of numerics": ", ".join(signature()),
+        "environment variables of numerics": ", ".join(signature()),
     }
 
 

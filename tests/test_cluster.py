@@ -104,8 +104,8 @@ def test_error_on_a_worker_is_raised_here(address, monkeypatch):
         ({}, "the scheduler at tcp://there has no workers"),
         ({"w": {"threads": 2}}, "threads of worker w must be 1; got 2"),
         (
-            {"v": {}, "w": {"variables of numerics": "COMPATIBLE"}},
-            "variables of numerics of worker w must be .* got COMP",
+            {"v": {}, "w": {"environment variables of numerics": "COMPATIBLE"}},
+            "environment variables of numerics of worker w must be .* got COMP",
         ),
         ({"w": {"the project's code": "/elsewhere"}}, "the project's code of worker w must be .* got /elsewhere"),
         ({"w": {"RESKIN_DEVICE": "cuda"}}, "RESKIN_DEVICE of worker w must be cpu; got cuda"),

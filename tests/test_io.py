@@ -153,7 +153,7 @@ def test_missing_column_is_an_error(tmp_path):
         io.read_readings(tmp_path / "c1.parquet")
 
 
-def test_json_without_nan(tmp_path):
+def test_nan_is_not_written_to_json(tmp_path):
     with pytest.raises(ValueError, match="Out of range float"):
         io.write_json(tmp_path / "a.json", {"x": float("nan")})
     assert list(tmp_path.iterdir()) == []

@@ -97,7 +97,9 @@ def fold_without(data: SceneData, board: str) -> Fold:
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
         what = f"board {board} is not held out by any fold of lobo ({', '.join(sorted(folds))})"
-        raise SchemaError(f"experiment manual: {what}. Record hand pokes on skins of the main captures.")
+        raise SchemaError(
+            f"experiment manual: {what}. Record hand pokes on skins that the other captures of the scene are of."
+        )
     return folds[board]
 
 

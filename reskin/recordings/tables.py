@@ -166,7 +166,9 @@ def _read_text(path: Path, where: str) -> str:
         text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a byte order mark
     except UnicodeDecodeError as error:
         byte = f"{error.object[error.start]:#04x} at {error.start}"
-        raise CaptureError(f"{where}: the file is not text: byte {byte}. Is it another file under this name?") from None
+        raise CaptureError(
+            f"{where}: the file is not text: byte {byte}. Is this the right file? Check its content."
+        ) from None
     except OSError as error:
         raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
     if not text.endswith("\n"):

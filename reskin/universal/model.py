@@ -42,7 +42,7 @@ from reskin.universal.calibration import (
     variance_inflations,
     write_calibration,
 )
-from reskin.universal.force import ESTIMATORS, LOG_CENTRE_N, ForceLine, fit_line, prior_line
+from reskin.universal.force import ESTIMATORS, FEW_N, LOG_CENTRE_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
@@ -84,13 +84,15 @@ CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for t
 class Evaluation:
     """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The likelihood power affects standard deviations and, in `by_map`, also places and forces.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces. unlabelled: likelihoods
+    of the map without labels, if this map estimates the forces.
     """
 
     evaluator: MapEvaluator
     likelihoods: Likelihoods
     network: NetworkEstimate
     line: ForceLine
+    unlabelled: Likelihoods | None = None
 
     __repr__ = one_line
 
@@ -109,20 +111,23 @@ class Evaluation:
         The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
         are computed from a power of the product. Forces are calibrated by the skin's line.
         """
-        place_mm, sd_mm, by_estimator = self._products(power)
+        place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
+        if self.unlabelled is not None:
+            by_estimator = self.log_forces()
         log_N, sd_log_N = self.line.apply(by_estimator[ESTIMATORS.index(self.line.estimator)])
         return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
         """Return the log forces of each of `ESTIMATORS` before their calibration."""
-        return self._products(1.0)[2]
+        return self._products(self.likelihoods if self.unlabelled is None else self.unlabelled, 1.0)[2]
 
-    def _products(self, power: float) -> tuple[np.ndarray, np.ndarray, Sequence[Float[np.ndarray, " n"]]]:
+    def _products(
+        self, likelihoods: Likelihoods, power: float
+    ) -> tuple[np.ndarray, np.ndarray, Sequence[Float[np.ndarray, " n"]]]:
         normals = np.empty((len(self.network.log_N), 6))
         normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
         np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
         np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
-        likelihoods = self.likelihoods
         place_mm, sd_mm, force_N, map_log_N = products(
             likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power
         )
@@ -134,12 +139,14 @@ class CalibratedModel:
     """Map and networks, calibrated to one skin.
 
     offsets_mm: corrections that are added to the networks' places, one after the other. line: calibration of forces.
+    unlabelled_skin: map without labels, which estimates the forces if there are few labels.
     """
 
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
     line: ForceLine = field(default_factory=prior_line)
+    unlabelled_skin: SkinMap | None = None
 
     __repr__ = one_line
 
@@ -162,8 +169,9 @@ class CalibratedModel:
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
         """Evaluate map and networks on a block of readings."""
-        evaluator = self.skin.evaluator
-        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line)
+        evaluator, other = self.skin.evaluator, self.unlabelled_skin
+        unlabelled = None if other is None else other.evaluator.evaluate(db_uT)
+        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line, unlabelled)
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
         """Estimate places and forces with the networks alone, with the offsets added to the places."""
@@ -224,17 +232,24 @@ class PressCalibration:
             return shift_onto_area(estimate, sd_mm)
         return -self.even_mm.mean(axis=0) if len(self.even_mm) else np.zeros(2)
 
-    def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
-        """Condition the map on labelled presses, and compute the offsets of the networks' places from them."""
+    def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
+        """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
+
+        few: whether forces are estimated by the map without labels, because the line alone shall use the known forces.
+        By default, this is so for fewer than `FEW_N` labels.
+        """
         skin = move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
+        few = len(labels) < FEW_N if few is None else few
+        unlabelled = skin if few and len(labels) else None
         skin = condition_on_labels(skin, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
-        return CalibratedModel(skin, self.layers, network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm))
+        offsets_mm = network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm)
+        return CalibratedModel(skin, self.layers, offsets_mm, unlabelled_skin=unlabelled)
 
     def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
         """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
         for kept, held_out in folds_of_labels(len(labels)):
-            model = self.with_labels(labels[kept]).with_offsets_in_biases()
+            model = self.with_labels(labels[kept], few=len(labels) < FEW_N).with_offsets_in_biases()
             yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
 
 

@@ -193,7 +193,7 @@ def test_score_of_an_area_without_pokes_is_a_dash():
     assert "0 of them less than" in table.attrs["meaning"]
 
 
-def test_table_compares_the_setup_with_the_papers():
+def test_table_compares_our_setup_with_that_of_the_paper():
     table = tables(numbers_and_figure_data()[0], "simulated")["sleeve_set_up"].set_index("what")
     assert table.loc["chips", ["ours", "paper"]].tolist() == ["16", "40"]
     assert table.loc["rate, Hz", ["ours", "paper"]].tolist() == ["133.0", "133"]
