@@ -144,7 +144,7 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
         )
     unlabelled, weight = rng.permutation(n)[:presses_n], rng.choice(middle, 1)
     part = board.part(split, draw_i)
-    tested = (part == -1) & ~np.isin(np.arange(n), [*unlabelled, *weight])
+    tested = (part == -1) & ~board.middle & ~np.isin(np.arange(n), [*unlabelled, *weight])
     if not tested.any() or not (part == 1).any():
         raise SchemaError(
             f"random_presses: board {board.board} has too few presses ({n}) to be split by {split}. "
@@ -177,6 +177,9 @@ def score_draw(
 
 def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
     """Return the labels of each number, and after no label those of the known weight, with their names."""
+    if max(labels_n, default=0) > len(draw.labels):
+        what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
+        raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
     sets = []
     for n in labels_n:
         sets.append((raise_forces(board.presses[draw.labels[:n]]), str(n)))
@@ -282,7 +285,8 @@ def interval_score(error: Float[np.ndarray, "..."], half_width: Float[np.ndarray
 
 def r2(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t"]) -> float:
     """Return the coefficient of determination of forces."""
-    return 1 - float(((force_N - true_N) ** 2).mean() / true_N.var())
+    var = float(true_N.var())
+    return 1 - float(((force_N - true_N) ** 2).mean()) / var if var else float("nan")
 
 
 GROUP = ("tested", "presses_n", "method", "labels")
@@ -311,10 +315,11 @@ TITLES = {
 MEANING = (
     "Means over {draws_n} draws of presses and labels, then over boards; (a; b) are the values of the boards. The "
     "model is calibrated to unlabelled presses at random places and forces. Labels are drawn from one part of the "
-    "places; the tested presses are in the other part and were not used in any way. Label `weight`: one press with a "
-    "known force in the middle of the skin. Forces: the estimator and its line are selected by cross-validation over "
-    "the labels. `line` always calibrates the combined force of map and networks; for `nearest label`, it is the mean "
-    "force of the labels."
+    "places. The tested presses are in the other part and were not used for the calibration; choices that were made on "
+    "these boards are listed in docs/learning.md. Label `weight`: one press with a known force in the middle of the "
+    "skin, where no press is tested. Forces: estimator and line are selected by cross-validation over the labels. "
+    "`line` always calibrates the combined force of map and networks; for `nearest label`, it is the mean force of the "
+    "labels."
 )
 
 

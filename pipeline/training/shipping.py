@@ -51,8 +51,8 @@ CARD = {
     "the variance inflation of cross-validated labels. Calibrated on simulated skins: 1.645 to either side cover 90 %",
     "made_in_s_of": "one core's processor time; other machines take others",
     "recorded_knowledge": "from two recorded boards: the form of the law, its slide, the force at which the slide ends "
-    "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), and the direction of the "
-    "magnetisation",
+    "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), the direction of the "
+    "magnetisation, the length scales of the law's error, and how forces are estimated",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
     "presses that lie evenly (see(presses, even=True)) and by labels; intervals with fewer presses are calibrated on "
     "simulated skins alone",

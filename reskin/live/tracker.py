@@ -182,7 +182,7 @@ class UniversalEstimator:
             model.see(self._presses_uT + self._noload_uT)
         if len(self._labelled_uT):
             b_uT = self._labelled_uT + self._noload_uT
-            model.label(self._labelled_mm, model.estimate(b_uT).force_N, b_uT, keep=True, force_known=False)
+            model.label(self._labelled_mm, None, b_uT, keep=True)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
         self._model = model
 

@@ -83,7 +83,7 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
 
 def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
     """Return the field changes; raise SchemaError if all are below the noise, for example because they are in mT."""
-    strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), -1, 3), axis=2).max(initial=0.0))
+    strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), CHANNELS_N // 3, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
         rule = f"{NOISE_uT:g} uT or more at some chip"
         remedy = "Are the fields in uT? Convert mT or G, or press the skin."
@@ -127,6 +127,11 @@ class LabelledPresses:
     def __len__(self) -> int:
         return len(self.force_N)
 
+    @property
+    def known(self) -> Bool[np.ndarray, " m"]:
+        """Which forces are true."""
+        return np.ones(len(self), bool) if self.force_known is None else self.force_known
+
     def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
         """Select presses."""
         known = None if self.force_known is None else self.force_known[which]
@@ -135,10 +140,9 @@ class LabelledPresses:
 
 def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses:
     """Append labelled presses to others."""
-    known = [np.ones(len(part), bool) if part.force_known is None else part.force_known for part in (one, other)]
     return LabelledPresses(
         np.concatenate([one.place_mm, other.place_mm]), np.concatenate([one.force_N, other.force_N]),
-        np.concatenate([one.db_uT, other.db_uT]), np.concatenate(known),
+        np.concatenate([one.db_uT, other.db_uT]), np.concatenate([one.known, other.known]),
     )  # fmt: skip
 
 
@@ -169,8 +173,8 @@ class CalibrationData:
 def write_calibration(data: CalibrationData, file: Path) -> None:
     """Write calibration data to a safetensors file, which does not contain the model."""
     labels = data.labels
-    known = np.ones(len(labels)) if labels.force_known is None else labels.force_known.astype(float)
-    values = (data.presses_uT, data.even_uT, data.area_uT, labels.place_mm, labels.force_N, labels.db_uT, known)
+    labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
+    values = (data.presses_uT, data.even_uT, data.area_uT, *labelled)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 

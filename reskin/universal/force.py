@@ -8,25 +8,40 @@ line corrects that factor and its growth with force.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 LOG_CENTRE_N = math.log(2.0)  # log force at which the line's intercept is defined
-# Standard deviations of intercept and slope about the identity, and of single log forces about the line. On 24
-# simulated skins with errors of the law as in training, they are 0.33, 0.10 and 0.36; with errors twice as large, they
-# are 0.70, 0.23 and 0.55. The values below are between these.
-INTERCEPT_SD, SLOPE_SD, SCATTER_SD = 0.5, 0.3, 0.4
-SCATTER_LABELS_N = 20  # weight of SCATTER_SD, as a number of labels
+SCATTER_LABELS_N = 20  # weight of the scatter's prior, as a number of labels
 NORMAL_90 = 1.645  # half width of a 90 % interval, in standard deviations
 
-# Estimators of the log force. "combined" (map and networks) is used if no force is known; "map" if some are known,
-# unless the labels clearly favour another one. On simulated skins, both are about equally good; on the boards of scene
-# lab, the map is better.
-ESTIMATORS = ("combined", "map", "constant")
-DEFAULT = "map"
+
+class LinePrior(NamedTuple):
+    """Prior of the line of one estimator: mean and standard deviation of intercept and slope, and the scatter."""
+
+    mean: tuple[float, float]
+    sd: tuple[float, float]
+    scatter_sd: float
+
+
+# Estimators of the log force, with priors of their lines. Lines that are fitted to simulated skins have these means and
+# standard deviations, for errors of the law as in training (in brackets: twice as large).
+# "combined": intercept -0.1 +- 0.35 (-0.7 +- 0.6), slope 1.0 +- 0.1 (1.0 +- 0.15), scatter 0.36 (0.55).
+# "map": intercept -0.3 +- 0.5 (-1.4 +- 1.1), slope 1.15 +- 0.15 (1.5 +- 0.5).
+# The priors are between both. That of "combined" has the mean (0, 1), which leaves forces as they are without a label.
+PRIORS = {
+    "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
+    "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
+    "constant": LinePrior((0.0, 0.0), (1.0, 1e-6), 0.6),
+}
+ESTIMATORS = tuple(PRIORS)
+# With `FEW_N` or more known forces, "map" is used unless the labels clearly favour another estimator. With fewer,
+# "combined" is used: it is better on simulated skins with one known force.
+FEW_N = 5
+FEW_ESTIMATOR, DEFAULT = "combined", "map"
 MARGIN = 3.0  # log likelihood of the labels by which another estimator must exceed the default; assumed
-FEW_N = 5  # with fewer labels, no estimator is selected, and forces are estimated by the map without labels
 
 
 @dataclass(frozen=True)
@@ -52,8 +67,10 @@ class ForceLine:
         row, deviation = _row(log_N), true_log_N - LOG_CENTRE_N
         posterior = self._update(row, deviation, self.scatter_var)
         residual = deviation - row @ posterior.mean
-        weight = SCATTER_LABELS_N
-        scatter_var = (weight * self.scatter_var + float(residual @ residual)) / (weight + len(residual))
+        squared = float(
+            residual @ residual + ((row @ posterior.cov) * row).sum()
+        )  # expected, given the line's posterior
+        scatter_var = (SCATTER_LABELS_N * self.scatter_var + squared) / (SCATTER_LABELS_N + len(residual))
         return self._update(row, deviation, scatter_var)
 
     def _update(self, row: Float[np.ndarray, "m 2"], deviation: Float[np.ndarray, " m"], var: float) -> "ForceLine":
@@ -62,26 +79,24 @@ class ForceLine:
         return ForceLine(self.estimator, cov @ (prior @ self.mean + row.T @ deviation / var), cov, var)
 
 
-def prior_line(estimator: str = "combined") -> ForceLine:
-    """Return the line before any force is known: the identity, or a line of slope 0 if the estimator is constant."""
-    slope, sd = (0.0, 1e-6) if estimator == "constant" else (1.0, SLOPE_SD)
-    intercept_sd = 2 * INTERCEPT_SD if estimator == "constant" else INTERCEPT_SD
-    scatter_sd = 1.5 * SCATTER_SD if estimator == "constant" else SCATTER_SD
-    return ForceLine(estimator, np.array([0.0, slope]), np.diag([intercept_sd**2, sd**2]), scatter_sd**2)
+def prior_line(estimator: str = FEW_ESTIMATOR) -> ForceLine:
+    """Return the line of an estimator before any force is known."""
+    prior = PRIORS[estimator]
+    return ForceLine(estimator, np.array(prior.mean), np.diag(np.square(prior.sd)), prior.scatter_sd**2)
 
 
 def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[np.ndarray, " m"]) -> ForceLine:
     """Fit the line to presses with known forces, and select the estimator.
 
-    The default estimator is replaced by another one if the likelihood of the labels, each predicted from the others, is
-    larger by a factor of at least exp(MARGIN). With fewer than `FEW_N` labels it is not replaced.
+    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With more, it is `DEFAULT`, unless another one
+    makes the labels, each predicted from the others, more likely by a factor of at least exp(MARGIN).
 
     Parameters
     ----------
     by_estimator : for each of `ESTIMATORS`, log forces that were estimated without the label of the same press
     true_log_N : true log forces of these presses
     """
-    log_forces, selected = dict(zip(ESTIMATORS, by_estimator, strict=True)), DEFAULT
+    log_forces, selected = dict(zip(ESTIMATORS, by_estimator, strict=True)), FEW_ESTIMATOR
     if len(true_log_N) >= FEW_N:
         score = {name: _held_out_likelihood(name, log_N, true_log_N) for name, log_N in log_forces.items()}
         best = max(score, key=lambda name: score[name])

@@ -112,14 +112,18 @@ class Evaluation:
         are computed from a power of the product. Forces are calibrated by the skin's line.
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
-        if self.unlabelled is not None:
-            by_estimator = self.log_forces()
+        by_estimator = self.other_log_forces or by_estimator
         log_N, sd_log_N = self.line.apply(by_estimator[ESTIMATORS.index(self.line.estimator)])
         return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
         """Return the log forces of each of `ESTIMATORS` before their calibration."""
-        return self._products(self.likelihoods if self.unlabelled is None else self.unlabelled, 1.0)[2]
+        return self.other_log_forces or self._products(self.likelihoods, 1.0)[2]
+
+    @cached_property
+    def other_log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
+        """Log forces of the map without known forces, if this map estimates the forces; otherwise empty."""
+        return () if self.unlabelled is None else self._products(self.unlabelled, 1.0)[2]
 
     def _products(
         self, likelihoods: Likelihoods, power: float
@@ -190,16 +194,11 @@ class HeldOutLabels(NamedTuple):
 
 def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
     """Fit the calibration of forces to the labels whose force is known."""
-    pairs = [(fold.labels, fold.evaluation.log_forces()) for fold in folds]
-    known = [slice(None) if labels.force_known is None else labels.force_known for labels, _ in pairs]
-    true_N = [labels.force_N[which] for (labels, _), which in zip(pairs, known, strict=True)]
-    if not sum(map(len, true_N)):
+    if not any(fold.labels.known.any() for fold in folds):
         return prior_line()
-    by_estimator = [
-        np.concatenate([log_N[i][which] for (_, log_N), which in zip(pairs, known, strict=True)])
-        for i in range(len(ESTIMATORS))
-    ]
-    return fit_line(by_estimator, np.log(np.concatenate(true_N)))
+    log_forces = [[log_N[fold.labels.known] for log_N in fold.evaluation.log_forces()] for fold in folds]
+    true_N = np.concatenate([fold.labels.force_N[fold.labels.known] for fold in folds])
+    return fit_line([np.concatenate(parts) for parts in zip(*log_forces, strict=True)], np.log(true_N))
 
 
 @dataclass(frozen=True)
@@ -232,16 +231,21 @@ class PressCalibration:
             return shift_onto_area(estimate, sd_mm)
         return -self.even_mm.mean(axis=0) if len(self.even_mm) else np.zeros(2)
 
+    @cached_property
+    def moved(self) -> SkinMap:
+        """The map, with its places moved onto the area of the grid if the presses are spread over it."""
+        return move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
+
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        few: whether forces are estimated by the map without labels, because the line alone shall use the known forces.
-        By default, this is so for fewer than `FEW_N` labels.
+        few: whether another map, which is not conditioned on presses with known forces, estimates the forces. The line
+        then is the only part that uses these forces. By default, this is so for 1 to `FEW_N` - 1 known forces.
         """
-        skin = move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
-        few = len(labels) < FEW_N if few is None else few
-        unlabelled = skin if few and len(labels) else None
-        skin = condition_on_labels(skin, labels.place_mm, labels.force_N, labels.db_uT)
+        few = has_few(labels) if few is None else few
+        rest = labels[np.flatnonzero(~labels.known)]
+        unlabelled = condition_on_labels(self.moved, rest.place_mm, rest.force_N, rest.db_uT) if few else None
+        skin = condition_on_labels(self.moved, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
         offsets_mm = network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm)
         return CalibratedModel(skin, self.layers, offsets_mm, unlabelled_skin=unlabelled)
@@ -249,8 +253,13 @@ class PressCalibration:
     def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
         """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
         for kept, held_out in folds_of_labels(len(labels)):
-            model = self.with_labels(labels[kept], few=len(labels) < FEW_N).with_offsets_in_biases()
+            model = self.with_labels(labels[kept], few=has_few(labels)).with_offsets_in_biases()
             yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
+
+
+def has_few(labels: LabelledPresses) -> bool:
+    """Return whether some forces are known, but too few to condition the map on them."""
+    return 0 < int(labels.known.sum()) < FEW_N
 
 
 @dataclass(frozen=True)
@@ -416,11 +425,17 @@ class Universal:
         mean place is the skin's centre. Set `area` if they all are at random places all over the area of the paper's
         grid, an octagon 16 mm wide: places are then moved onto this area.
         """
+        if even and area:
+            raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
         db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
+        if not len(db_uT):
+            return self
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
-        if even:
-            return self._restart(self._noload_map, replace(data, presses_uT=presses_uT, even_uT=presses_uT))
-        data = replace(data, area_uT=presses_uT if area else no_presses())
+        if even or area:
+            even_uT, area_uT = (presses_uT, no_presses()) if even else (no_presses(), presses_uT)
+            data = replace(data, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT)
+            return self._restart(self._noload_map, data)
+        data = replace(data, area_uT=no_presses())
         rounds_n = 1 if len(data.presses_uT) else ROUNDS_N
         press_map = condition_on_presses(self._calibration.skin, db_uT, rounds_n)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
@@ -429,17 +444,15 @@ class Universal:
     def label(
         self,
         place_mm: Float[np.ndarray, "*m 2"] | Sequence[Any],
-        force_N: Float[np.ndarray, "*m"] | Sequence[float] | float,
+        force_N: Float[np.ndarray, "*m"] | Sequence[float] | float | None,
         b_uT: Float[np.ndarray, "*m ch"],
         *,
         keep: bool = False,
-        force_known: bool = True,
     ) -> "Universal":
         """Calibrate to one or several presses at known places with known forces.
 
-        Earlier labels are discarded, unless `keep` is set. If only the places are known, pass estimated forces and
-        `force_known=False`: forces are then not calibrated to these presses. A single press of known force, such as a
-        weight on the middle of the skin, calibrates the forces of the whole skin.
+        Earlier labels are discarded, unless `keep` is set. If only places are known, pass `None` as forces. A single
+        press of known force, such as a weight on the middle of the skin, calibrates the forces of the whole skin.
 
         Raises
         ------
@@ -448,12 +461,15 @@ class Universal:
             unchanged.
         """
         readings_uT = check_readings(b_uT)
+        known = force_N is not None
+        if force_N is None:
+            force_N = np.clip(self.estimate(readings_uT).force_N, *self.tables.force_N[[0, -1]])
         places_mm, forces_N = check_labels(
             np.asarray(place_mm, float), np.asarray(force_N, float), len(readings_uT), CENTRE_MM + REACH_MM
         )
         check_range(forces_N, self.tables.force_N)
         db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
-        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT, np.full(len(forces_N), force_known))
+        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
             check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # all labels together may be too many

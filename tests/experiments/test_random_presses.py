@@ -16,6 +16,7 @@ from pipeline.experiments.random_presses import (
     RandomPresses,
     draw_presses,
     interval_score,
+    label_sets,
     score_draw,
     score_nearest,
     summarise_rows,
@@ -62,6 +63,7 @@ def test_tested_presses_are_not_drawn_and_far_from_labels(split, draw_i, presses
     distance_mm = np.linalg.norm(labelled_mm[:, None] - tested_mm, axis=2)
     assert distance_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # grid places are 2 mm apart
     assert (np.abs(board.presses.place_mm[draw.weight]) < 1).all()
+    assert np.linalg.norm(tested_mm - board.presses.place_mm[draw.weight], axis=1).min() >= 2 - 1e-9
 
 
 def test_parts_alternate_from_draw_to_draw(board):
@@ -75,6 +77,12 @@ def test_board_without_a_press_in_the_middle_is_an_error(board):
     reduced = replace(board, presses=board.presses[outside])
     with pytest.raises(SchemaError, match="no press within 1 mm of the middle"):
         draw_presses(reduced, CHECKERBOARD, 12, 2021, 0)
+
+
+def test_too_many_labels_are_an_error(board):
+    draw = draw_presses(board, CHECKERBOARD, 12, 2021, 0)
+    with pytest.raises(SchemaError, match="presses for labels, but labels_n asks for 500"):
+        label_sets(board, draw, (0, 500))
 
 
 def test_nearest_label_is_exact_for_its_own_reading(board):

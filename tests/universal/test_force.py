@@ -9,13 +9,12 @@ from pipeline.training.universal import draw_prior_skins, law_error, split_press
 from reskin.data.grid import CENTRE_MM
 from reskin.seeds import rng_for
 from reskin.universal.force import (
-    DEFAULT,
     ESTIMATORS,
-    INTERCEPT_SD,
+    FEW_ESTIMATOR,
     LOG_CENTRE_N,
     NORMAL_90,
-    SCATTER_SD,
-    SLOPE_SD,
+    PRIORS,
+    SCATTER_LABELS_N,
     fit_line,
     prior_line,
 )
@@ -23,6 +22,7 @@ from reskin.universal.law import to_chips
 from reskin.universal.model import load_universal
 
 SKINS_N, LABELS_N = 5, 20
+(INTERCEPT_SD, SLOPE_SD), SCATTER_SD = PRIORS["combined"].sd, PRIORS["combined"].scatter_sd
 
 
 def draw_log_forces(labels_n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,7 +76,7 @@ def test_best_estimator_is_selected(noise, expected):
     by_estimator = [log_N + sd * rng.standard_normal(40) for sd in noise]
     assert fit_line([*by_estimator, np.full(40, LOG_CENTRE_N)], true_log_N).estimator == expected
     few = [part[:3] for part in (*by_estimator, np.full(40, LOG_CENTRE_N))]
-    assert fit_line(few, true_log_N[:3]).estimator == DEFAULT
+    assert fit_line(few, true_log_N[:3]).estimator == FEW_ESTIMATOR
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +112,55 @@ def test_labels_improve_forces(calibrated):
     assert rms[LABELS_N] < 0.9 * rms[0]
 
 
-def test_estimated_forces_of_labels_do_not_calibrate_forces():
+def test_scatter_is_learnt_from_residuals():
+    log_N = np.log(np.geomspace(0.5, 8, 200))
+    for scatter_sd in (0.1, 1.0):
+        residual = scatter_sd * rng_for(4, "force line").standard_normal(200)
+        line = prior_line().condition(log_N, log_N + residual)
+        expected = (SCATTER_LABELS_N * SCATTER_SD**2 + 200 * scatter_sd**2) / (SCATTER_LABELS_N + 200)
+        assert line.scatter_var == pytest.approx(expected, rel=0.15)  # 200 residuals: 10 % of their variance
+
+
+def test_constant_is_selected_if_estimates_are_noise():
+    rng = rng_for(5, "force line")
+    true_log_N, noise_log_N = np.log(rng.uniform(1.5, 2.5, 8)), 3 * rng.standard_normal((2, 8))
+    assert fit_line([*noise_log_N, np.full(8, LOG_CENTRE_N)], true_log_N).estimator == "constant"
+
+
+def test_presses_with_unknown_force_do_not_calibrate_forces():
     model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     presses_uT = to_chips(model.tables.mean_uT[11:13, 11, 4])
-    model.zero(rest_uT).label([[8.4, 8.4], [9.2, 8.4]], [3.0, 3.0], rest_uT + presses_uT, force_known=False)
+    model.zero(rest_uT).label([[8.4, 8.4], [9.2, 8.4]], None, rest_uT + presses_uT)
     np.testing.assert_array_equal(model.line.mean, prior_line().mean)
     model.label([[8.4, 8.4]], [4.0], rest_uT + presses_uT[:1], keep=True)
     assert model.line.mean[0] != 0
+    model.label([[8.4, 8.4]], [0.05], rest_uT + presses_uT[:1])  # calibrated forces are then far below the estimate
+    model.label([[9.2, 8.4]], None, rest_uT + 1e-2 * presses_uT[1:] + 3.0, keep=True)  # a light press is accepted
+
+
+@pytest.mark.parametrize("labels_n", [1, 5, 12])
+def test_held_out_labels_are_unknown_to_their_model(labels_n):
+    model = load_universal()
+    rest_uT = to_chips(model.tables.rest_uT[None])
+    place_i = rng_for(6, "force line").integers(4, 18, (labels_n, 2))
+    presses_uT = rest_uT + to_chips(model.tables.mean_uT[place_i[:, 0], place_i[:, 1], 5])
+    place_mm, force_N = model.tables.axis_mm[place_i] + CENTRE_MM, np.full(labels_n, 3.0)
+    model.zero(rest_uT).label(place_mm, force_N, presses_uT)
+    before = model.line
+    wrong_N = np.where(np.arange(labels_n) == 0, 8.0, 3.0)  # another force of the first label
+    model.label(place_mm, wrong_N, presses_uT)
+    (fold, *_) = model._held_out()
+    same_as_without = load_universal().zero(rest_uT)
+    others = np.arange(labels_n) % 5 != 0
+    if others.any():
+        same_as_without.label(place_mm[others], force_N[others], presses_uT[others])
+        calibration = same_as_without._calibration.with_labels(same_as_without._data.labels, few=0 < labels_n < 5)
+    else:
+        calibration = same_as_without._calibration.with_labels(same_as_without._data.labels)
+    expected = calibration.evaluate(fold.labels.db_uT).log_forces()
+    np.testing.assert_allclose(fold.evaluation.log_forces(), expected, atol=1e-3)
+    assert model.line.mean[0] != before.mean[0]
 
 
 def test_one_known_weight_is_used_once():
@@ -128,7 +169,9 @@ def test_one_known_weight_is_used_once():
     press_uT = rest_uT + to_chips(model.tables.mean_uT[11:12, 11, 5])
     model.zero(rest_uT).label([[8.4, 8.4]], [weight_N], press_uT)
     (fold,) = model._held_out()  # its model has no label
-    estimated_log_N = fold.evaluation.log_forces()[ESTIMATORS.index(DEFAULT)]
+    estimated_log_N = fold.evaluation.log_forces()[ESTIMATORS.index(FEW_ESTIMATOR)]
+    unlabelled_N = load_universal().zero(rest_uT).estimate(press_uT).force_N
+    np.testing.assert_allclose(np.exp(estimated_log_N), unlabelled_N, rtol=1e-4)
     off = estimated_log_N[0] - LOG_CENTRE_N
     gain = 1 / (1 + model.line.scatter_var / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2))
     expected = estimated_log_N + gain * (np.log(weight_N) - estimated_log_N)

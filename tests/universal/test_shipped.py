@@ -273,7 +273,7 @@ def repeated_labels(labels_n):
 def test_saved_skin_keeps_the_area_and_which_forces_are_known(skin, tmp_path):
     rest_uT, read_uT = to_chips(skin.tables.rest_uT[None]), pokes(skin)
     skin.zero(rest_uT).see(rest_uT + np.tile(read_uT, (4, 1)), area=True)
-    skin.label(PLACES_MM[:2], [1.0, 2.0], rest_uT + read_uT[:2], force_known=False)
+    skin.label(PLACES_MM[:2], None, rest_uT + read_uT[:2])
     skin.label(PLACES_MM[2:], [1.5, 2.5], rest_uT + read_uT[2:], keep=True).save(tmp_path / "s0.safetensors")
     loaded = load_universal(tmp_path / "s0.safetensors")
     for before, after in zip(
