@@ -34,7 +34,6 @@ class LinePrior(NamedTuple):
 PRIORS = {
     "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
     "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
-    "constant": LinePrior((0.0, 0.0), (1.0, 1e-6), 0.6),
 }
 ESTIMATORS = tuple(PRIORS)
 # With `FEW_N` or more known forces, "map" is used unless the labels clearly favour another estimator. With fewer,

@@ -42,7 +42,7 @@ from reskin.universal.calibration import (
     variance_inflations,
     write_calibration,
 )
-from reskin.universal.force import ESTIMATORS, FEW_N, LOG_CENTRE_N, ForceLine, fit_line, prior_line
+from reskin.universal.force import ESTIMATORS, FEW_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
@@ -135,7 +135,7 @@ class Evaluation:
         place_mm, sd_mm, force_N, map_log_N = products(
             likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power
         )
-        return place_mm, sd_mm, (np.log(force_N), map_log_N, np.full(len(map_log_N), LOG_CENTRE_N))
+        return place_mm, sd_mm, (np.log(force_N), map_log_N)
 
 
 @dataclass(frozen=True)
