@@ -124,7 +124,7 @@ def test_scatter_is_learnt_from_residuals():
 def test_line_becomes_constant_if_estimates_are_noise():
     rng = rng_for(5, "force line")
     true_log_N = np.log(rng.uniform(1.5, 2.5, 40))
-    line = fit_line(3 * rng.standard_normal((2, 40)), true_log_N)
+    line = fit_line(list(3 * rng.standard_normal((2, 40))), true_log_N)
     assert abs(line.mean[1]) < 0.1
 
 
