@@ -21,8 +21,17 @@ from reskin.universal.calibration import (
     lower_by_residuals,
     variance_inflations,
 )
+from reskin.universal.force import FEW_N, ForceLine, prior_line
 from reskin.universal.map import FORCES_N, Estimate, condition_on_labels
-from reskin.universal.model import CalibratedModel, Evaluation, PressCalibration, PriorModel, network_offsets_mm
+from reskin.universal.model import (
+    CalibratedModel,
+    Evaluation,
+    HeldOutLabels,
+    PressCalibration,
+    PriorModel,
+    line_of_labels,
+    network_offsets_mm,
+)
 from reskin.universal.population import PLACES_N, Population, draw_population
 from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add_error
 
@@ -142,6 +151,18 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
     ]
 
 
+def fit_force_line(calibration: PoolCalibration, labels_n: int) -> ForceLine:
+    """Fit the calibration of forces by cross-validation over the labels; with fewer than `FEW_N`, it is the identity."""
+    labels_n = min(labels_n, len(calibration.pool))
+    if labels_n < FEW_N:
+        return prior_line()
+    folds = []
+    for kept, held_out in folds_of_labels(labels_n):
+        model, labels = calibration.reordered(kept).with_labels(len(kept)), calibration.pool[held_out]
+        folds.append(HeldOutLabels(labels, model.evaluate(labels.db_uT)))
+    return line_of_labels(folds)
+
+
 def score_fold(
     benchmark: Benchmark, fold: Fold, rig: Mapping[str, Variant], labels_n: Sequence[int]
 ) -> list[dict[str, Any]]:
@@ -161,7 +182,8 @@ def score_fold(
                 powers = benchmark.board_powers[board][n]
             else:
                 (powers,) = lower_by_labels(calibration, n, [calibration.nominal_powers(benchmark.nominal_powers[n])])
-            (by_method,) = estimate(calibration.with_labels(n), test_uT, [powers])
+            model = replace(calibration.with_labels(n), line=fit_force_line(calibration, n))
+            (by_method,) = estimate(model, test_uT, [powers])
             for name, estimates in zip(METHODS, by_method, strict=True):
                 points.append({
                     "method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.board, "seed_i": fold.draw_i,

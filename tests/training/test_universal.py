@@ -12,11 +12,13 @@ from pipeline.training.universal import (
     PoolCalibration,
     Powers,
     best_powers,
+    calibrate,
     calibrate_on_simulated,
     calibrate_to_simulated,
     draw_prior_skins,
     estimate,
     lower_by_labels,
+    split_presses,
 )
 from pipeline.training.universal_variants import (
     READINGS_N,
@@ -154,3 +156,20 @@ def test_powers_are_calibrated_for_all_numbers_of_labels(nominal, monkeypatch):
     found = calibrate_on_simulated(nominal, (0, 40), seed=0)
     assert set(found) == {0, 40}
     assert set(np.ravel(list(found.values()))) <= set(NOMINAL_POWERS)
+
+
+def test_force_line_corrects_forces_of_a_stiffer_skin():
+    tables = make_tables()
+    model = PriorModel(new_map(tables), [draw_weights(15, rng_for(0, "sureness"))])
+    skins = make_population(1, rng_for(3, "stiffer"))
+    pool, tested = split_presses(skins, 0, seed=1)
+    pool, tested = (replace(part, force_N=2 * part.force_N) for part in (pool, tested))  # all forces are twice as large
+    calibration = calibrate(model, skins.rest_uT[0].astype(float), pool)
+    assert universal.fit_force_line(calibration, 4).mean[0] == 0  # too few labels
+    labelled = calibration.with_labels(0)
+    corrected = replace(labelled, line=universal.fit_force_line(calibration, 40))
+    errors = [
+        np.abs(np.log(each.estimate(tested.db_uT, [0.5])[0].force_N / tested.force_N)).mean()
+        for each in (labelled, corrected)
+    ]
+    assert errors[1] < errors[0]
