@@ -152,7 +152,7 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
 
 
 def fit_force_line(calibration: PoolCalibration, labels_n: int) -> ForceLine:
-    """Fit the calibration of forces by cross-validation over the labels; with fewer than `FEW_N`, it is the identity."""
+    """Fit the calibration of forces by cross-validation over the labels; it is the identity for fewer than `FEW_N`."""
     labels_n = min(labels_n, len(calibration.pool))
     if labels_n < FEW_N:
         return prior_line()
