@@ -58,6 +58,7 @@ from reskin.universal.map import (
     condition_on_noload,
     condition_on_presses,
     expected_gain,
+    kernel,
     move_places,
     new_map,
     shift_onto_area,
@@ -84,14 +85,15 @@ CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for t
 class Evaluation:
     """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The likelihood power affects standard deviations and, in `by_map`, also places and forces. unlabelled: likelihoods
-    of the map without labels, if this map estimates the forces.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces. few, unlabelled: if few
+    forces are known, these presses, and likelihoods of the map without them.
     """
 
     evaluator: MapEvaluator
     likelihoods: Likelihoods
     network: NetworkEstimate
     line: ForceLine
+    few: "FewForces | None" = None
     unlabelled: Likelihoods | None = None
 
     __repr__ = one_line
@@ -109,11 +111,15 @@ class Evaluation:
         """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
 
         The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
-        are computed from a power of the product. Forces are calibrated by the skin's line.
+        are computed from a power of the product. Forces are calibrated by the skin's line. If few forces are known,
+        this is so far away from these presses; close to them, the map that is conditioned on them estimates the force.
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
-        by_estimator = self.other_log_forces or by_estimator
-        log_N, sd_log_N = self.line.apply(by_estimator[ESTIMATORS.index(self.line.estimator)])
+        selected = ESTIMATORS.index(self.line.estimator)
+        log_N, sd_log_N = self.line.apply((self.other_log_forces or by_estimator)[selected])
+        if self.few is not None:
+            near = kernel(place_mm, self.few.place_mm, log_N, self.few.log_N).max(axis=1)
+            log_N = near * by_estimator[selected] + (1 - near) * log_N
         return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
@@ -139,18 +145,29 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class FewForces:
+    """A few presses with known forces (board's frame), and the map that is not conditioned on them."""
+
+    skin: SkinMap
+    place_mm: Float[np.ndarray, "m 2"]
+    log_N: Float[np.ndarray, " m"]
+
+    __repr__ = one_line
+
+
+@dataclass(frozen=True)
 class CalibratedModel:
     """Map and networks, calibrated to one skin.
 
     offsets_mm: corrections that are added to the networks' places, one after the other. line: calibration of forces.
-    unlabelled_skin: map without labels, which estimates the forces if there are few labels.
+    few: the presses with known forces, if they are few.
     """
 
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
     line: ForceLine = field(default_factory=prior_line)
-    unlabelled_skin: SkinMap | None = None
+    few: FewForces | None = None
 
     __repr__ = one_line
 
@@ -173,9 +190,9 @@ class CalibratedModel:
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
         """Evaluate map and networks on a block of readings."""
-        evaluator, other = self.skin.evaluator, self.unlabelled_skin
-        unlabelled = None if other is None else other.evaluator.evaluate(db_uT)
-        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line, unlabelled)
+        evaluator, few = self.skin.evaluator, self.few
+        own = evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line
+        return Evaluation(*own, few, None if few is None else few.skin.evaluator.evaluate(db_uT))
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
         """Estimate places and forces with the networks alone, with the offsets added to the places."""
@@ -239,16 +256,19 @@ class PressCalibration:
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        few: whether another map, which is not conditioned on presses with known forces, estimates the forces. The line
-        then is the only part that uses these forces. By default, this is so for 1 to `FEW_N` - 1 known forces.
+        few: whether the line is for forces of another map, which is not conditioned on presses with known forces. By
+        default, this is so for 1 to `FEW_N` - 1 known forces, which the map and the line would otherwise use twice.
         """
         few = has_few(labels) if few is None else few
-        rest = labels[np.flatnonzero(~labels.known)]
-        unlabelled = condition_on_labels(self.moved, rest.place_mm, rest.force_N, rest.db_uT) if few else None
+        few_forces = None
+        if few:
+            known, rest = labels[np.flatnonzero(labels.known)], labels[np.flatnonzero(~labels.known)]
+            without = condition_on_labels(self.moved, rest.place_mm, rest.force_N, rest.db_uT)
+            few_forces = FewForces(without, known.place_mm, np.log(known.force_N)) if len(known) else None
         skin = condition_on_labels(self.moved, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
         offsets_mm = network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm)
-        return CalibratedModel(skin, self.layers, offsets_mm, unlabelled_skin=unlabelled)
+        return CalibratedModel(skin, self.layers, offsets_mm, few=few_forces)
 
     def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
         """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""

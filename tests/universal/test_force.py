@@ -9,7 +9,6 @@ from pipeline.training.universal import draw_prior_skins, law_error, split_press
 from reskin.data.grid import CENTRE_MM
 from reskin.seeds import rng_for
 from reskin.universal.force import (
-    ESTIMATORS,
     FEW_ESTIMATOR,
     LOG_CENTRE_N,
     NORMAL_90,
@@ -164,16 +163,15 @@ def test_held_out_labels_are_unknown_to_their_model(labels_n):
     assert model.line.mean[0] != before.mean[0]
 
 
-def test_one_known_weight_is_used_once():
+def test_one_known_weight_moves_far_forces_by_the_line_and_near_forces_by_the_map():
     model, weight_N = load_universal(), 4.0
     rest_uT = to_chips(model.tables.rest_uT[None])
-    press_uT = rest_uT + to_chips(model.tables.mean_uT[11:12, 11, 5])
-    model.zero(rest_uT).label([[8.4, 8.4]], [weight_N], press_uT)
-    (fold,) = model._held_out()  # its model has no label
-    estimated_log_N = fold.evaluation.log_forces()[ESTIMATORS.index(FEW_ESTIMATOR)]
-    unlabelled_N = load_universal().zero(rest_uT).estimate(press_uT).force_N
-    np.testing.assert_allclose(np.exp(estimated_log_N), unlabelled_N, rtol=1e-4)
-    off = estimated_log_N[0] - LOG_CENTRE_N
-    gain = 1 / (1 + model.line.scatter_var / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2))
-    expected = estimated_log_N + gain * (np.log(weight_N) - estimated_log_N)
-    np.testing.assert_allclose(np.log(model.estimate(press_uT).force_N), expected, rtol=1e-4)
+    weight_uT, far_uT = (rest_uT + to_chips(model.tables.mean_uT[i : i + 1, i, 5]) for i in (11, 2))
+    before_N = model.zero(rest_uT).estimate(np.concatenate([weight_uT, far_uT])).force_N
+    after_N = model.label([[8.4, 8.4]], [weight_N], weight_uT).estimate(np.concatenate([weight_uT, far_uT])).force_N
+    assert abs(np.log(after_N[0] / weight_N)) < 0.6 * abs(np.log(before_N[0] / weight_N))
+    off = np.log(before_N[0]) - LOG_CENTRE_N
+    cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.array([off**2, off * (np.log(before_N[1]) - LOG_CENTRE_N)])
+    gain = cov / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2 + model.line.scatter_var)
+    moved = np.log(after_N[1] / before_N[1]) / np.log(weight_N / before_N[0])
+    assert moved == pytest.approx(gain[1], rel=0.05)  # 12 mm away: the weight is used once
