@@ -218,7 +218,7 @@ def memory(board: Board, skin: Skin) -> Case:
     )
     changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not be counted below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
-    per_poke_n = (many_n - few_n) / (3 * POKES_N)
+    per_poke_n = float(round((many_n - few_n) / (3 * POKES_N)))  # a run differs from another by some bytes in total
     observed = (
         f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {per_poke_n:.0f} bytes a "
         f"poke, results included, {per_poke_n:.0f} MB for 1e6"
