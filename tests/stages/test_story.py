@@ -37,7 +37,14 @@ LEARNING = (
 )  # fmt: skip
 RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
 # Experiments that scene ci does not run: those on recordings and those on many skins.
-EXPERIMENTS_OF_CI = set(ANALYSES) - {"compare", "reference_methods", "touches", "population", "worlds"}
+EXPERIMENTS_OF_CI = set(ANALYSES) - {
+    "compare",
+    "reference_methods",
+    "random_presses",
+    "touches",
+    "population",
+    "worlds",
+}
 OUTPUT = "output.txt"  # file with the output of the first run
 # time limit for tests that hang; long, because a busy machine needs four times as long
 pytestmark = pytest.mark.timeout(1800)
