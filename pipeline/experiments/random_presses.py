@@ -22,7 +22,7 @@ from pipeline.report.formatting import show, tabulate
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic
-from pipeline.training.universal import WAYS, coverage
+from pipeline.training.universal import FORCE_MIN_N, WAYS, coverage
 from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
 from reskin.config import Strict
 from reskin.errors import SchemaError
@@ -37,7 +37,7 @@ from reskin.universal.calibration import (
     variance_inflations,
 )
 from reskin.universal.force import NORMAL_90, ForceLine, prior_line
-from reskin.universal.map import FORCES_N, Estimate
+from reskin.universal.map import Estimate
 from reskin.universal.model import (
     Evaluation,
     HeldOutLabels,
@@ -48,7 +48,6 @@ from reskin.universal.model import (
 )
 
 SPACING_MM = 2.0  # of the places; presses are assigned to the nearest place of a grid with this spacing
-FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
 MIDDLE_MM = 1.0  # presses with |x| and |y| below this are in the middle of the skin
 CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
 WEIGHT = "weight"

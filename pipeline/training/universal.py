@@ -21,7 +21,7 @@ from reskin.universal.calibration import (
     lower_by_residuals,
     variance_inflations,
 )
-from reskin.universal.force import FEW_N, ForceLine, prior_line
+from reskin.universal.force import FEW_N, NORMAL_90, ForceLine, prior_line
 from reskin.universal.map import FORCES_N, Estimate, condition_on_labels
 from reskin.universal.model import (
     CalibratedModel,
@@ -38,7 +38,6 @@ from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add
 EXPERIMENT = "labels"  # experiment whose folds are scored
 METHODS = ("universal map, ", "universal, ")  # first words of method names: the map alone; map and networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of method names, by variant
-REACH = 1.645  # half width of a 90 % interval, in standard deviations
 BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers, selected on other boards
 NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers for a misfit of 1
 ASSUMED_POWER = 0.5  # for places and forces of the map alone: as if channels had equal errors in pairs
@@ -195,7 +194,7 @@ def score_fold(
 
 def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
     """Return the fraction of true coordinates that are inside the 90 % intervals of the estimate."""
-    return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
+    return float((np.abs(estimate.place_mm - place_mm) <= NORMAL_90 * estimate.sd_mm).mean())
 
 
 def coverages(
@@ -215,7 +214,7 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
     scores = score_test(known.data, test, predicted)
     true_mm = known.frame.place(known.data.rows.target[test, :2].astype(float))
-    half_width_mm = REACH * float(np.median(estimate.sd_mm))
+    half_width_mm = NORMAL_90 * float(np.median(estimate.sd_mm))
     intervals = {"coverage_pct": 100 * coverage(estimate, true_mm), "half_width_mm": half_width_mm}
     skins = {name: own | intervals for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
     return scores | {"all": scores["all"] | intervals} | ({"by_skin": skins} if skins else {})

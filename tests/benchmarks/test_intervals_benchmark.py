@@ -17,7 +17,6 @@ from pipeline.training.universal import (
     AS_TRAINED,
     ASSUMED_POWER,
     LAW_ERRORS,
-    REACH,
     LawError,
     Powers,
     calibrate_on_simulated,
@@ -29,6 +28,7 @@ from pipeline.training.universal import (
 )
 from pipeline.training.universal_variants import Variant
 from reskin.universal import training
+from reskin.universal.force import NORMAL_90
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map, tabulate
 from reskin.universal.model import PriorModel
 from reskin.universal.population import Population
@@ -111,6 +111,6 @@ def _scores(calibration, tested, labels_n, powers):
     before, found = estimate(calibration.with_labels(labels_n), tested.db_uT, [assumed, *lowered])
     within = [(np.abs(one.place_mm - tested.place_mm) <= 1).all(axis=1).mean() for one in found]
     return [
-        (coverage(one, tested.place_mm), coverage(other, tested.place_mm), REACH * np.median(other.sd_mm), right)
+        (coverage(one, tested.place_mm), coverage(other, tested.place_mm), NORMAL_90 * np.median(other.sd_mm), right)
         for one, other, right in zip(before, found, within, strict=True)
     ]
