@@ -23,9 +23,9 @@ from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 from reskin.models.train import train
 from reskin.seeds import rng_for
+from reskin.universal.batches import SkinPrior
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import PRESSES_N, Population
-from reskin.universal.training import SkinPrior
 from reskin.universal.training import train as train_universal
 from tests.models.example_jobs import some_job, some_rows
 from tests.universal.skins import SETUP

@@ -17,10 +17,12 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from tests.benchmarks import FULL
 
-# No deadlines: the time of an example depends on the load of the machine.
-settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
-settings.register_profile("thorough", settings.get_profile("busy"), max_examples=1000)  # --hypothesis-profile=thorough
-settings.load_profile("busy")
+# No deadlines: the time of an example depends on the load of the machine. The examples are the same in each run, so that
+# a run without changes does not fail; `--hypothesis-profile=thorough` draws many others.
+always = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("same", max_examples=50, derandomize=True, **always)
+settings.register_profile("thorough", max_examples=1000, **always)
+settings.load_profile("same")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 LONG = (  # the slowest test files: they run stages and commands

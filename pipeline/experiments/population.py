@@ -42,14 +42,14 @@ from reskin.physics.skin import SkinDesign
 from reskin.physics.slide import force_at
 from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
+from reskin.universal.batches import NOISE_uT, SkinPrior
 from reskin.universal.calibration import CalibrationData, LabelledPresses
 from reskin.universal.law import Law, Setup
 from reskin.universal.map import RIG_SPREADS, Estimate, Tables, new_map
 from reskin.universal.map import tabulate as tabulate_map
 from reskin.universal.model import Evaluation, PriorModel
-from reskin.universal.network import Weights
+from reskin.universal.network import Weights, draw_weights
 from reskin.universal.population import PLACES_N, Forces, Population, draw_population
-from reskin.universal.training import NOISE_uT, SkinPrior, draw_weights, train
 
 EXPERIMENT = "lobo"  # experiment whose folds are used, with the pools of unlabelled pokes from adaptation
 POOL_MAX_N = 65  # one press at each place of the paper's grid, at any of the depths pressed there
@@ -158,6 +158,8 @@ def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -
 
 def train_network(designed: DesignedSkins, skins: Population, skins_n: int, steps_n: int) -> Weights:
     """Train a network on the first skins of a population, or load it from the cache."""
+    from reskin.universal.training import train  # imported late, because it imports PyTorch
+
     first = Population(*(getattr(skins, name)[:skins_n] for name in Population.__annotations__))
     rng_name = (designed.seed, "population", "network")  # without skins_n: all networks have the same initial weights
     empty = draw_weights(skins.rest_uT.shape[1], rng_for(*rng_name))

@@ -99,7 +99,7 @@ def train_classical(
         ClassicalJob(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)
         for fold, name, method in pairs
     ]
-    with make_executor(imports="reskin.models.classical") as executor:
+    with make_executor(imports="sklearn.ensemble") as executor:
         results = run_classical_jobs(
             jobs, training_data(data), executor, lambda line: say(f"{settings.scene} classical: {line}")
         )

@@ -24,7 +24,7 @@ from pipeline.training.universal import (
 from pipeline.training.universal_variants import make_variants, write_networks
 from reskin import io
 from reskin.models.classical import run_classical_jobs
-from reskin.universal.training import TrainingSettings
+from reskin.universal.batches import TrainingSettings
 
 
 def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
@@ -40,7 +40,7 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
             *((entry, job, result) for (entry, job), result in zip(pairs, trained, strict=True)),
         ]
     tasks = few.classical_jobs(study)
-    with make_executor(imports="reskin.models.classical") as executor:
+    with make_executor(imports="sklearn.ensemble") as executor:
         fitted = run_classical_jobs(
             [task for _, task in tasks],
             training_data(data),

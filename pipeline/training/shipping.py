@@ -27,13 +27,14 @@ from reskin.config import parse, read_yaml
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.simulation import defaults
+from reskin.universal.batches import NOMINAL_NAME, SkinPrior, TrainingSettings
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.law import CHIPS_MM, Setup, to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, tabulate
 from reskin.universal.model import Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
-from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
+from reskin.universal.training import train_networks
 
 PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
 PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not

@@ -12,6 +12,7 @@ from pipeline.training.universal_variants import KnownBoards, Variant
 from reskin.data.splits import Fold, labelling_order
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
+from reskin.universal.batches import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add_error
 from reskin.universal.calibration import (
     CalibrationData,
     HeldOut,
@@ -33,7 +34,6 @@ from reskin.universal.model import (
     network_offsets_mm,
 )
 from reskin.universal.population import PLACES_N, Population, draw_population
-from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add_error
 
 EXPERIMENT = "labels"  # experiment whose folds are scored
 METHODS = ("universal map, ", "universal, ")  # first words of method names: the map alone; map and networks

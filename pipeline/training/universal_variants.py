@@ -17,6 +17,7 @@ from pipeline.executors import make_executor
 from pipeline.training.jobs import SceneData
 from reskin import io
 from reskin.data.rows import Rows
+from reskin.universal.batches import NOMINAL_NAME, RecordedBoard, SkinPrior, TrainingSettings
 from reskin.universal.law import TEN, AlignedPresses, Law, Setup, fit, simulate_uT
 from reskin.universal.map import (
     NOMINAL,
@@ -30,7 +31,6 @@ from reskin.universal.map import (
 )
 from reskin.universal.model import PriorModel
 from reskin.universal.network import Weights, from_tensors, to_tensors
-from reskin.universal.training import NOMINAL_NAME, RecordedBoard, SkinPrior, TrainingSettings, train_networks
 
 READINGS_N = 100  # readings that training uses per press of a recorded board
 FORMAT = "reskin-universal-1"
@@ -92,6 +92,8 @@ class Variants(NamedTuple):
 
 def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
     """Fit a law to each known board; then tabulate a map and train networks for each variant."""
+    from reskin.universal.training import train_networks  # imported late, because it imports PyTorch
+
     with make_executor(imports="reskin.universal.training") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]

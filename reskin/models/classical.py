@@ -10,12 +10,6 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 from pydantic import Field
-from sklearn.ensemble import HistGradientBoostingRegressor
-from sklearn.kernel_ridge import KernelRidge
-from sklearn.linear_model import Ridge as LinearRidge
-from sklearn.multioutput import MultiOutputRegressor
-from sklearn.neighbors import KNeighborsRegressor
-from sklearn.preprocessing import PolynomialFeatures
 from threadpoolctl import ThreadpoolController  # type: ignore[import-untyped]
 
 from reskin.config import Strict
@@ -212,18 +206,28 @@ def one_thread() -> Any:
 
 def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
     """Create the regressor of these settings, which has methods fit(inputs, target, weight) and predict(inputs)."""
+    # scikit-learn is imported late, because it takes .7 s, and modules that only read settings do not need it.
     match settings:
         case Ridge():
-            return LinearRidge(settings.alpha)
+            from sklearn import linear_model
+
+            return linear_model.Ridge(settings.alpha)
         case CubicRidge():
             return _BlockwiseCubicRidge(settings.alpha)
         case Neighbours(neighbours_n=k):
+            from sklearn.neighbors import KNeighborsRegressor
+
             # A k-d tree is fast, because readings vary along few directions. With 16 or more inputs, scikit-learn would
             # use brute force by default.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
+            from sklearn.kernel_ridge import KernelRidge
+
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
         case Boosting():
+            from sklearn.ensemble import HistGradientBoostingRegressor
+            from sklearn.multioutput import MultiOutputRegressor
+
             trees = HistGradientBoostingRegressor(
                 max_iter=settings.rounds_n,
                 learning_rate=settings.rate,
@@ -241,6 +245,8 @@ class _BlockwiseCubicRidge:
     """
 
     def __init__(self, alpha: float) -> None:
+        from sklearn.preprocessing import PolynomialFeatures
+
         self.alpha = alpha
         self.lift = PolynomialFeatures(3)  # the first product is 1; its coefficient is not penalised
 
@@ -265,7 +271,7 @@ class _WeightedNeighbours:
     The prediction is scikit-learn's prediction of the target w y, divided by its prediction of the target w.
     """
 
-    neighbours: KNeighborsRegressor
+    neighbours: Any  # sklearn.neighbors.KNeighborsRegressor
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         weights = np.ones(len(inputs)) if weight is None else weight

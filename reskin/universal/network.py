@@ -20,6 +20,8 @@ DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale the inputs dB/|dB|, 
 LENGTH_MIN_uT = 1.0  # if |dB| is smaller, dB is divided by this value instead, so that tiny changes have no direction
 PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
 LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
+OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
+FILM_SD = 0.02  # standard deviation of initial FiLM weights; it is small so that the code has little effect at first
 FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled presses
 
 
@@ -38,6 +40,23 @@ class NetworkEstimate:
     sd_mm: Float[np.ndarray, "n 2"]
     log_N: Float[np.ndarray, " n"]
     sd_log_N: Float[np.ndarray, " n"]
+
+
+def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Draw initial weights uniformly within 1/sqrt(fan in), as PyTorch does; FiLM weights are close to zero."""
+    inputs_n = 2 * channels_n + 1
+    shapes = {"set1": (SET_WIDTH, inputs_n), "set2": (SET_WIDTH, SET_WIDTH), "code": (CODE_WIDTH, SET_WIDTH + 1)}
+    shapes |= {f"layer{i}": (WIDTH, WIDTH if i else inputs_n) for i in range(LAYERS_N)}
+    shapes["answer"] = (OUTPUTS_N, WIDTH)
+    weights = {}
+    for name, (out_n, in_n) in shapes.items():
+        limit = in_n**-0.5
+        weights[f"{name}_weight"] = rng.uniform(-limit, limit, (out_n, in_n)).astype(np.float32)
+        weights[f"{name}_bias"] = rng.uniform(-limit, limit, out_n).astype(np.float32)
+    for i in range(LAYERS_N):
+        weights[f"film{i}_weight"] = (FILM_SD * rng.standard_normal((2 * WIDTH, CODE_WIDTH))).astype(np.float32)
+        weights[f"film{i}_bias"] = np.zeros(2 * WIDTH, np.float32)
+    return weights
 
 
 def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: Float[np.ndarray, "c ch"]) -> Layers:
@@ -59,7 +78,7 @@ def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: F
 
 def evaluate(networks: Sequence[Layers], db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
     """Estimate places and forces as means over networks; the spread of the networks adds to the standard deviations."""
-    outputs = np.empty((len(networks), len(db_uT), 6))
+    outputs = np.empty((len(networks), len(db_uT), OUTPUTS_N))
     for layers, output in zip(networks, outputs, strict=True):
         _forward(db_uT, *layers, output)
     if len(networks) == 1:

@@ -27,12 +27,13 @@ from pipeline.training.universal import (
     lower_by_labels,
 )
 from pipeline.training.universal_variants import Variant
-from reskin.universal import training
+from reskin.universal import batches
+from reskin.universal.batches import SkinPrior, TrainingSettings, add_error
 from reskin.universal.force import NORMAL_90
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map, tabulate
 from reskin.universal.model import PriorModel
 from reskin.universal.population import Population
-from reskin.universal.training import SkinPrior, TrainingSettings, add_error, train_networks
+from reskin.universal.training import train_networks
 from tests.benchmarks import FULL, size
 from tests.universal.skins import SETUP
 
@@ -40,12 +41,12 @@ SEED, SETTINGS = 2021, TrainingSettings(skins_n=size(500, 4), steps_n=size(1200,
 SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
-def law_error(size: float, length_mm: tuple[float, float] = training.ERROR_MM) -> LawError:
+def law_error(size: float, length_mm: tuple[float, float] = batches.ERROR_MM) -> LawError:
     """Return a law error like that of training, of rms size `size` |dB|; its length scale is drawn from `length_mm`."""
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(training, "ERROR_MM", length_mm)
+            patch.setattr(batches, "ERROR_MM", length_mm)
             return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (size, size), rng)
 
     return add

@@ -15,11 +15,11 @@ from reskin.live.session import GUIDED_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
+from reskin.universal.batches import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from reskin.universal.law import CHIPS_MM, Setup, to_board
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, expected_gain
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_population
-from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from tests.benchmarks import size
 
 SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0

@@ -20,11 +20,12 @@ from reskin.data.grid import SKIN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal import map
+from reskin.universal.batches import NOMINAL_NAME, SkinPrior, TrainingSettings
 from reskin.universal.law import CHIPS_MM, Setup
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Tables, tabulate
 from reskin.universal.model import Universal
 from reskin.universal.network import FULL_SET_N, Weights
-from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
+from reskin.universal.training import train_networks
 from tests.benchmarks import FULL, size
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -32,8 +32,8 @@ from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
 from reskin.universal.map import Estimate, new_map
 from reskin.universal.model import PriorModel
+from reskin.universal.network import draw_weights
 from reskin.universal.population import Population
-from reskin.universal.training import draw_weights
 from tests.universal.skins import DESIGN, make_population, make_tables
 
 KIND = BoardKind(

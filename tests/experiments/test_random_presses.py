@@ -25,11 +25,12 @@ from pipeline.experiments.random_presses import (
 from pipeline.training.universal_variants import Variant, Variants
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
+from reskin.universal.batches import SkinPrior
 from reskin.universal.calibration import LabelledPresses, LikelihoodPowers
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import PriorModel
+from reskin.universal.network import draw_weights
 from reskin.universal.population import grid
-from reskin.universal.training import SkinPrior, draw_weights
 from tests.universal.skins import SETUP, make_tables, poked_uT
 
 DEPTHS_N, READINGS_N = 3, 2

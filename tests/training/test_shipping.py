@@ -13,11 +13,11 @@ from pipeline.training.universal import (
     lower_by_labels,
 )
 from reskin.seeds import rng_for
+from reskin.universal.batches import SkinPrior
 from reskin.universal.calibration import LikelihoodPowers
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import PriorModel, Universal, load_universal
 from reskin.universal.population import PRESSES_N, Population
-from reskin.universal.training import SkinPrior
 from tests.universal.skins import DESIGN, SETUP
 
 

@@ -32,11 +32,11 @@ from pipeline.training.universal_variants import (
 from reskin import io
 from reskin.data.rows import Rows
 from reskin.seeds import rng_for
+from reskin.universal.batches import SkinPrior, TrainingSettings
 from reskin.universal.calibration import LabelledPresses, variance_inflation
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import PriorModel
-from reskin.universal.network import predict
-from reskin.universal.training import SkinPrior, TrainingSettings, draw_weights
+from reskin.universal.network import draw_weights, predict
 from tests.universal.skins import SETUP, make_population, make_tables
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from reskin.seeds import rng_for
-from reskin.universal.network import LOG_N, PLACE_MM, predict
-from reskin.universal.training import Network, draw_weights, inputs
+from reskin.universal.network import LOG_N, PLACE_MM, draw_weights, predict
+from reskin.universal.training import Network, inputs
 
 RNG = rng_for(0, "network")
 PRESSES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))

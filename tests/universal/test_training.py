@@ -4,19 +4,11 @@ import numpy as np
 import pytest
 
 from reskin.seeds import rng_for
+from reskin.universal.batches import Batches, RecordedBoard, SkinPrior, add_error, draw_kept, draw_recorded, residual_uT
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, fit_residual
 from reskin.universal.network import predict
 from reskin.universal.population import PLACES_N, PRESSES_N
-from reskin.universal.training import (
-    Batches,
-    RecordedBoard,
-    SkinPrior,
-    add_error,
-    draw_kept,
-    draw_recorded,
-    residual_uT,
-    train,
-)
+from reskin.universal.training import train
 from tests.universal.skins import SETUP, fields_uT, make_population
 
 PRIOR = SkinPrior("made up", NOMINAL, NOMINAL_SPREADS, SETUP)
