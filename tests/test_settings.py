@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import dpath
 import pytest
 from ruamel.yaml import YAML
 
@@ -97,18 +98,24 @@ def stages(root) -> list[Any]:
         return list(repo.index.stages)
 
 
+@pytest.fixture(scope="module")
+def before(root, stages) -> dict[str, str]:
+    """Return the parameter values of each stage without overrides."""
+    return parameter_values(root, stages)
+
+
 def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
     """Return the parameter values of each stage, which DVC compares with those of the last run."""
     from dvc.dependency.param import read_param_file
 
-    return {
-        stage.name: repr([
-            read_param_file(dep.repo.fs, dep.fs_path, dep.params, flatten=True)
-            for dep in stage.deps
-            if hasattr(dep, "params")
-        ])
-        for stage in stages
-    }  # fmt: skip
+    dependencies = [(stage.name, dep) for stage in stages for dep in stage.deps if hasattr(dep, "params")]
+    files = {dep.fs_path: read_param_file(dep.repo.fs, dep.fs_path) for _, dep in dependencies}  # reads each file once
+    values: dict[str, list[Any]] = {stage.name: [] for stage in stages}
+    for name, dep in dependencies:
+        # as in `read_param_file` of DVC: without keys, a stage depends on the whole file
+        content = files[dep.fs_path]
+        values[name].append([dpath.get(content, key, separator=".") for key in dep.params] if dep.params else content)
+    return {name: repr(of_stage) for name, of_stage in values.items()}
 
 
 @contextmanager
@@ -155,8 +162,7 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
 
 
 @pytest.mark.parametrize(("file", "override", "readers"), OVERRIDES, ids=[override for _, override, _ in OVERRIDES])
-def test_override_reruns_the_stages_that_read_it(root, stages, file, override, readers):
-    before = parameter_values(root, stages)
+def test_override_reruns_the_stages_that_read_it(root, stages, before, file, override, readers):
     with override_files(root, (file, override)):
         after = parameter_values(root, stages)
     known = {name if "@" in name else f"{name}@ci" for name in set().union(*(named for _, _, named in OVERRIDES))}
@@ -164,8 +170,7 @@ def test_override_reruns_the_stages_that_read_it(root, stages, file, override, r
     assert changed & known == {name if "@" in name else f"{name}@ci" for name in readers}
 
 
-def test_protocol_edit_simulates_only_that_protocol(root, stages):
-    before = parameter_values(root, stages)
+def test_protocol_edit_simulates_only_that_protocol(root, stages, before):
     for protocol in FURTHER_PROTOCOLS:
         with override_files(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
             after = parameter_values(root, stages)
