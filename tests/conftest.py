@@ -17,8 +17,8 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from tests.benchmarks import FULL
 
-# No deadlines: the time of an example depends on the load of the machine. The examples are the same in each run, so that
-# a run without changes does not fail; `--hypothesis-profile=thorough` draws many others.
+# No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that
+# tests of unchanged code do not begin to fail; `--hypothesis-profile=thorough` draws many others.
 always = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("same", max_examples=50, derandomize=True, **always)
 settings.register_profile("thorough", max_examples=1000, **always)
