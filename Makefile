@@ -46,8 +46,9 @@ repro: $(STAMP)
 	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage publish if all results equal those in dvc.lock
 	@$(BIN)/reskin compare || true # compares with the committed reports; your own scenes have none
 
+# Three workers, for two cores or more: tests of live boards mostly wait.
 test: lint
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 # Trains tiny networks on processors that QEMU emulates: weights must equal those from this processor. Needs qemu-user.
 test-processors: $(STAMP)
