@@ -271,7 +271,8 @@ def predict(
     from reskin.predicting import warnings
 
     counts = write(log, model, out, rate_hz=rate_hz)
-    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
+    numbers = {key: count for key, count in counts.items() if not isinstance(count, list)}
+    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in numbers.items()))
     for sentence in warnings(counts):
         typer.echo(sentence)
 

@@ -41,7 +41,8 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     Returns
     -------
     A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
-    of readings in contact: with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range.
+    of readings in contact (with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range), whether
+    the skin is turned by a quarter, and the model's warnings.
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
@@ -76,20 +77,25 @@ class _UniversalOfLog:
         self._misfit = result.misfit
         return np.column_stack([result.place_mm, result.force_N]).astype(np.float32)
 
-    def count_suspects(self, estimates: LogEstimates) -> dict[str, int]:
-        """Count readings in contact with a large misfit, and those at a limit of the model's force range."""
+    def count_suspects(self, estimates: LogEstimates) -> dict[str, Any]:
+        """Count readings in contact with a large misfit, and those at a limit of the model's force range.
+
+        The result also tells whether the skin is turned by a quarter, and contains the model's warnings.
+        """
         force_N = estimates.targets[0, estimates.contact, 2]
         lowest_N, highest_N = self._model.tables.force_N[[0, -1]]
         at_limit = (force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)
         return {
             "unknown_skin_readings_n": int((self._misfit[estimates.contact] > MISFIT_MAX).sum()),
             "force_at_limit_readings_n": int(at_limit.sum()),
+            "skin_turned": self._model.mounting.turned,
+            "model_warnings": self._model.warnings,
         }
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
     """Return warnings for the user, from those counts of `predict` that cast doubt on its estimates."""
-    sentences, contact_n = [], counts["contact_readings_n"]
+    sentences, contact_n = list(counts.get("model_warnings", [])), counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
             f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {contact_n} readings in contact. Are "

@@ -111,7 +111,10 @@ class UniversalEstimator:
         self._calibrate()
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Set the no-load field to the mean of f readings without contact, and recalibrate."""
+        """Set the no-load field to the mean of f readings without contact, and recalibrate.
+
+        The no-load field also tells whether the skin is turned by a quarter (`Universal.mounting`).
+        """
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._calibrate()
 
@@ -184,7 +187,7 @@ class UniversalEstimator:
             b_uT = self._labelled_uT + self._noload_uT
             model.label(self._labelled_mm, None, b_uT, keep=True)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
-        self._model = model
+        self._model, self.warnings = model, model.warnings
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
@@ -360,6 +363,8 @@ class LiveSkin:
             alarms.append(self._model_problem)
         if not self.detected.problem:
             alarms += [] if self.zeroed else [TAKING_NOLOAD]
+            if self.zeroed and isinstance(self.estimator, UniversalEstimator):
+                alarms += self.estimator.warnings
             alarms += [alarm.name for alarm in self.health.active(self.reader.unix_s())]
         return tuple(alarms)
 

@@ -97,7 +97,9 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-FORMAT, FORMAT_1 = "reskin-skin-2", "reskin-skin-1"  # files of the first format do not tell which forces are known
+# Files of the first format do not tell which forces are known, and those of the first two do not tell how the skin is
+# mounted: it is then not turned.
+FORMAT, FORMAT_2, FORMAT_1 = "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
 SHAPES: Mapping[str, tuple[int, ...]] = {  # arrays in the file, with their shapes after the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
@@ -160,7 +162,8 @@ class CalibrationData:
 
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
-    the area of the labels' grid. labels: presses at known places.
+    the area of the labels' grid. labels: presses at known places. turned: whether the skin is turned by a quarter; the
+    sign of all fields here is then opposite to that of the board's fields, as if the skin were not turned.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -168,6 +171,7 @@ class CalibrationData:
     even_uT: Float[np.ndarray, "e ch"] = field(default_factory=no_presses)
     area_uT: Float[np.ndarray, "a ch"] = field(default_factory=no_presses)
     labels: LabelledPresses = field(default_factory=no_labels)
+    turned: bool = False
 
 
 def write_calibration(data: CalibrationData, file: Path) -> None:
@@ -175,7 +179,8 @@ def write_calibration(data: CalibrationData, file: Path) -> None:
     labels = data.labels
     labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
     values = (data.presses_uT, data.even_uT, data.area_uT, *labelled)
-    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
+    about = {"format": FORMAT, "turned": str(data.turned).lower()}
+    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, about)
 
 
 def is_calibration(file: Path) -> bool:
@@ -183,7 +188,11 @@ def is_calibration(file: Path) -> bool:
 
     Raises SchemaError if the file is damaged, unless it is too large for a file of calibration data.
     """
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, FORMAT_1)
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (
+        FORMAT,
+        FORMAT_2,
+        FORMAT_1,
+    )
 
 
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
@@ -200,7 +209,7 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
         added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses()}
         tensors = {**tensors, **added}
-    elif metadata.get("format") != FORMAT:
+    elif metadata.get("format") not in (FORMAT, FORMAT_2):
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
@@ -219,7 +228,10 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     rest_uT = check_readings(tensors["rest_uT"])[0]
     labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
     presses_uT, even_uT, area_uT = (fields_uT[name] for name in UNLABELLED)
-    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels)
+    turned = metadata.get("turned", "false")
+    if turned not in ("true", "false"):
+        raise SchemaError(file, "turned", "true or false", turned, REMEDY)
+    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels, turned == "true")
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels

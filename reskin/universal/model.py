@@ -63,6 +63,7 @@ from reskin.universal.map import (
     new_map,
     shift_onto_area,
 )
+from reskin.universal.mounting import LABELS_MIN_N, LabelFrame, Mounting, find_label_frame, find_mounting
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
 # Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
@@ -355,6 +356,7 @@ class Universal:
 
     def __repr__(self) -> str:
         noload = "no no-load reading" if self._noload_uT is None else "no-load reading taken"
+        noload += ", skin turned by a quarter" if self._data.turned else ""
         presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
         return (
             f"Universal(five chips of the paper's board, trained on simulated skins, {noload}, "
@@ -382,6 +384,29 @@ class Universal:
     def zeroed(self) -> bool:
         """Whether `zero` has been called (or a calibration loaded)."""
         return self._noload_uT is not None
+
+    @property
+    def mounting(self) -> Mounting:
+        """Orientation of the skin on the board, with the odds for it; raises SchemaError before `zero`."""
+        if not self.zeroed:
+            raise SchemaError("mounting: the model has no no-load reading. First call zero.")
+        return find_mounting(self.tables, self._sign * self._data.rest_uT, turned=self._data.turned)
+
+    @property
+    def label_frame(self) -> LabelFrame | None:
+        """Most probable orientation of the labels' axes other than the given one; None if there are few labels."""
+        labels = self._data.labels
+        if len(labels) < LABELS_MIN_N:
+            return None
+        power = self.powers.power_for(len(self._data.presses_uT), 0, even=len(self._data.even_uT) > 0)
+        unlabelled = self._calibration.with_labels(labels[:0])
+        return find_label_frame(unlabelled.estimate(labels.db_uT, [power])[0], labels.place_mm)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences for the user if the orientation of the skin or of the labels' axes is uncertain or wrong."""
+        findings = [self.mounting, self.label_frame]
+        return [warning for finding in findings if finding is not None and (warning := finding.warning())]
 
     @property
     def presses_n(self) -> int:
@@ -418,22 +443,31 @@ class Universal:
             self._line = line_of_labels(self._held_out())
         return self._line
 
-    def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
+    def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False, turned: bool | None = None) -> "Universal":
         """Set the no-load field to the mean of readings without contact, and condition the map on it.
 
         Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
-        already calibrated to. The model is changed in place and returned.
+        already calibrated to. The no-load field also tells whether the skin is turned by a quarter (see `mounting`);
+        set `turned` if you know it. The model is changed in place and returned.
 
         Raises
         ------
-        SchemaError : there is no reading, or a reading is not finite, out of range or from another board
+        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; or `keep` is
+            set, and `turned` contradicts the earlier calibration
         """
         noload_uT = check_readings(b_uT)
         if not len(noload_uT):
             raise SchemaError("zero: there are no readings without contact. Read the board before a contact.")
-        self._noload_uT = noload_uT.mean(axis=0)
-        rest_uT = to_board(self._noload_uT[None])[0]
-        data = replace(self._data, rest_uT=rest_uT) if keep else CalibrationData(rest_uT)
+        kept = keep and self.zeroed
+        if kept and turned not in (None, self._data.turned):
+            raise SchemaError(
+                "zero: the presses to keep are from a skin in the other orientation. Call it without keep."
+            )
+        noload_uT = noload_uT.mean(axis=0)
+        rest_uT = to_board(noload_uT[None])[0]
+        turned = self._data.turned if kept else find_mounting(self.tables, rest_uT, turned=turned).turned
+        self._noload_uT, rest_uT = noload_uT, -rest_uT if turned else rest_uT
+        data = replace(self._data, rest_uT=rest_uT) if kept else CalibrationData(rest_uT, turned=turned)
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
@@ -549,7 +583,7 @@ class Universal:
     def remember(self, file: Path | str) -> "Universal":
         """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`."""
         data = read_calibration(Path(file), REACH_MM)
-        self._noload_uT = to_chips(data.rest_uT[None])[0]
+        self._noload_uT = (-1 if data.turned else 1) * to_chips(data.rest_uT[None])[0]
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
@@ -562,7 +596,11 @@ class Universal:
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return field changes along the board's axes; raise SchemaError before `zero`."""
-        return to_board(check_shape(b_uT) - self.noload_uT)
+        return self._sign * to_board(check_shape(b_uT) - self.noload_uT)
+
+    @property
+    def _sign(self) -> int:
+        return -1 if self._data.turned else 1
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
         """Calibrate to `data` from scratch, starting with a map that is conditioned on the no-load field only."""

@@ -1,0 +1,139 @@
+"""How a skin and its labels are oriented, found from the no-load field and from presses at known places.
+
+The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after a quarter turn
+(or three), every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
+down, fields have the same sign and are about 1.3 times as large. Without a check, the universal model would estimate
+wrong places on a turned skin, and without a warning: the field change of a press resembles that of a press on the
+opposite side of a skin that is not turned.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float
+from scipy.linalg import cho_factor, cho_solve
+
+from reskin.universal.map import Estimate, OFFSET_uT, Tables
+
+LOG_ODDS_MIN = 2.0  # a smaller log odds of the found orientation is reported as uncertain (odds of 7 to 1)
+LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
+FRAME_LOG_ODDS_MIN = 5.0  # log odds from which other axes of the labels are reported (odds of 150 to 1)
+FRAME_SD_MM = 1.0  # standard deviation of errors of places that the estimate does not know of
+OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0  # share of presses whose estimates are useless; they may be anywhere on this area
+
+TURNED = "turned by a quarter"
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Orientation of a skin on its board.
+
+    turned: whether the signs of all fields are opposite to those on the recorded boards. log_odds: logarithm of the
+    probability of this orientation divided by that of the other one; negative if the other one fits better. misfit:
+    chi^2 per channel of the no-load field.
+    """
+
+    turned: bool
+    log_odds: float
+    misfit: float
+
+    @property
+    def probability(self) -> float:
+        """Probability of this orientation, if both are equally probable before the no-load reading."""
+        return float(1 / (1 + np.exp(-self.log_odds)))
+
+    def warning(self) -> str | None:
+        """Return a sentence for the user if the orientation is uncertain or contradicts the no-load field."""
+        found = TURNED if self.turned else "not turned"
+        if self.log_odds < -LOG_ODDS_MIN:
+            return (
+                f"the skin is taken as {found}, but its no-load field fits the other orientation better (log odds "
+                f"{self.log_odds:.1f}). Call zero without `turned`, or check that nothing touches the skin."
+            )
+        if self.log_odds < LOG_ODDS_MIN:
+            return (
+                f"the skin is taken as {found}, but its no-load field fits both orientations (log odds "
+                f"{self.log_odds:.1f}). Label three presses far from the centre to check it."
+            )
+        return None
+
+
+def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
+    """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
+
+    The no-load field has a normal distribution under the map's prior. Both orientations are equally probable before.
+    """
+    covariance = _noload_covariance(tables)
+    chi2 = {}
+    for sign in (1, -1):
+        off_uT = sign * rest_uT - tables.rest_uT
+        chi2[sign] = float(off_uT @ cho_solve(covariance, off_uT))
+    if turned is None:
+        turned = chi2[-1] < chi2[1]
+    sign = -1 if turned else 1
+    return Mounting(turned, (chi2[-sign] - chi2[sign]) / 2, chi2[sign] / len(rest_uT))
+
+
+def _noload_covariance(tables: Tables) -> tuple[Float[np.ndarray, "ch ch"], bool]:
+    """Return the Cholesky factor of the no-load field's covariance under the map's prior."""
+    slope_uT = tables.rest_slope_uT
+    return cho_factor(slope_uT @ slope_uT.T + OFFSET_uT**2 * np.eye(len(slope_uT)))
+
+
+@cache
+def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
+    """Return the eight possible orientations of the labels' axes, by name: four turns, each also mirrored.
+
+    A matrix converts labelled places to those places that they would be in the given orientation.
+    """
+    quarter, mirror_x = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
+    turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
+    names = ("as given", "turned by 90°", "turned by 180°", "turned by 270°")
+    mirrored = ("mirrored in x", "with x and y exchanged", "mirrored in y", "with -x and -y exchanged")
+    matrices = dict(zip(names, turns, strict=True)) | dict(
+        zip(mirrored, [turn @ mirror_x for turn in turns], strict=True)
+    )
+    return MappingProxyType(matrices)
+
+
+@dataclass(frozen=True)
+class LabelFrame:
+    """Most probable orientation of the labels' axes other than the given one.
+
+    log_odds: logarithm of its probability divided by that of the axes as given; above 0 if it fits better.
+    """
+
+    name: str
+    log_odds: float
+
+    def warning(self) -> str | None:
+        """Return a sentence for the user if the labels' axes are probably not as given."""
+        if self.log_odds < FRAME_LOG_ODDS_MIN:
+            return None
+        return (
+            f"the labelled places fit the estimated places better if they are {self.name} (log odds "
+            f"{self.log_odds:.1f}). Check the axes of the labels, and on which side of the board its connector is."
+        )
+
+
+def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame | None:
+    """Compare labelled places with estimates that do not use the labels; return None for fewer than `LABELS_MIN_N`.
+
+    Both are relative to the board's centre. Errors are normally distributed, with a share of outliers.
+    """
+    if len(place_mm) < LABELS_MIN_N:
+        return None
+    log_p = {name: _log_likelihood(estimate, place_mm @ matrix.T) for name, matrix in frames().items()}
+    as_given = log_p.pop("as given")
+    name = max(log_p, key=log_p.__getitem__)
+    return LabelFrame(name, log_p[name] - as_given)
+
+
+def _log_likelihood(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> float:
+    var_mm2 = estimate.sd_mm**2 + FRAME_SD_MM**2
+    density = np.exp(-((estimate.place_mm - place_mm) ** 2 / var_mm2).sum(axis=1) / 2)
+    density = density / (2 * np.pi * np.sqrt(var_mm2.prod(axis=1)))
+    return float(np.log((1 - OUTLIER_SHARE) * density + OUTLIER_SHARE / AREA_MM2).sum())

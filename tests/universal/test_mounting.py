@@ -1,0 +1,145 @@
+"""Tests of how the orientation of a skin and of its labels is found."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
+
+from reskin import io
+from reskin.errors import SchemaError
+from reskin.live.tracker import UniversalEstimator
+from reskin.seeds import rng_for
+from reskin.universal.law import to_chips
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Estimate, OFFSET_uT
+from reskin.universal.model import load_universal
+from reskin.universal.mounting import LABELS_MIN_N, LOG_ODDS_MIN, find_label_frame, find_mounting, frames
+from reskin.universal.population import draw_population
+from tests.universal.skins import SETUP
+
+TABLES = load_universal().tables
+SKINS = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, 20, rng_for(0, "mounted"))
+PLACES_MM = np.array([[5.0, 1.0], [-2.0, 6.0], [-4.0, -3.0], [1.0, -5.0]])
+
+
+def skin(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a simulated skin's no-load reading and readings in contact, along the chips' axes, places and forces."""
+    rest_uT, db_uT = to_chips(SKINS.rest_uT[i : i + 1]), to_chips(SKINS.db_uT[i])
+    return rest_uT, rest_uT + db_uT, SKINS.place_mm[i] + 8.0, np.asarray(SKINS.force_N[i], float)
+
+
+def test_log_odds_equal_the_ratio_of_densities():
+    rest_uT = SKINS.rest_uT[0].astype(float)
+    cov = TABLES.rest_slope_uT @ TABLES.rest_slope_uT.T + OFFSET_uT**2 * np.eye(15)
+    log_p, log_p_turned = (multivariate_normal.logpdf(sign * rest_uT, TABLES.rest_uT, cov) for sign in (1, -1))
+    found = find_mounting(TABLES, rest_uT)
+    assert found.log_odds == pytest.approx(log_p - log_p_turned)
+    assert found.probability == pytest.approx(np.exp(log_p) / (np.exp(log_p) + np.exp(log_p_turned)))
+
+
+def test_orientation_of_all_simulated_skins_is_found():
+    for rest_uT in SKINS.rest_uT.astype(float):
+        found, turned = find_mounting(TABLES, rest_uT), find_mounting(TABLES, -rest_uT)
+        assert (found.turned, turned.turned) == (False, True)
+        assert found.log_odds == pytest.approx(turned.log_odds)
+        assert found.log_odds > 0
+
+
+def test_zero_field_is_reported_as_uncertain():
+    found = find_mounting(TABLES, np.zeros(15))
+    assert not found.turned
+    assert found.log_odds == pytest.approx(0, abs=1e-9)
+    assert "fits both orientations" in found.warning()
+
+
+def test_wrong_orientation_is_reported():
+    found = find_mounting(TABLES, SKINS.rest_uT[0].astype(float), turned=True)
+    assert found.turned
+    assert found.log_odds < -LOG_ODDS_MIN
+    assert "fits the other orientation better" in found.warning()
+
+
+def test_turned_skin_has_the_same_estimates():
+    rest_uT, b_uT, place_mm, force_N = skin(0)
+    own, turned = load_universal(), load_universal()
+    for model, sign in ((own, 1), (turned, -1)):
+        model.zero(sign * rest_uT).see(sign * b_uT[:20]).label(place_mm[20:30], force_N[20:30], sign * b_uT[20:30])
+    assert (own.mounting.turned, turned.mounting.turned) == (False, True)
+    assert "turned by a quarter" in repr(turned)
+    assert turned.warnings == own.warnings == []
+    np.testing.assert_array_equal(turned.predict(-b_uT), own.predict(b_uT))
+    np.testing.assert_array_equal(turned.noload_uT, -own.noload_uT)
+
+
+def test_given_orientation_is_used_and_kept():
+    rest_uT, b_uT, *_ = skin(0)
+    model = load_universal().zero(rest_uT, turned=True).see(b_uT[:12])
+    assert model.mounting.turned
+    assert "fits the other orientation better" in " ".join(model.warnings)
+    assert model.zero(rest_uT, keep=True).mounting.turned
+    with pytest.raises(SchemaError, match="presses to keep are from a skin in the other orientation"):
+        model.zero(rest_uT, keep=True, turned=False)
+    assert not model.zero(rest_uT).mounting.turned  # without `keep`, the orientation is found again
+
+
+def test_orientation_is_saved(tmp_path):
+    rest_uT, b_uT, *_ = skin(1)
+    file = tmp_path / "s.safetensors"
+    model = load_universal().zero(-rest_uT).see(-b_uT[:12])
+    model.save(file)
+    loaded = load_universal(file)
+    assert loaded.mounting.turned
+    np.testing.assert_allclose(loaded.predict(-b_uT[12:]), model.predict(-b_uT[12:]), rtol=1e-5)
+    tensors, metadata = io.read_tensors(file)
+    io.write_tensors(file, tensors, {"format": "reskin-skin-2"})  # a file from before orientations were found
+    assert not load_universal(file).mounting.turned
+    io.write_tensors(file, tensors, {**metadata, "turned": "perhaps"})
+    with pytest.raises(SchemaError, match="turned must be true or false; got perhaps"):
+        load_universal(file)
+
+
+def test_mounting_needs_a_noload_reading():
+    with pytest.raises(SchemaError, match="mounting: the model has no no-load reading"):
+        _ = load_universal().mounting
+
+
+@pytest.mark.parametrize("frame", list(frames()))
+def test_wrong_axes_of_labels_are_named(frame):
+    estimate = Estimate(PLACES_MM + 0.4, np.full((4, 2), 0.6), np.ones(4), np.ones(4), np.full(4, np.nan))
+    given_mm = PLACES_MM @ frames()[frame]  # the inverse of an orthogonal matrix is its transpose
+    found = find_label_frame(estimate, given_mm)
+    if frame == "as given":
+        assert found.log_odds < 0
+        assert found.warning() is None
+    else:
+        assert found.name == frame
+        assert f"if they are {frame}" in found.warning()
+    assert find_label_frame(estimate, given_mm[: LABELS_MIN_N - 1]) is None
+
+
+def test_frames_are_all_symmetries_of_a_square():
+    matrices = np.array([*frames().values()])
+    np.testing.assert_array_equal(matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(2), (8, 1, 1)))
+    assert len(np.unique(matrices.reshape(8, 4), axis=0)) == 8
+    assert (np.linalg.det(matrices) > 0).sum() == 4
+
+
+@given(st.integers(0, len(SKINS) - 1))
+def test_labels_as_given_raise_no_warning(i):
+    rest_uT, b_uT, place_mm, force_N = skin(i)
+    model = load_universal().zero(rest_uT).label(place_mm[:5], force_N[:5], b_uT[:5])
+    assert model.label_frame.warning() is None
+
+
+def test_mirrored_labels_raise_a_warning_in_the_model_and_live():
+    rest_uT, b_uT, place_mm, force_N = skin(2)
+    mirrored_mm = place_mm[:6] * (-1, 1) + (16, 0)
+    model = load_universal().zero(rest_uT).label(mirrored_mm, force_N[:6], b_uT[:6])
+    assert model.label_frame.name == "mirrored in x"
+    assert any("mirrored in x" in warning for warning in model.warnings)
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(rest_uT)
+    assert estimator.warnings == []
+    db_uT = (b_uT - rest_uT)[:6]
+    estimator.label(mirrored_mm, db_uT, np.arange(6) == 5)
+    assert any("mirrored in x" in warning for warning in estimator.warnings)
