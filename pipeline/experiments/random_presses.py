@@ -211,7 +211,8 @@ class CalibratedBoard:
         line = line_of_labels(folds)
 
         def with_and_without_line(evaluation: Evaluation) -> list[Estimate]:
-            return [replace(evaluation, line=each).combined(power) for each in (line, prior_line())]
+            raw = replace(evaluation, line=prior_line(), few=None)
+            return [replace(evaluation, line=line).combined(power), raw.combined(power)]
 
         calibrated, raw = model.estimate_by(with_and_without_line, tested.db_uT)
         log_N, _ = line_of_combined(folds).apply(np.log(raw.force_N))

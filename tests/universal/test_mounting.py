@@ -1,5 +1,7 @@
 """Tests of how the orientation of a skin and of its labels is found."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from scipy.stats import multivariate_normal
 from reskin import io
 from reskin.errors import SchemaError
 from reskin.live.tracker import UniversalEstimator
+from reskin.physics import magnet
 from reskin.seeds import rng_for
 from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Estimate, OFFSET_uT
@@ -43,6 +46,26 @@ def test_orientation_of_all_simulated_skins_is_found():
         assert (found.turned, turned.turned) == (False, True)
         assert found.log_odds == pytest.approx(turned.log_odds)
         assert found.log_odds > 0
+
+
+def test_quarter_turn_of_the_simulated_skin_negates_its_field():
+    nodes_m, moments = SETUP.rest.nodes_m, np.array(SETUP.rest.moments_A_m2)
+    middle_m = np.array([0, 0, SETUP.thickness_m / 2])
+    chips_m = np.column_stack([SETUP.chips_mm, np.full(5, -1.6)]) * 1e-3
+
+    def field(matrix) -> np.ndarray:
+        turned_m = (nodes_m - middle_m) @ np.transpose(matrix) + middle_m
+        return magnet.field(turned_m, np.asfortranarray(moments @ np.transpose(matrix)), chips_m)
+
+    own = field(np.eye(3))
+    # tolerance: rounding relative to the largest field
+    close = partial(np.testing.assert_allclose, atol=1e-9 * np.abs(own).max())
+    close(field([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), -own)
+    close(field(np.diag([-1.0, -1.0, 1.0])), own)
+    upside_down = field(np.diag([1.0, -1.0, -1.0]))
+    ratio = np.linalg.norm(upside_down) / np.linalg.norm(own)
+    assert 1.2 < ratio < 1.5
+    close(upside_down / ratio, own, rtol=0.2, atol=0.05 * np.abs(own).max())
 
 
 def test_zero_field_is_reported_as_uncertain():
