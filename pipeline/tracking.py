@@ -37,7 +37,8 @@ PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a
 # runs contain.
 NOT_METRICS = {"provenance", "runtime", "described", "variants"}
 
-# A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and means by name.
+# A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and the mean of
+# each metric.
 Point = tuple[str, int, Mapping[str, float]]
 Curves = Mapping[str, Sequence[Point]]
 

@@ -27,7 +27,7 @@ def test_every_stage_depends_on_its_code_digests():
     }
 
 
-def test_stage_code_depends_on_exactly_the_imported_modules():
+def test_the_stage_named_code_depends_on_all_modules_that_stages_import():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
     needed = {file_of(name) for stage in all_stages() for name in digests_of(stage)}
     deps = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
@@ -40,7 +40,7 @@ def test_digests_contain_the_modules_of_a_stage():
     assert {f"pipeline.experiments.{name}" for name in ANALYSES} <= digests_of("report").keys()
 
 
-def test_report_depends_on_every_data_file_of_tables_pages_and_experiments():
+def test_report_depends_on_every_data_file_of_the_report_and_of_the_experiments():
     data = {file for name in ("report", "experiments") for file in (ROOT / "pipeline" / name).rglob("*.*")}
     read = {file for name in digests_of("report") for file in files_of(name)}
     assert {file for file in data if file.suffix in code.DATA} <= read

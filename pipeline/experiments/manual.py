@@ -98,7 +98,7 @@ def fold_without(data: SceneData, board: str) -> Fold:
     if board not in folds:
         what = f"board {board} is not held out by any fold of lobo ({', '.join(sorted(folds))})"
         raise SchemaError(
-            f"experiment manual: {what}. Record hand pokes on skins that the other captures of the scene are of."
+            f"experiment manual: {what}. Record hand pokes on skins that also occur in other captures of the scene."
         )
     return folds[board]
 

@@ -33,7 +33,7 @@ class Rows:
     and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
     number of the pass, counted over all captures of a skin. `indentation` is the number of the indentation, counted
     over all captures of the scene; all readings of an indentation have the same number. `dropped` counts the readings
-    that are not in contact, by reason.
+    that are left out because they are not in contact, by reason.
     """
 
     capture: np.ndarray

@@ -98,7 +98,9 @@ def read_script(source: str) -> Script:
     if folder.suffix == ".yaml" and folder.is_file():
         scene = read_yaml(folder)
         if not isinstance(scene, dict) or "simulate" not in scene:
-            raise ParamsError(f"{source}: not a simulated scene. Use the folder of one of its captures.")
+            raise ParamsError(
+                f"{source}: the scene is recorded, not simulated. Give the folder of one of its captures instead."
+            )
         return simulate(scene["simulate"], scene.get("seed", SEED), source)
     raise ParamsError(
         f"{source}: the source must be the folder of a capture (with {HEADER_FILE}), {NOMINAL_SOURCE}, or the YAML "
@@ -107,7 +109,7 @@ def read_script(source: str) -> Script:
 
 
 def read_capture(folder: Path) -> Script:
-    """Create a script from a recorded byte stream or an SD card log; readings of a log are encoded as binary frames."""
+    """Create a script from a recorded byte stream, or from an SD card log, encoded as binary frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)

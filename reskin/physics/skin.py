@@ -76,7 +76,7 @@ def draw_skin(
     rule: Quadrature = DEFAULT_QUADRATURE,
     sides_m: tuple[float, float] = SKIN_SIDES_M,
 ) -> Skin:
-    """Draw a skin on its board with a random generator that is seeded by `seed` and `name`.
+    """Draw the parameters of a skin on its board at random, from a generator that is seeded by `seed` and `name`.
 
     The quadrature rule affects only the discretisation of the skin, not the random numbers. The magnetising array has
     as many magnets as are needed to cover a skin with the given side lengths.

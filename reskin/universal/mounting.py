@@ -64,7 +64,8 @@ class Mounting:
 def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
     """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
 
-    The no-load field has a normal distribution under the map's prior. Both orientations are equally probable before.
+    The no-load field has a normal distribution under the map's prior. Before the no-load reading, both orientations
+    are equally probable.
     """
     covariance = _noload_covariance(tables)
     chi2 = {}

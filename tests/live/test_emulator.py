@@ -236,6 +236,6 @@ def test_script_of_a_simulation_has_contacts(source):
 
 def test_invalid_sources_raise(tmp_path):
     for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
-        with pytest.raises(ReskinError, match="must be the folder of a capture|not a simulated scene") as error:
+        with pytest.raises(ReskinError, match="must be the folder of a capture|recorded, not simulated") as error:
             read_script(source)
         assert "Traceback" not in str(error.value)

@@ -123,7 +123,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(passes_n=st.integers(1, 4), failed=st.sets(st.integers(2, 7)))
-def test_every_row_is_a_reading_or_counted(
+def test_every_row_is_returned_or_counted_as_noload_or_dropped(
     tmp_path_factory: pytest.TempPathFactory, passes_n: int, failed: set[int]
 ) -> None:
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * passes_n)

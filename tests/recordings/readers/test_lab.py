@@ -60,7 +60,7 @@ def test_contact_rows_become_readings(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == [7, 7, 7, 8]
 
 
-def test_noload_is_the_mean_of_the_same_press(tmp_path: Path) -> None:
+def test_noload_is_the_mean_of_the_noload_rows_of_the_same_press(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.noload_uT[:, 0].tolist() == [102, 102, 102, 90]
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
