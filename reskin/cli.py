@@ -20,7 +20,8 @@ from typer import Argument, Option
 from reskin.errors import ParamsError, ReskinError, explaining
 
 CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
-    "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
+    "add", "check-cache", "compare", "fetch", "merge", "model", "publish", "readme", "remove", "scenes",
+    "verify-reports",
 )  # fmt: skip
 
 BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
