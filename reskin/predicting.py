@@ -28,13 +28,13 @@ FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the mod
 PARQUET_MAGIC = b"PAR1"
 
 
-def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
     Parameters
     ----------
     log : a capture's folder, a table that `reskin decode` wrote, or the log of an SD card
-    model : a network, a universal model or a calibration of it; None for the shipped universal model
+    model : a network; a universal model, a calibration, or both; None for the shipped universal model
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
 
@@ -43,8 +43,11 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
     of readings in contact: with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range.
     """
-    models = read_models([] if model is None else [model])
-    inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
+    files = [] if model is None else [model] if isinstance(model, Path) else list(model)
+    models = read_models(files)
+    if len(files) > 1 and not isinstance(models, Universal):
+        raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
+    inputs = (log, *files, *(file.with_suffix(".json") for file in files))
     if out.resolve() in {file.resolve() for file in inputs}:
         raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
     t_s, b_uT, _, counts = read_any_log(log, rate_hz)

@@ -604,9 +604,11 @@ def load_universal(calibration: Path | str | None = None, *, file: Path | str = 
 
 
 def is_model(file: Path) -> bool:
-    """Return whether a file is a universal model, which its card tells; False if there is no readable card."""
+    """Return whether a file is a universal model, which its card tells; False if there is no card."""
     card_file = file.with_suffix(".json")
-    return card_file.is_file() and _format_of(io.read_json(card_file)).startswith(FORMAT.rpartition("-")[0])
+    if file.suffix != FILE.suffix or not card_file.is_file():
+        return False
+    return _format_of(io.read_json(card_file)).startswith(FORMAT.rpartition("-")[0])
 
 
 def _format_of(card: Any) -> str:

@@ -1,7 +1,7 @@
 """Accuracy of a model made for a layout: on simulated skins of the layout, and on recorded eFlesh pads.
 
 Run it with the folders of the recordings, which are not part of the project (docs/learning.md, "Models for other
-boards"); five minutes:
+boards"); six minutes:
 
     RESKIN_BENCHMARKS=full RESKIN_EFLESH=DATASETS RESKIN_EFLASH7=FOLDER \
         pytest -s tests/benchmarks/test_board_model_benchmark.py
@@ -14,6 +14,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -146,17 +147,25 @@ def presses_of(
     return Presses(db_uT, np.broadcast_to(place_mm, (len(kept), 2))[kept], readings.Fz_N.astype(float)[kept], noload_uT)
 
 
-@pytest.fixture(scope="module")
-def model() -> Universal:
-    """Make the model for the eFlesh pad; at tiny size, load the shipped model."""
-    if not FULL:
+@cache
+def model_for(name: str) -> Universal:
+    """Make the model for a layout of the project; at tiny size and for the paper's board, load the shipped model."""
+    if not FULL or name == "reskin":
         return load_universal()
-    layout = read_layout("eflesh")
+    layout = read_layout(name)
     return make_model(layout, read_inputs(layout=layout))
 
 
-def test_simulated_skins_of_the_layout(model: Universal) -> None:
+@pytest.fixture
+def model() -> Universal:
+    """Return the model for the eFlesh pad."""
+    return model_for("eflesh")
+
+
+@pytest.mark.parametrize("name", ["reskin", "anyskin", "eflesh"])
+def test_simulated_skins_of_the_layout(name: str) -> None:
     """Score the model on simulated skins of its layout, with errors of the law as in training."""
+    model = model_for(name)
     inputs = read_inputs(layout=model.layout)
     skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", LAW_ERRORS[AS_TRAINED])
     centre_mm = np.array(model.layout.centre_mm)

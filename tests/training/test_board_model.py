@@ -25,6 +25,7 @@ from reskin.simulation.defaults import nominal
 from reskin.universal.batches import TrainingSettings
 from reskin.universal.layout import read_layout
 from reskin.universal.model import FILE, load_universal
+from tests.live.boards import make_script, play_to_skin
 
 SPREADS, CHIP = parse(Spreads, nominal("spreads"), "spreads"), parse(ChipDesign, nominal("chip"), "chip")
 # Four chips at the corners of a square, another pitch, other turns, a thicker skin and an area without cut corners.
@@ -162,6 +163,15 @@ def test_live_page_and_predict_accept_the_model(made, tmp_path):
     guided_mm = GuidedPresses(estimator.board).place_mm - [0.0, 20.0]
     assert (np.abs(guided_mm) < [5.0, 4.0]).all()
     assert np.abs(guided_mm).max() > 2.5
+
+
+def test_board_with_these_chips_is_read_with_the_model(made):
+    skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), predicting.read_models([made]))
+    assert skin.layout.known
+    assert np.isfinite(np.concatenate([batch.target[batch.contact] for batch in readings])).all()
+    assert any(batch.contact.any() for batch in readings)
+    other, _ = play_to_skin(make_script(pokes_n=1, chips_n=5), predicting.read_models([made]))
+    assert "no place or force: the universal model is for 4 chips. Use a model for this board." in other.alarms()
 
 
 def test_card_states_layout_and_limits(made):
