@@ -629,6 +629,9 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     }
     layout = as_layout(card["layout"], f"{card_file}: layout")
     tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.setup().area)
+    if len(tables.rest_uT) != layout.channels_n:
+        chips_n, remedy = len(tables.rest_uT) // 3, "Use the card that was written with the model."
+        raise SchemaError(card_file, "layout", f"of {chips_n} chips", f"{len(layout.chips)} chips", remedy)
     return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"]), layout, card
 
 

@@ -1,5 +1,6 @@
 """Tests of a universal model that is made for another board: its file, its accuracy on simulated skins, refusals."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -181,6 +182,14 @@ def test_card_states_layout_and_limits(made):
     assert card["centre"]["gap_mm"] == 1.2
     assert card["spreads"]["seat_x_mm"] == 0.3
     assert "layout" in card["not_for"]
+
+
+def test_card_of_another_model_is_refused(made, tmp_path):
+    file = tmp_path / "mixed.safetensors"
+    shutil.copy(made, file)
+    io.write_json(file.with_suffix(".json"), io.read_json(FILE.with_suffix(".json")))
+    with pytest.raises(SchemaError, match="layout must be of 4 chips; got 5 chips. Use the card"):
+        load_universal(file=file)
 
 
 def test_output_is_not_overwritten(made):
