@@ -13,7 +13,7 @@ import typer
 from typer import Argument, Option
 
 from pipeline import PLAN
-from reskin.cli import MAINTENANCE, PIPELINE, RECORDINGS, Wire
+from reskin.cli import BOARD, MAINTENANCE, PIPELINE, RECORDINGS, Wire
 from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
@@ -25,6 +25,8 @@ ROOT = Path()  # the checkout, which is the working directory
 app = typer.Typer()
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes", rich_help_panel=PIPELINE)
+models = typer.Typer(no_args_is_help=True, help="Make a universal model for your own board.")
+app.add_typer(models, name="model", rich_help_panel=BOARD)
 
 Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
 LAYOUT = "Format: table for your own CSV, capture for a folder written by `record`; for the others, see data/README.md."
@@ -270,6 +272,21 @@ def tidy() -> None:
 def check() -> None:
     """Check the planned scenes and params.yaml, and that pipeline/plan.yaml is up to date."""
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
+
+
+@models.command("make")
+def make_model(
+    layout: Annotated[
+        Path,
+        Option(help="YAML file of your board, like reskin/universal/layouts/reskin.yaml; or reskin, anyskin, eflesh."),
+    ],
+    out: Annotated[Path, Option(help="The model to write (.safetensors); its card is beside it (.json).")],
+) -> None:
+    """Simulate skins on your board and train a universal model for it. Takes a few minutes; needs PyTorch."""
+    from pipeline.training import shipping
+
+    shipping.make(layout, out, typer.echo)
+    typer.echo(f"wrote {out}. Next: reskin live --model {out}")
 
 
 # `reskin --help` lists groups of commands in the order in which their first commands are registered. Sorting puts the

@@ -336,8 +336,8 @@ def load_model(file: Path | str) -> Model:
     return Model(read_network(Path(file)))
 
 
-def load_universal(calibration: Path | str | None = None) -> Universal:
-    """Load the universal model that comes with the library. It needs no training data from the skin it is used on.
+def load_universal(calibration: Path | str | None = None, *, file: Path | str | None = None) -> Universal:
+    """Load the universal model for the paper's board, or one for another board. It needs no data from your skin.
 
     Its methods calibrate the model to a skin: `zero` accepts readings without contact, `see` accepts presses at unknown
     places, and `label` accepts presses at known places. `next_place` proposes where to press next, and `save` writes
@@ -347,6 +347,9 @@ def load_universal(calibration: Path | str | None = None) -> Universal:
     ----------
     calibration : path, optional
         A calibration file that `save` wrote; the returned model continues from this calibration.
+    file : path, optional
+        A model (.safetensors, with its JSON card) that `reskin model make` made for a board. Default: the model for
+        the paper's board, which comes with the library.
 
     Returns
     -------
@@ -355,7 +358,7 @@ def load_universal(calibration: Path | str | None = None) -> Universal:
     Raises
     ------
     ReskinError
-        If the file is missing or is not a calibration.
+        If a file is missing or is not a calibration or a model, or the calibration is for another board.
 
     Examples
     --------
@@ -364,9 +367,10 @@ def load_universal(calibration: Path | str | None = None) -> Universal:
     >>> model.predict(b_uT).shape  # x_mm, y_mm, F_N
     (1, 3)
     """
+    from reskin.universal.model import FILE
     from reskin.universal.model import load_universal as load
 
-    return load(calibration)
+    return load(calibration, file=FILE if file is None else file)
 
 
 @overload
@@ -385,8 +389,8 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     port : str or list of str
         A serial port or `socket://host:port`; a list for several boards at once.
     model : optional
-        One or more trained networks (files or `Model` objects), or one universal model (a calibration file or a
-        `Universal` object; the object is not modified). Default: the uncalibrated universal model.
+        One or more trained networks (files or `Model` objects), or one universal model: a `Universal` object, which
+        is not modified, or the files of a model, of a calibration, or of both. Default: the shipped universal model.
     baud : int
         Baud rate; USB ports ignore it.
 
@@ -433,7 +437,7 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
         return given[0]
     files = [Path(item) for item in given if isinstance(item, str | Path)]
     read = read_models(files) if files or not given else []
-    if isinstance(read, Universal) and len(given) <= 1:
+    if isinstance(read, Universal) and len(given) == len(files):
         return read
     if isinstance(read, Universal) or any(isinstance(item, Universal) for item in given):
         raise ParamsError("reskin.open: a universal model cannot be combined with other models. Use it alone.")

@@ -20,7 +20,8 @@ from typer import Argument, Option
 from reskin.errors import ParamsError, ReskinError, explaining
 
 CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
-    "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
+    "add", "check-cache", "compare", "fetch", "merge", "model", "publish", "readme", "remove", "scenes",
+    "verify-reports",
 )  # fmt: skip
 
 BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
@@ -55,7 +56,10 @@ FAULT = (
     "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. Names: failed-read, zeros, chip-reset, stuck, "
     "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
-MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
+MODEL = (
+    "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or the last "
+    "two. Default: the universal model for the paper's board."
+)
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -205,7 +209,7 @@ def emulate(
 @app.command(rich_help_panel=BOARD)
 def live(
     port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
-    model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several models are averaged.")] = None,
+    model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several networks are averaged.")] = None,
     replay: Annotated[str | None, Option(help="Folder of a capture to play, instead of a board.")] = None,
     emulate: Annotated[
         str | None, Option(help="Simulation to play, instead of a board: nominal, or the YAML of a simulated scene.")
@@ -261,7 +265,7 @@ def decode(
 def predict(
     log: Annotated[Path, Argument(help=LOG)],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
-    model: Annotated[Path | None, Option(help=MODEL)] = None,
+    model: Annotated[list[Path] | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
         float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
     ] = 400.0,

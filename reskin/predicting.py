@@ -21,20 +21,20 @@ from reskin.recordings.decode import read_frames
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
-from reskin.universal.calibration import CHANNELS_N, is_calibration
-from reskin.universal.model import MISFIT_MAX, Universal, load_universal
+from reskin.universal.calibration import is_calibration
+from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
 FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the model's force range is "at the limit"
 PARQUET_MAGIC = b"PAR1"
 
 
-def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
     Parameters
     ----------
     log : a capture's folder, a table that `reskin decode` wrote, or the log of an SD card
-    model : a network or a calibration of the universal model; None for the uncalibrated universal model
+    model : a network; a universal model, a calibration, or both; None for the shipped universal model
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
 
@@ -44,12 +44,15 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     of readings in contact (with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range), whether
     the skin is turned by a quarter, and the model's warnings.
     """
-    models = read_models([] if model is None else [model])
-    inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
+    files = [] if model is None else [model] if isinstance(model, Path) else list(model)
+    models = read_models(files)
+    if len(files) > 1 and not isinstance(models, Universal):
+        raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
+    inputs = (log, *files, *(file.with_suffix(".json") for file in files))
     if out.resolve() in {file.resolve() for file in inputs}:
         raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
     t_s, b_uT, _, counts = read_any_log(log, rate_hz)
-    channels_n = CHANNELS_N if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
+    channels_n = models.channels_n if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         raise SchemaError(
             f"{log}: the log has {b_uT.shape[1]} channels, but the model has {channels_n}. Use a model for this board."
@@ -143,13 +146,19 @@ def _read_capture(folder: Path) -> sd_card.Log:
 
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
-    """Read trained networks, or one calibration of the universal model; without files, the uncalibrated model."""
-    calibrations = [file for file in files if file.is_file() and _is_calibration(file)]
-    if not calibrations:
+    """Read trained networks, or one universal model, one calibration of it, or both.
+
+    Without a universal model, a calibration is for the shipped one; without any file, the model is the shipped one.
+    """
+    made = [file for file in files if is_model(file)]
+    calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
+    if not (made or calibrations):
         return [read_network(file) for file in files] or load_universal()
-    if len(files) > 1:
-        raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Use it alone.")
-    return load_universal(calibrations[0])
+    if max(len(made), len(calibrations)) > 1 or len(made) + len(calibrations) < len(files):
+        kind = "universal model" if made else "calibration"
+        remedy = "Use it alone, or a universal model with one calibration."
+        raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
+    return load_universal(calibrations[0] if calibrations else None, file=made[0] if made else FILE)
 
 
 def _is_calibration(file: Path) -> bool:

@@ -205,12 +205,20 @@ def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, mod
         tmp_path / "net.pt": "not a trained model",
         model.with_suffix(".json"): f"not a trained model.* Use {model}",
         tmp_path: r"this is a folder.* model\.safetensors",
-        FILE: "this is the universal model. Omit --model",
     }
     for file, message in cases.items():
         with pytest.raises(ReskinError, match=f"{file}: {message}") as refused:
             predict(write_log(tmp_path), file, tmp_path / "out.csv")
         assert "delete" not in str(refused.value)
+    with pytest.raises(ReskinError, match="this is a universal model. Load it with reskin.load_universal"):
+        load_model(FILE)
+
+
+def test_one_log_needs_one_network(tmp_path, model):
+    with pytest.raises(ReskinError, match="a log is estimated by one network. Use one --model"):
+        predict(write_log(tmp_path), [model, model], tmp_path / "out.csv")
+    same = predict(write_log(tmp_path), FILE, tmp_path / "out.csv")  # the shipped model, named explicitly
+    assert same == predict(write_log(tmp_path), None, tmp_path / "out.csv")
 
 
 def test_log_that_starts_in_contact_is_an_error(tmp_path, model):

@@ -165,7 +165,7 @@ def test_constraints_omit_reskin_and_gpu_packages():
 
 def test_checkout_commands_are_listed():
     names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
-    assert {"scenes", *names} == {*CHECKOUT_COMMANDS}
+    assert {"scenes", "model", *names} == {*CHECKOUT_COMMANDS}
 
 
 @pytest.mark.parametrize("name", CHECKOUT_COMMANDS)

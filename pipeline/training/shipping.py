@@ -1,13 +1,15 @@
-"""Train the universal model that is part of `reskin`: `python -m pipeline.training.shipping` (a few minutes).
+"""Make universal models for boards: `reskin model make`, and the shipped one: `python -m pipeline.training.shipping`.
 
-Writes reskin/universal/universal.safetensors and its card. The network has the training settings and the seed of scene
-lab, where it is tested as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
+The latter writes reskin/universal/universal.safetensors and its card, in a few minutes. Networks have the training
+settings and the seed of scene lab, where the shipped model is tested as `universal, simulated alone`. Likelihood powers
+are calibrated on simulated skins.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +17,6 @@ from jaxtyping import Float
 from pipeline.training.universal import (
     AS_TRAINED,
     CALIBRATION_SKINS_N,
-    FORCE_MIN_N,
     LAW_ERRORS,
     NOMINAL_POWERS,
     best_powers,
@@ -24,25 +25,20 @@ from pipeline.training.universal import (
     split_presses,
 )
 from reskin.config import parse, read_yaml
-from reskin.data.grid import CENTRE_MM, SKIN_MM
-from reskin.physics.skin import SkinDesign
-from reskin.simulation import defaults
+from reskin.errors import ParamsError, require
 from reskin.universal.batches import NOMINAL_NAME, SkinPrior, TrainingSettings
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
-from reskin.universal.law import CHIPS_MM, Setup, to_chips
-from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, tabulate
-from reskin.universal.model import Universal, write
+from reskin.universal.layout import BoardLayout, paper_layout, read_layout
+from reskin.universal.map import tabulate
+from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
-from reskin.universal.training import train_networks
 
 PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
 PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
-    "name": "universal, simulated alone",
     "source": "simulated",
-    "centre": asdict(NOMINAL),
     "map": "presses of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
     "network": "trained on presses of simulated skins, errors of the law drawn at every step; no recorded row",
     "answers": "places: the map's probabilities times the network's normal distribution; forces: by map and network or "
@@ -54,10 +50,18 @@ CARD = {
     "recorded_knowledge": "from two recorded boards: the form of the law, its slide, the force at which the slide ends "
     "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), the direction of the "
     "magnetisation, the length scales of the law's error, and how forces are estimated",
+}
+SHIPPED = {  # what the card of the shipped model says in addition
+    "name": "universal, simulated alone",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
     "presses that lie evenly (see(presses, even=True)) and by labels; intervals with fewer presses are calibrated on "
     "simulated skins alone",
     "not_for": "boards of other chips or turns, skins of other magnets, of other thickness, two contacts, shear",
+}
+MADE = {
+    "name": "universal, simulated alone, for the board of a layout",
+    "tested_on": "simulated skins of the layout alone",
+    "not_for": "boards of another layout, two contacts, shear, skins whose magnets are not powder in an elastic layer",
 }
 
 
@@ -84,15 +88,16 @@ def calibrate(
     Returns the readings of the skin's test presses, in the chips' axes, and their places in the frame of labels.
     """
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
-    rest_uT, pool_uT, tested_uT = (to_chips(db_uT) for db_uT in (skins.rest_uT[i][None], pool.db_uT, tested.db_uT))
+    fields_uT, centre_mm = (skins.rest_uT[i][None], pool.db_uT, tested.db_uT), np.array(model.layout.centre_mm)
+    rest_uT, pool_uT, tested_uT = (model.layout.to_chips(db_uT) for db_uT in fields_uT)
     model.zero(rest_uT)
     if presses_n:
         model.see(rest_uT + pool_uT[:presses_n], even=even)
     if labels_n:
         first = slice(labels_n)
-        force_N = np.maximum(pool.force_N[first], FORCE_MIN_N)
-        model.label(pool.place_mm[first] + CENTRE_MM, force_N, rest_uT + pool_uT[first])
-    return rest_uT + tested_uT, tested.place_mm + CENTRE_MM
+        force_N = np.maximum(pool.force_N[first], model.tables.force_N[0])
+        model.label(pool.place_mm[first] + centre_mm, force_N, rest_uT + pool_uT[first])
+    return rest_uT + tested_uT, tested.place_mm + centre_mm
 
 
 def _coverages(
@@ -115,35 +120,62 @@ class Inputs:
     seed: int
 
 
-def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
-    """Read the nominal skin design (mounted on the paper's board) and a scene's training settings."""
-    design = parse(SkinDesign, defaults.nominal("skin"), f"{defaults.NOMINAL}: skin")
-    setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
+def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml"), layout: BoardLayout | None = None) -> Inputs:
+    """Read a scene's training settings, for skins on the board of a layout (by default, the paper's)."""
+    board = layout or paper_layout()
     settings = read_yaml(scene)
     training = {name: settings["universal"][name] for name in TrainingSettings.model_fields}
     return Inputs(
-        SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup),
+        SkinPrior(NOMINAL_NAME, board.law, board.all_spreads, board.setup(), forces=board.forces),
         parse(TrainingSettings, training, f"{scene}: universal"),
         tuple(settings["universal"]["labels_n"]),
         settings["seed"],
     )
 
 
-def make() -> None:
-    """Train the model, and overwrite its file and its card."""
-    inputs = read_inputs()
+def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] = print) -> Universal:
+    """Simulate the map, train the networks and calibrate the likelihood powers for the board of a layout."""
+    from reskin.universal.training import train_networks  # imported here, because it imports torch
+
     times_s = [time.process_time()]
-    tables = tabulate(NOMINAL, NOMINAL_SPREADS, inputs.prior.setup)
+    say("1 of 3: simulating the map ...")
+    tables = tabulate(layout.law, layout.all_spreads, inputs.prior.setup, layout.tabulated_N)
     times_s.append(time.process_time())
+    say("2 of 3: training the network on simulated skins ...")
     networks = train_networks(inputs.prior, inputs.training, inputs.seed)
     times_s.append(time.process_time())
-    model = Universal(tables, networks, NO_POWERS)
-    powers = calibrate_powers(model, inputs.prior, inputs.labels_n, inputs.seed)
+    say("3 of 3: calibrating standard deviations on simulated skins ...")
+    powers = calibrate_powers(
+        Universal(tables, networks, NO_POWERS, layout), inputs.prior, inputs.labels_n, inputs.seed
+    )
     times_s.append(time.process_time())
     elapsed_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
     training = inputs.training.model_dump() | {"seed": inputs.seed}
-    write(tables, networks, powers, CARD | {"lessons": training, "made_in_s": elapsed_s})
+    about = CARD | {"centre": asdict(layout.law), "lessons": training, "made_in_s": elapsed_s}
+    return Universal(tables, networks, powers, layout, about)
+
+
+def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> None:
+    """Make the model for the layout in a file, and write it and its card (same name with suffix .json).
+
+    Raises
+    ------
+    ParamsError : the layout is wrong, `out` is not a new .safetensors file, or PyTorch is not installed
+    """
+    layout = read_layout(layout_file)
+    if out.suffix != ".safetensors":
+        raise ParamsError(f"--out: {out} must end in .safetensors. Try: {out.with_suffix('.safetensors')}")
+    for file in (out, out.with_suffix(".json")):
+        if file.exists():
+            raise ParamsError(f"--out: {file} exists. Choose another name, or delete it.")
+    require("torch", "model make")
+    write_model(make_model(layout, read_inputs(layout=layout), say), MADE, out)
+
+
+def write_model(model: Universal, about: Mapping[str, Any], out: Path) -> None:
+    """Write a model that `make_model` made; `about` is added to its card."""
+    write(model.tables, model.networks, model.powers, model.layout, {**about, **model.card}, out)
 
 
 if __name__ == "__main__":
-    make()
+    write_model(make_model(paper_layout(), read_inputs()), SHIPPED, FILE)

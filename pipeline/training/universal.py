@@ -293,7 +293,7 @@ def best_powers(candidates: Sequence[float], of_skins: Sequence[Coverages]) -> P
 def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
     """Simulate skins drawn from a prior; the field changes include noise and errors of the law."""
     rng = rng_for(seed, "universal", prior.name, name)
-    skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng)
+    skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng, prior.forces)
     db_uT = error(skins, rng).reshape(skins.db_uT.shape)
     sd_uT = np.tile(np.array(NOISE_uT), skins.rest_uT.shape[1] // len(NOISE_uT))
     return replace(skins, db_uT=(db_uT + sd_uT * rng.standard_normal(skins.db_uT.shape)).astype(np.float32))

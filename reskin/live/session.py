@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin.data.grid import CENTRE_MM
 from reskin.errors import ReskinError, SchemaError
 from reskin.live.health import LIVE_POLICY
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
@@ -20,6 +19,7 @@ from reskin.recordings.header import Header
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.recordings.stream_recorder import CaptureWriter
 from reskin.seeds import rng_for
+from reskin.universal.layout import BoardLayout, paper_layout
 
 POLL_S = 0.1
 # With several boards, frames are collected for this time and then estimated together, which needs less computing time.
@@ -34,7 +34,8 @@ HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins
 NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
 
 PRESSES_N = 12
-GUIDED_MM = CENTRE_MM + 3.0 * np.array([-1.5, -0.5, 0.5, 1.5])  # grid of places to press, along x and along y
+# Grid of places to press along x and along y, relative to the board's centre, as fractions of the area's half width.
+GUIDED = 0.375 * np.array([-1.5, -0.5, 0.5, 1.5])
 READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
 
 
@@ -160,8 +161,11 @@ class GuidedPresses(Presses):
     Every second press is held out from the calibration, to measure the error of the calibrated model.
     """
 
-    def __init__(self) -> None:
-        grid_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2)
+    def __init__(self, board: BoardLayout | None = None) -> None:
+        board = board or paper_layout()
+        grid_mm = (
+            np.array(board.centre_mm) + np.stack(np.meshgrid(GUIDED, GUIDED), axis=-1).reshape(-1, 2) * board.half_mm
+        )
         self.place_mm = rng_for(0, "shown places").permutation(grid_mm)
         super().__init__(len(self.place_mm))
 
@@ -178,7 +182,7 @@ class GuidedPresses(Presses):
         return np.arange(self.presses_n) % 2 == 1
 
 
-ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # name of a button -> the presses that it requests
+ADAPTING = ("adapt", "places")  # names of the buttons that request presses
 
 
 class Session:
@@ -297,8 +301,9 @@ class Session:
         with self._button_lock:
             if button == "zero":
                 self.skin.zero()
-            elif isinstance(button, str) and button in ADAPTING and isinstance(self.skin.estimator, UniversalEstimator):
-                self._presses = ADAPTING[button]() if self._presses is None else None
+            elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
+                requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
+                self._presses = requested if self._presses is None else None
             elif button == "record" and self._recording is not None:
                 self._end_recording()
             elif button == "record" and self.skin.detected.problem is None:

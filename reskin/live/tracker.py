@@ -37,7 +37,8 @@ from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
-from reskin.universal.calibration import CHANNELS_N, check_presses
+from reskin.universal.calibration import check_presses
+from reskin.universal.layout import BoardLayout
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
@@ -99,15 +100,14 @@ class UniversalEstimator:
     the same method, so that the user can repeat bad presses.
     """
 
-    channels_n = CHANNELS_N
     name = "universal model"
 
     def __init__(self, model: Universal) -> None:
-        self._given_model = model
+        self._given_model, self.channels_n, self.board = model, model.channels_n, model.layout
         # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
-        self._noload_uT = model.noload_uT if model.zeroed else np.zeros(CHANNELS_N)
-        self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
-        self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
+        self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
+        self._presses_uT = np.zeros((0, self.channels_n))  # field changes for presses at unknown places
+        self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, self.channels_n))
         self._calibrate()
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
@@ -233,6 +233,14 @@ def layout_of(chips_n: int) -> Layout:
     chips_mm = np.column_stack([SPACING_MM * (0.5 + np.arange(chips_n)), np.full(chips_n, SPACING_MM)])
     skin_mm = (SPACING_MM * chips_n, 2 * SPACING_MM)
     return Layout(False, chips_mm, np.tile(np.eye(3), (chips_n, 1, 1)), (0.0, 0.0), skin_mm)
+
+
+def layout_of_board(board: BoardLayout) -> Layout:
+    """Return the layout of the board that a universal model was made for."""
+    centre_mm, size_mm = np.array(board.centre_mm), np.array(board.skin.size_mm)
+    turn = Rotation.from_euler("z", np.array(board.turns_deg)[:, None], degrees=True).as_matrix()
+    x_mm, y_mm = (centre_mm - size_mm / 2).tolist()
+    return Layout(True, centre_mm + board.chips_mm, turn, (x_mm, y_mm), board.skin.size_mm)
 
 
 class Contact(NamedTuple):
@@ -415,6 +423,8 @@ class LiveSkin:
             self._reject_model(self.estimator, detected.chips_n)
         self.description = f"{detected.port}: {detected.format}, {detected.scale}"
         self.health, self.layout = Health(detected.chips_n, self.fault_policy), layout_of(detected.chips_n)
+        if isinstance(self.estimator, UniversalEstimator):
+            self.layout = layout_of_board(self.estimator.board)
         self._start_stream(detected)
         self.detected = detected  # set last: other threads use the attributes above as soon as a board is detected
         return chunks
@@ -431,7 +441,8 @@ class LiveSkin:
                 "Use a model that was trained on such boards."
             )
         self.estimator = None
-        self._model_problem = f"no place or force: the {estimator.name} is for five chips. Use a model for this board."
+        chips = f"{estimator.channels_n // 3} chips"
+        self._model_problem = f"no place or force: the {estimator.name} is for {chips}. Use a model for this board."
 
     def _start_stream(self, detected: find.DetectedBoard) -> None:
         self._stream = FrameStream(detected.wire, detected.chips_n)

@@ -104,7 +104,7 @@ def read_network(model: Path) -> Network:
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
     if str(form).startswith(UNIVERSAL):
-        raise ParamsError(f"{model}: this is the universal model. Omit --model, or use reskin.load_universal().")
+        raise ParamsError(f"{model}: this is a universal model. Load it with reskin.load_universal(file=...).")
     if form != FORMAT:
         raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]

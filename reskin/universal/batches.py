@@ -16,7 +16,7 @@ from reskin.config import Strict
 from reskin.universal.law import Law, Setup
 from reskin.universal.map import Residual
 from reskin.universal.network import LOG_N, PLACE_MM
-from reskin.universal.population import PLACES_N, PRESSES_N, Population
+from reskin.universal.population import DEFAULT_FORCES, PLACES_N, PRESSES_N, Forces, Population
 
 SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins per step; recorded ones among them, if any
 NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; else 1 to 65 presses
@@ -53,7 +53,7 @@ class SkinPrior:
 
     Skins are simulated with parameters around those of a central law. If boards of the rig were recorded, `recorded`
     has their readings and `residual` predicts the law's errors from those on these boards. follows_law: True if skins
-    follow the law exactly, as in a simulated scene, so that no errors are added.
+    follow the law exactly, as in a simulated scene, so that no errors are added. forces: distribution of the forces.
     """
 
     name: str
@@ -63,6 +63,7 @@ class SkinPrior:
     recorded: Sequence[RecordedBoard] = ()
     residual: Residual | None = None
     follows_law: bool = False
+    forces: Forces = DEFAULT_FORCES
 
 
 @dataclass(frozen=True)

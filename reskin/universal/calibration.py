@@ -14,29 +14,29 @@ from reskin.errors import SchemaError
 from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
-CHANNELS_N = 15  # five chips with three axes each
+CHANNELS_N = 15  # of the paper's board: five chips with three axes each
 FIELD_MAX_uT = 1e6  # 20 times the range of a chip; the square of this value fits single precision
 RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
-CHANNELS_RULE = f"This model needs {CHANNELS_N} numbers per reading: Bx, By, Bz of each of five chips."
 LABELS_MAX_N = 2000  # memory grows with the square of the number of labels, and computing time grows faster still
 
 
-def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
+def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
     """Return one or several readings as a 2-D array, one row per reading; raise SchemaError for a wrong shape."""
+    needed = f"This model needs {channels_n} numbers per reading: Bx, By, Bz of each of {channels_n // 3} chips."
     try:
         rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     except (TypeError, ValueError):  # text, or rows of different lengths
         got = " ".join(repr(b_uT).split())[:60]
-        raise SchemaError(f"b_uT: {got} is not an array of numbers. {CHANNELS_RULE}") from None
-    if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
+        raise SchemaError(f"b_uT: {got} is not an array of numbers. {needed}") from None
+    if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
         got = f"{rows_uT.size} numbers" if np.ndim(b_uT) < 2 else f"shape {rows_uT.shape}"
-        raise SchemaError(f"b_uT has {got}. {CHANNELS_RULE}")
+        raise SchemaError(f"b_uT has {got}. {needed}")
     return rows_uT
 
 
-def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
+def check_readings(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
     """Return calibration readings as a 2-D array; raise SchemaError for values that are not finite or too large."""
-    rows_uT = check_shape(b_uT)
+    rows_uT = check_shape(b_uT, channels_n)
     _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in magnitude"
     _need("fields", "calibration readings", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
@@ -55,11 +55,11 @@ def check_labels(
     must be one label for each of the `rows_n` readings, and at most LABELS_MAX_N labels.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
-    got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
+    got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n})"
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
         raise SchemaError(
             f"labels: each press needs x and y, a force and a reading; got {got}. Pass arrays of shapes "
-            f"[m, 2], [m] and [m, {CHANNELS_N}]."
+            "[m, 2], [m] and [m, channels]."
         )
     if rows_n > LABELS_MAX_N:
         raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
@@ -83,7 +83,7 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
 
 def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
     """Return the field changes; raise SchemaError if all are below the noise, for example because they are in mT."""
-    strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), CHANNELS_N // 3, 3), axis=2).max(initial=0.0))
+    strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), db_uT.shape[1] // 3, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
         rule = f"{NOISE_uT:g} uT or more at some chip"
         remedy = "Are the fields in uT? Convert mT or G, or press the skin."
@@ -100,18 +100,11 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 # Files of the first format do not tell which forces are known, and those of the first two do not tell how the skin is
 # mounted: it is then not turned.
 FORMAT, FORMAT_2, FORMAT_1 = "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
-SHAPES: Mapping[str, tuple[int, ...]] = {  # arrays in the file, with their shapes after the first axis (presses)
-    "pokes_uT": (CHANNELS_N,),
-    "even_uT": (CHANNELS_N,),
-    "area_uT": (CHANNELS_N,),
-    "labelled_mm": (2,),
-    "labelled_N": (),
-    "labelled_uT": (CHANNELS_N,),
-    "force_known": (),
-}
+ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
 FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
 REMEDY = "Use a file that `save` wrote."
+BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in the file; name that files without the key have
 
 
 @dataclass(frozen=True)
@@ -148,12 +141,12 @@ def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses
     )  # fmt: skip
 
 
-def no_presses() -> Float[np.ndarray, "0 ch"]:
-    return np.zeros((0, CHANNELS_N))
+def no_presses(channels_n: int = CHANNELS_N) -> Float[np.ndarray, "0 ch"]:
+    return np.zeros((0, channels_n))
 
 
-def no_labels() -> LabelledPresses:
-    return LabelledPresses(np.zeros((0, 2)), np.zeros(0), no_presses())
+def no_labels(channels_n: int = CHANNELS_N) -> LabelledPresses:
+    return LabelledPresses(np.zeros((0, 2)), np.zeros(0), no_presses(channels_n))
 
 
 @dataclass(frozen=True)
@@ -162,8 +155,9 @@ class CalibrationData:
 
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
-    the area of the labels' grid. labels: presses at known places. turned: whether the skin is turned by a quarter; the
-    sign of all fields here is then opposite to that of the board's fields, as if the skin were not turned.
+    the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter; the sign of
+    all fields here is then opposite to that of the board's fields, as if the skin were not turned. By default, there
+    are no presses on the paper's board.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -173,14 +167,20 @@ class CalibrationData:
     labels: LabelledPresses = field(default_factory=no_labels)
     turned: bool = False
 
+    @classmethod
+    def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "CalibrationData":
+        """Return the data of a skin that was not pressed, on a board with any number of chips."""
+        empty = no_presses(len(rest_uT))
+        return cls(rest_uT, empty, empty, empty, no_labels(len(rest_uT)))
 
-def write_calibration(data: CalibrationData, file: Path) -> None:
-    """Write calibration data to a safetensors file, which does not contain the model."""
+
+def write_calibration(data: CalibrationData, file: Path, board: str) -> None:
+    """Write calibration data to a safetensors file, which does not contain the model, but the name of its board."""
     labels = data.labels
     labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
     values = (data.presses_uT, data.even_uT, data.area_uT, *labelled)
-    about = {"format": FORMAT, "turned": str(data.turned).lower()}
-    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, about)
+    about = {"format": FORMAT, "turned": str(data.turned).lower(), BOARD: board}
+    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(ARRAYS, values, strict=True))}, about)
 
 
 def is_calibration(file: Path) -> bool:
@@ -195,29 +195,41 @@ def is_calibration(file: Path) -> bool:
     )
 
 
-def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
+def read_calibration(
+    file: Path, reach_mm: Float[np.ndarray, "2 2"], channels_n: int = CHANNELS_N, board: str = PAPER_BOARD
+) -> CalibrationData:
     """Read the calibration data that `write_calibration` wrote.
 
-    Raises SchemaError for other files, and for labelled places outside `reach_mm` (rows: least and largest x and y,
-    relative to the board's centre).
+    Raises SchemaError for other files, for a calibration on a board of another name, and for labelled places outside
+    `reach_mm` (rows: least and largest x and y, relative to the board's centre).
     """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
+    if (own := metadata.get(BOARD, PAPER_BOARD)) != board:
+        remedy = f"Load it with the model that was made for board {own}."
+        raise SchemaError(file, "the calibrated board", f"{board}, the board of the model", own, remedy)
     if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
-        added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses()}
+        added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses(channels_n)}
         tensors = {**tensors, **added}
     elif metadata.get("format") not in (FORMAT, FORMAT_2):
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
-    expected = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
+    shapes: dict[str, tuple[int, ...]] = {"labelled_mm": (2,), "labelled_N": (), "force_known": ()}
+    expected = {"rest_uT": (channels_n,)} | {
+        name: (counts_n.get(name, 0), *shapes.get(name, (channels_n,))) for name in ARRAYS
+    }
     if got != expected or max(counts_n[name] for name in UNLABELLED) > FULL_SET_N:
-        rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled presses"
+        rule = f"rest_uT, {', '.join(ARRAYS)} of {channels_n} channels and at most {FULL_SET_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
-    fields_uT = {name: check_readings(values) for name, values in tensors.items() if values.shape[1:] == (CHANNELS_N,)}
+    fields_uT = {
+        name: check_readings(values, channels_n)
+        for name, values in tensors.items()
+        if expected[name][1:] == (channels_n,)
+    }
     labels_n = len(fields_uT["labelled_uT"])
     place_mm, force_N = check_labels(
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
@@ -225,7 +237,7 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     if counts_n["force_known"] != labels_n:
         known = f"{counts_n['force_known']} values for {labels_n} labels"
         raise SchemaError(file, "force_known", "one value per label", known, REMEDY)
-    rest_uT = check_readings(tensors["rest_uT"])[0]
+    rest_uT = check_readings(tensors["rest_uT"], channels_n)[0]
     labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
     presses_uT, even_uT, area_uT = (fields_uT[name] for name in UNLABELLED)
     turned = metadata.get("turned", "false")

@@ -18,19 +18,44 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
 from reskin.universal.presses import RecordedPresses, magnitudes_uT
 
-MARGIN_MM = 0.4  # width of the margin around the paper's grid
+MARGIN_MM = 0.4  # width of the margin around the area of presses
 HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y| and largest |x| + |y| of the paper's grid
 
 
-def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Return which places are within the octagon of the paper's grid, including a margin around it."""
+@dataclass(frozen=True)
+class Area:
+    """The places that are pressed: a rectangle around the board's centre, or the octagon that is left without corners.
+
+    The octagon has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
+    """
+
+    half_x_mm: float = HALF_MM
+    half_y_mm: float = HALF_MM
+    octagon: bool = True
+
+    @property
+    def half_mm(self) -> Float[np.ndarray, "2"]:
+        """Largest |x| and |y| without the margin."""
+        return np.array([self.half_x_mm, self.half_y_mm])
+
+
+PAPER_AREA = Area()
+
+
+def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[np.ndarray, " n"]:
+    """Return which places (relative to the board's centre) are within an area, including a margin around it."""
     x_mm, y_mm = np.abs(place_mm).T
-    return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
+    within = (x_mm <= area.half_x_mm + MARGIN_MM) & (y_mm <= area.half_y_mm + MARGIN_MM)
+    if not area.octagon:
+        return within
+    scaled_mm = x_mm * (HALF_MM / area.half_x_mm) + y_mm * (HALF_MM / area.half_y_mm)
+    return within & (scaled_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
 # Quadrature rule for the skin's field, the same as in scene `quick`: the cheapest rule whose error is below 2 % of the
 # field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
+COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; the law itself has larger errors
 
 
 @dataclass(frozen=True)
@@ -58,7 +83,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """Data that all laws of a scene share: the nominal skin design, the chips' positions, and the tip."""
+    """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area."""
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
@@ -67,6 +92,8 @@ class Setup:
     skin_flipped: bool  # all fields have the opposite sign, as after a rotation of a checkerboard skin by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
+    coarse_rule: Quadrature = COARSE
+    area: Area = PAPER_AREA
 
     @property
     def sides_m(self) -> tuple[float, float]:
@@ -257,17 +284,17 @@ CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 
 
-def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Rotate readings from the chips' axes to the board's axes."""
-    return b_uT @ _turn()
+def to_board(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...] = TURNS_DEG) -> Float[np.ndarray, "f ch"]:
+    """Rotate readings from the axes of chips with these rotations to the board's axes."""
+    return b_uT @ _turn(turns_deg)
 
 
-def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Rotate readings from the board's axes to the chips' axes."""
-    return b_uT @ _turn().T
+def to_chips(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...] = TURNS_DEG) -> Float[np.ndarray, "f ch"]:
+    """Rotate readings from the board's axes to the axes of chips with these rotations."""
+    return b_uT @ _turn(turns_deg).T
 
 
 @cache
-def _turn() -> Float[np.ndarray, "ch ch"]:
-    of_chips = Rotation.from_euler("z", np.array(TURNS_DEG)[:, None], degrees=True).as_matrix()
+def _turn(turns_deg: tuple[float, ...]) -> Float[np.ndarray, "ch ch"]:
+    of_chips = Rotation.from_euler("z", np.array(turns_deg)[:, None], degrees=True).as_matrix()
     return np.array(block_diag(*of_chips)).T

@@ -7,6 +7,7 @@ error of the law.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from math import ceil
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -16,9 +17,19 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.universal.kernels import Lattice, LinearMeans, in_blocks, means, whiten
-from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_parameters
+from reskin.universal.law import (
+    MARGIN_MM,
+    PAPER_AREA,
+    Area,
+    Law,
+    Setup,
+    at_rest_uT,
+    inside,
+    simulate_uT,
+    with_parameters,
+)
 
-PITCH_MM, STEPS_N = 0.8, 22  # lattice of places: pitch, and number of places along each axis
+PITCH_MM, STEPS_MAX_N = 0.8, 28  # lattice of places: pitch, and largest number of places along each axis
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
 LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is the standard deviation of their logarithm
 # Standard deviations of a skin's parameters about the mean of known boards of the same rig, or about nominal parameters
@@ -55,13 +66,20 @@ class Tables:
     slope_uT: Float[np.ndarray, "a a q ch t"]
     rest_uT: Float[np.ndarray, " ch"]
     rest_slope_uT: Float[np.ndarray, "ch t"]
+    area: Area = PAPER_AREA  # only places within this area are hypotheses
 
     __repr__ = one_line
 
 
-def lattice_mm() -> Float[np.ndarray, " a"]:
-    """Return the coordinates of the lattice's places along one axis, relative to the board's centre."""
-    return PITCH_MM * (np.arange(STEPS_N) - (STEPS_N - 1) / 2)
+def lattice_mm(area: Area = PAPER_AREA) -> Float[np.ndarray, " a"]:
+    """Return the coordinates of the lattice's places along one axis, relative to the board's centre.
+
+    The pitch is `PITCH_MM` or slightly less. It is larger only for areas wider than 20.8 mm, which have `STEPS_MAX_N`
+    places along each axis, so that the time for the simulation is limited.
+    """
+    width_mm = 2 * (float(area.half_mm.max()) + MARGIN_MM)
+    steps_n = min(ceil(width_mm / PITCH_MM - 1e-9) + 1, STEPS_MAX_N)
+    return width_mm / (steps_n - 1) * (np.arange(steps_n) - (steps_n - 1) / 2)
 
 
 def tabulate(
@@ -71,7 +89,7 @@ def tabulate(
 
     With the default forces, these are 4,356 presses per law, 70,000 in total; the simulation takes about 30 s.
     """
-    axis_mm = lattice_mm()
+    axis_mm = lattice_mm(setup.area)
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm = np.repeat(places_mm, len(forces_N), axis=0)
     force_N = np.tile(forces_N, len(places_mm))
@@ -86,6 +104,7 @@ def tabulate(
         names=tuple(spreads), spreads=np.array(list(spreads.values())), axis_mm=axis_mm, force_N=forces_N,
         mean_uT=mean_uT, slope_uT=np.stack([(db_uT - mean_uT) / STEP for db_uT, _ in perturbed], axis=-1),
         rest_uT=rest_uT, rest_slope_uT=np.stack([(noload_uT - rest_uT) / STEP for _, noload_uT in perturbed], axis=-1),
+        area=setup.area,
     )  # fmt: skip
 
 
@@ -224,7 +243,7 @@ class Hypotheses:
 def lattice(tables: Tables, residual: Residual) -> Hypotheses:
     """Return the hypotheses: all tabulated places that are on the skin, each with all tabulated forces."""
     place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
-    on_skin = inside(place_mm)
+    on_skin = inside(place_mm, tables.area)
     log_N, channels_n = np.log(tables.force_N), len(tables.rest_uT)
     mean_uT = tables.mean_uT.reshape(len(place_mm), len(log_N), -1)[on_skin].reshape(-1, channels_n)
     slope_uT = tables.slope_uT.reshape(len(place_mm), len(log_N), -1)[on_skin].reshape(*mean_uT.shape, -1)
@@ -244,8 +263,8 @@ SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, how
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
 ROUNDS_N = 3  # default number of rounds of expectation maximisation
 LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
-# Lattice on which the shift of presses onto the grid's area is computed: half width, step, and largest shift.
-AREA_REACH_MM, AREA_STEP_MM, SHIFT_MAX_MM = 12.0, 0.2, 2.0
+# Lattice on which the shift of presses onto the area is computed: width beyond the area, step, and largest shift.
+AREA_BEYOND_MM, AREA_STEP_MM, SHIFT_MAX_MM = 4.0, 0.2, 2.0
 DENSITY_MIN = 1e-3  # least density of a place relative to that inside the area, so that single outliers are tolerated
 EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
@@ -419,19 +438,20 @@ def move_places(skin: SkinMap, by_mm: Float[np.ndarray, "2"]) -> SkinMap:
     return replace(skin, mean=mean)
 
 
-def shift_onto_area(estimate: Estimate, sd_mm: float) -> Float[np.ndarray, "2"]:
-    """Return the shift that moves places of presses onto the area of the paper's grid, as a posterior mean.
+def shift_onto_area(estimate: Estimate, sd_mm: float, area: Area = PAPER_AREA) -> Float[np.ndarray, "2"]:
+    """Return the shift that moves places of presses onto the area, as a posterior mean.
 
-    The true places are assumed to be uniformly distributed over this octagon. sd_mm: standard deviation of the shift's
+    The true places are assumed to be uniformly distributed over the area. sd_mm: standard deviation of the shift's
     prior, a normal distribution with mean zero.
     """
-    axis_mm = np.arange(-AREA_REACH_MM, AREA_REACH_MM + AREA_STEP_MM / 2, AREA_STEP_MM)
+    reach_mm = float(area.half_mm.max()) + AREA_BEYOND_MM
+    axis_mm = np.arange(-reach_mm, reach_mm + AREA_STEP_MM / 2, AREA_STEP_MM)
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1)
-    area = inside(place_mm.reshape(-1, 2)).reshape(place_mm.shape[:2]).astype(float)
-    density = gaussian_filter(area, float(estimate.sd_mm.mean()) / AREA_STEP_MM) + DENSITY_MIN
+    pressed = inside(place_mm.reshape(-1, 2), area).reshape(place_mm.shape[:2]).astype(float)
+    density = gaussian_filter(pressed, float(estimate.sd_mm.mean()) / AREA_STEP_MM) + DENSITY_MIN
     steps_mm = np.arange(-SHIFT_MAX_MM, SHIFT_MAX_MM + AREA_STEP_MM / 2, AREA_STEP_MM)
     shift_mm = np.stack(np.meshgrid(steps_mm, steps_mm, indexing="ij"), axis=-1).reshape(-1, 2)
-    at = (estimate.place_mm[:, None] + shift_mm + AREA_REACH_MM) / AREA_STEP_MM
+    at = (estimate.place_mm[:, None] + shift_mm + reach_mm) / AREA_STEP_MM
     log_density = np.log(map_coordinates(density, at.reshape(-1, 2).T, order=1, mode="nearest"))
     log_p = log_density.reshape(len(at), -1).sum(axis=0) - (shift_mm**2).sum(axis=1) / (2 * sd_mm**2)
     p = np.exp(log_p - log_p.max())

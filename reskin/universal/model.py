@@ -4,9 +4,9 @@
 data of one skin: `PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` also on
 labelled presses. These three classes use the board's frame and axes, and work for any board.
 
-`Universal` is the model that comes with the project. It is for the paper's board with five chips, oriented as on the
-recorded boards. It takes readings along the chips' axes, and its places are in the frame of the labels, in which the
-board's centre is at (8, 8) mm.
+`Universal` is a model for the board of one layout (`reskin.universal.layout`); the one that comes with the project is
+for the paper's board. It takes readings along the chips' axes, and its places are in the frame of the labels, in which
+the board's centre is at the layout's `centre_mm`.
 """
 
 import math
@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Float
 
 from reskin import io
-from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.universal import network
@@ -44,7 +43,7 @@ from reskin.universal.calibration import (
 )
 from reskin.universal.force import ESTIMATORS, FEW_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
-from reskin.universal.law import to_board, to_chips
+from reskin.universal.layout import BoardLayout, as_layout, paper_layout
 from reskin.universal.map import (
     ROUNDS_N,
     Estimate,
@@ -77,8 +76,8 @@ BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
-REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # rows: least and largest x and y, relative to the board's centre
 OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
+UNSTORED = ("names", "area")  # fields of `Tables` that follow from the card
 CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
 
@@ -246,7 +245,7 @@ class PressCalibration:
             estimate = CalibratedModel(self.skin, self.layers, ()).estimate(self.data.area_uT, [MAP_POWER])[0]
             pairs = zip(self.skin.tables.names, self.skin.tables.spreads, strict=True)
             sd_mm = math.hypot(*(float(sd) for name, sd in pairs if name in OFFSETS_ALONG_X))
-            return shift_onto_area(estimate, sd_mm)
+            return shift_onto_area(estimate, sd_mm, self.skin.tables.area)
         return -self.even_mm.mean(axis=0) if len(self.even_mm) else np.zeros(2)
 
     @cached_property
@@ -324,7 +323,7 @@ def network_offsets_mm(
 
 @dataclass
 class Universal:
-    """The universal model that comes with the project, for the paper's board; it can be calibrated during use.
+    """The universal model for the board of one layout; it can be calibrated during use.
 
     First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
     presses at known places, in any order and any number of times. Each of these three methods changes the model in
@@ -335,11 +334,15 @@ class Universal:
     tables : the map's prior
     networks : weights of the networks
     powers : likelihood powers by numbers of presses and labels
+    layout : the board and the skin that the model was made for
+    card : how the model was trained, and what it must not be used for
     """
 
     tables: Tables
     networks: Sequence[Weights]
     powers: LikelihoodPowers
+    layout: BoardLayout = field(default_factory=paper_layout)
+    card: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Start without any calibration data."""
@@ -352,21 +355,22 @@ class Universal:
         self._folds: list[HeldOutLabels] | None  # of the labels; None: not computed yet
         self._power: float | None
         self._line: ForceLine | None
-        self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
+        self._restart(self._prior_map, CalibrationData.at_rest(self.tables.rest_uT))
 
     def __repr__(self) -> str:
         noload = "no no-load reading" if self._noload_uT is None else "no-load reading taken"
         noload += ", skin turned by a quarter" if self._data.turned else ""
         presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
+        board = f"board {self.layout.name}, {len(self.layout.chips)} chips"
         return (
-            f"Universal(five chips of the paper's board, trained on simulated skins, {noload}, "
+            f"Universal({board}, trained on simulated skins, {noload}, "
             f"{presses_n} presses at unknown places, {labels_n} labelled)"
         )
 
     @property
-    def card(self) -> dict[str, Any]:
-        """The model's JSON card: how it was trained, and what it must not be used for."""
-        return io.read_json(FILE.with_suffix(".json"))
+    def channels_n(self) -> int:
+        """Number of values of a reading: three per chip."""
+        return self.layout.channels_n
 
     @property
     def skin(self) -> SkinMap:
@@ -384,6 +388,11 @@ class Universal:
     def zeroed(self) -> bool:
         """Whether `zero` has been called (or a calibration loaded)."""
         return self._noload_uT is not None
+
+    @property
+    def turnable(self) -> bool:
+        """Whether a quarter turn of the skin reverses the sign of its fields, as with a checkerboard of poles."""
+        return self.layout.skin.polarity == "checkerboard"
 
     @property
     def mounting(self) -> Mounting:
@@ -405,7 +414,7 @@ class Universal:
     @property
     def warnings(self) -> list[str]:
         """Sentences for the user if the orientation of the skin or of the labels' axes is uncertain or wrong."""
-        findings = [self.mounting, self.label_frame]
+        findings = [self.mounting if self.turnable else None, self.label_frame]
         return [warning for finding in findings if finding is not None and (warning := finding.warning())]
 
     @property
@@ -455,7 +464,7 @@ class Universal:
         SchemaError : there is no reading, or a reading is not finite, out of range or from another board; or `keep` is
             set, and `turned` contradicts the earlier calibration
         """
-        noload_uT = check_readings(b_uT)
+        noload_uT = check_readings(b_uT, self.channels_n)
         if not len(noload_uT):
             raise SchemaError("zero: there are no readings without contact. Read the board before a contact.")
         kept = keep and self.zeroed
@@ -464,10 +473,13 @@ class Universal:
                 "zero: the presses to keep are from a skin in the other orientation. Call it without keep."
             )
         noload_uT = noload_uT.mean(axis=0)
-        rest_uT = to_board(noload_uT[None])[0]
-        turned = self._data.turned if kept else find_mounting(self.tables, rest_uT, turned=turned).turned
+        rest_uT = self.layout.to_board(noload_uT[None])[0]
+        if kept:
+            turned = self._data.turned
+        elif turned is None:
+            turned = self.turnable and find_mounting(self.tables, rest_uT).turned
         self._noload_uT, rest_uT = noload_uT, -rest_uT if turned else rest_uT
-        data = replace(self._data, rest_uT=rest_uT) if kept else CalibrationData(rest_uT, turned=turned)
+        data = replace(self._data if kept else CalibrationData.at_rest(rest_uT), rest_uT=rest_uT, turned=turned)
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
@@ -476,20 +488,20 @@ class Universal:
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
         expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
         presses together are evenly spread over the skin (for example a grid with one press per place), so that their
-        mean place is the skin's centre. Set `area` if they all are at random places all over the area of the paper's
-        grid, an octagon 16 mm wide: places are then moved onto this area.
+        mean place is the skin's centre. Set `area` if they all are at random places all over the layout's area of
+        presses (paper's board: an octagon 16 mm wide): places are then moved onto this area.
         """
         if even and area:
             raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
-        db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
+        db_uT, data = check_presses(self._change(check_readings(b_uT, self.channels_n))), self._data
         if not len(db_uT):
             return self
-        presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
+        presses_uT, none = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:], no_presses(self.channels_n)
         if even or area:
-            even_uT, area_uT = (presses_uT, no_presses()) if even else (no_presses(), presses_uT)
+            even_uT, area_uT = (presses_uT, none) if even else (none, presses_uT)
             data = replace(data, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT)
             return self._restart(self._noload_map, data)
-        data = replace(data, area_uT=no_presses())
+        data = replace(data, area_uT=none)
         rounds_n = 1 if len(data.presses_uT) else ROUNDS_N
         press_map = condition_on_presses(self._calibration.skin, db_uT, rounds_n)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
@@ -514,19 +526,24 @@ class Universal:
             not above 0 N, or outside the model's range by a factor of 2; there are too many labels. The model is then
             unchanged.
         """
-        readings_uT = check_readings(b_uT)
+        readings_uT = check_readings(b_uT, self.channels_n)
         known = force_N is not None
         if force_N is None:
             force_N = np.clip(self.estimate(readings_uT).force_N, *self.tables.force_N[[0, -1]])
         places_mm, forces_N = check_labels(
-            np.asarray(place_mm, float), np.asarray(force_N, float), len(readings_uT), CENTRE_MM + REACH_MM
+            np.asarray(place_mm, float),
+            np.asarray(force_N, float),
+            len(readings_uT),
+            self._centre_mm + self.layout.reach_mm,
         )
         check_range(forces_N, self.tables.force_N)
         db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
-        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT, np.full(len(forces_N), known))
+        labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
-            check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # all labels together may be too many
+            check_labels(
+                labels.place_mm, labels.force_N, len(labels), self.layout.reach_mm
+            )  # all labels together may be too many
         data, press_map = replace(self._data, labels=labels), self._calibration.skin
         if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
             press_map = condition_on_unlabelled(self._noload_map, data)
@@ -543,7 +560,7 @@ class Universal:
             raise SchemaError("next_place", "the force", "finite and above 0 N", force_N, "Try: 2.0")
         place_mm = self.skin.hypotheses.place_mm[::CHOICE_EVERY_N]
         gain = expected_gain(self.skin, place_mm, np.full(len(place_mm), force_N))
-        return place_mm[gain.argmax()] + CENTRE_MM
+        return place_mm[gain.argmax()] + self._centre_mm
 
     def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
         """Predict x_mm, y_mm and the normal force in N for readings in contact."""
@@ -560,7 +577,7 @@ class Universal:
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
         """Return the result of `estimate` for each likelihood power; only the places' standard deviations differ."""
         estimates = replace(self._model, line=self.line).estimate(self._change(b_uT), powers)
-        return [replace(estimate, place_mm=estimate.place_mm + CENTRE_MM) for estimate in estimates]
+        return [replace(estimate, place_mm=estimate.place_mm + self._centre_mm) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
         """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
@@ -578,17 +595,21 @@ class Universal:
         """Write this skin's calibration data to a file for `load_universal(file)`; raise SchemaError before `zero`."""
         if self._noload_uT is None:
             raise SchemaError("save: the model has no no-load reading. First call zero.")
-        write_calibration(self._data, Path(file))
+        write_calibration(self._data, Path(file), self.layout.name)
 
     def remember(self, file: Path | str) -> "Universal":
         """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`."""
-        data = read_calibration(Path(file), REACH_MM)
-        self._noload_uT = (-1 if data.turned else 1) * to_chips(data.rest_uT[None])[0]
+        data = read_calibration(Path(file), self.layout.reach_mm, self.channels_n, self.layout.name)
+        self._noload_uT = (-1 if data.turned else 1) * self.layout.to_chips(data.rest_uT[None])[0]
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
         """Predict x_mm, y_mm and force_N from field changes, with the interface of a trained network."""
-        return self.predict(check_shape(db_uT) + self.noload_uT).astype(np.float32)
+        return self.predict(check_shape(db_uT, self.channels_n) + self.noload_uT).astype(np.float32)
+
+    @property
+    def _centre_mm(self) -> Float[np.ndarray, "2"]:
+        return np.array(self.layout.centre_mm)
 
     @property
     def _data(self) -> CalibrationData:
@@ -596,7 +617,7 @@ class Universal:
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return field changes along the board's axes; raise SchemaError before `zero`."""
-        return self._sign * to_board(check_shape(b_uT) - self.noload_uT)
+        return self._sign * self.layout.to_board(check_shape(b_uT, self.channels_n) - self.noload_uT)
 
     @property
     def _sign(self) -> int:
@@ -619,33 +640,60 @@ class Universal:
         return self
 
 
-def load_universal(calibration: Path | str | None = None, *, file: Path = FILE) -> Universal:
-    """Load the model that comes with the project, calibrated to a skin if `calibration` is a file from `save`."""
-    model = Universal(*_read_parts(file))
+def load_universal(calibration: Path | str | None = None, *, file: Path | str = FILE) -> Universal:
+    """Load a universal model, calibrated to a skin if `calibration` is a file from `save`.
+
+    file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
+    """
+    model = Universal(*_read_parts(Path(file)))
     return model if calibration is None else model.remember(calibration)
 
 
+def is_model(file: Path) -> bool:
+    """Return whether a file is a universal model, which its card tells; False if there is no card."""
+    card_file = file.with_suffix(".json")
+    if file.suffix != FILE.suffix or not card_file.is_file():
+        return False
+    return _format_of(io.read_json(card_file)).startswith(FORMAT.rpartition("-")[0])
+
+
+def _format_of(card: Any) -> str:
+    return str(card.get("format")) if isinstance(card, dict) else "none"
+
+
 @lru_cache(maxsize=2)
-def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers]:
+def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers, BoardLayout, Mapping[str, Any]]:
     card_file = file.with_suffix(".json")
     card = io.read_json(card_file)
-    form = card.get("format") if isinstance(card, dict) else None
+    form = _format_of(card)
     if form != FORMAT:
-        remedy = "Use the files of this version, or regenerate them: python -m pipeline.training.shipping"
+        remedy = "Use the files of this version, or make the model again: reskin model make"
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file, digest_needed=True)
-    map_arrays = {field.name: parts.pop(field.name).astype(float) for field in fields(Tables) if field.name != "names"}
-    tables = Tables(names=tuple(card["spreads"]), **map_arrays)
-    return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"])
+    map_arrays = {
+        field.name: parts.pop(field.name).astype(float) for field in fields(Tables) if field.name not in UNSTORED
+    }
+    layout = as_layout(card["layout"], f"{card_file}: layout")
+    tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.setup().area)
+    if len(tables.rest_uT) != layout.channels_n:
+        chips_n, remedy = len(tables.rest_uT) // 3, "Use the card that was written with the model."
+        raise SchemaError(card_file, "layout", f"of {chips_n} chips", f"{len(layout.chips)} chips", remedy)
+    return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"]), layout, card
 
 
 def write(
-    tables: Tables, networks: Sequence[Weights], powers: LikelihoodPowers, about: Mapping[str, Any], file: Path = FILE
+    tables: Tables,
+    networks: Sequence[Weights],
+    powers: LikelihoodPowers,
+    layout: BoardLayout,
+    about: Mapping[str, Any],
+    file: Path = FILE,
 ) -> None:
-    """Write the map's prior (in single precision), the networks, and the card (`about`, powers and spreads)."""
-    names = [field.name for field in fields(tables) if field.name != "names"]
+    """Write the map's prior (in single precision), the networks, and the card (`about`, layout, powers, spreads)."""
+    names = [field.name for field in fields(tables) if field.name not in UNSTORED]
     map_arrays = {name: getattr(tables, name).astype(np.float32) for name in names}
     io.write_tensors(file, map_arrays | network.to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
-    card = {"format": FORMAT, **about, "sureness": powers.to_card(), "spreads": spreads}
+    own = layout.model_dump(mode="json")
+    card = {"format": FORMAT, **about, "layout": own, "sureness": powers.to_card(), "spreads": spreads}
     io.write_json(file.with_suffix(".json"), card)

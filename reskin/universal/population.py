@@ -12,20 +12,18 @@ from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
 from reskin.physics.deformation import RestingDipoles
-from reskin.physics.magnet import Quadrature
-from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT
+from reskin.universal.law import HALF_MM, PAPER_AREA, Area, Law, Setup, at_rest_uT, inside, simulate_uT
 from reskin.universal.map import LOGARITHMIC, perturb
 
-COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # coarser than `law.RULE`; the law itself has larger errors
 PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most this number of presses
 PRESSES_N = 2 * PLACES_N  # presses per skin: half for conditioning, half for training
 PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press from its grid place
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
 # Variation of boards and skins in addition to that of the law's parameters. These values and the parameters' spreads
-# are assumed.
-THICKNESSES_MM = {1.8: 0.07, 1.9: 0.24, 2.0: 0.38, 2.1: 0.24, 2.2: 0.07}  # mm: probability
-TIPS_MM = {1.75: 0.25, 2.0: 0.5, 2.5: 0.25}  # radius, mm: probability
+# are assumed. Thickness and tip radius are relative to those of the setup.
+THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: probability
+TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: probability
 # In fits to the boards of scene lab, a larger gap comes with a larger amplitude, because their effects compensate.
 LOG_AMPLITUDE_PER_MM = 0.95
 # Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
@@ -82,21 +80,20 @@ def draw_population(
 
     `skins` is the number of skins, or a slice that selects some skins of a longer sequence.
     """
+    own_mm = setup.design.thickness_mm
     setups = {
-        (thickness_mm, tip_mm): replace(
-            setup, design=setup.design.model_copy(update={"thickness_mm": thickness_mm}), tip_radius_mm=tip_mm,
-            rule=COARSE,
+        (thickness, tip): replace(
+            setup, design=setup.design.model_copy(update={"thickness_mm": thickness * own_mm}),
+            tip_radius_mm=tip * setup.tip_radius_mm, rule=setup.coarse_rule,
         )
-        for thickness_mm in THICKNESSES_MM
-        for tip_mm in TIPS_MM
+        for thickness in THICKNESSES
+        for tip in TIPS
     }  # fmt: skip
     parts, selected = [], skins if isinstance(skins, slice) else slice(skins)
     for skin_rng in rng.spawn(selected.stop)[selected]:  # one per skin: the first skins do not depend on the number
         law = draw_law(centre, spreads, skin_rng)
-        thickness_mm, tip_mm = (
-            float(skin_rng.choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES_MM, TIPS_MM)
-        )
-        parts.append(draw_skin(law, setups[thickness_mm, tip_mm], skin_rng, forces))
+        thickness, tip = (float(skin_rng.choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES, TIPS))
+        parts.append(draw_skin(law, setups[thickness, tip], skin_rng, forces))
     return Population(*(np.array(part, np.float32) for part in zip(*parts, strict=True)))
 
 
@@ -114,7 +111,7 @@ def draw_skin(
     law: Law, setup: Setup, rng: np.random.Generator, forces: Forces = DEFAULT_FORCES
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Simulate one skin on imperfect chips: field changes, no-load field, places and forces."""
-    place_mm = draw_places(rng)
+    place_mm = draw_places(rng, setup.area)
     force_N = forces.draw(PRESSES_N, rng)
     if forces.weight_N is not None:
         place_mm, force_N = np.vstack([place_mm, np.zeros(2)]), np.append(force_N, forces.weight_N)
@@ -127,26 +124,29 @@ def draw_skin(
     return db_uT.reshape(len(place_mm), -1), rest_uT.ravel(), place_mm, force_N
 
 
-def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
+def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.ndarray, "m 2"]:
     """Draw places of presses in mm from the board's centre.
 
-    The order is: all places of the grid, half of them again, and places anywhere on the skin.
+    The order is: all places of the grid, half of them again, and places anywhere in the area.
     """
-    grid_mm = grid()
+    grid_mm = grid(area)
     anywhere_n = int(PLACES_N * ANYWHERE_SHARE)
     repeated_mm = grid_mm[rng.permutation(PLACES_N)[anywhere_n:]]
     near_mm = np.concatenate([grid_mm, repeated_mm])
     near_mm = near_mm + JITTER_MM * rng.standard_normal(near_mm.shape)
-    limit_mm = np.abs(grid_mm).max() + 0.3
-    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # about 85 % of these are on the skin
-    return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm)][:anywhere_n]])
+    limit_mm = np.abs(grid_mm).max(axis=0) + 0.3
+    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # 85 % or more of these are in the area
+    return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm, area)][:anywhere_n]])
 
 
-def grid() -> Float[np.ndarray, "65 2"]:
-    """Return the places of the paper's grid in mm from its centre: 9 x 9 places without four in each corner."""
+def grid(area: Area = PAPER_AREA) -> Float[np.ndarray, "65 2"]:
+    """Return the places of the paper's grid, scaled to an area, in mm from its centre.
+
+    The grid has 9 x 9 places without four in each corner.
+    """
     step = np.arange(-4, 5)
     steps = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
-    return PITCH_MM * steps[np.abs(steps).min(axis=1) <= 2].astype(float)
+    return area.half_mm / HALF_MM * PITCH_MM * steps[np.abs(steps).min(axis=1) <= 2].astype(float)
 
 
 def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:

@@ -79,7 +79,7 @@ def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b
 def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
     """Simulate skins of a prior, train networks on them one after the other, and return the networks' weights."""
     rng = rng_for(seed, "universal", prior.name, "skins")
-    skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng)
+    skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng, prior.forces)
     names = ("universal", prior.name, "network")
     return [train(skins, prior, settings.steps_n, rng_for(seed, *names, i)) for i in range(settings.seeds_n)]
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from reskin.config import parse
 from reskin.data.grid import CENTRE_MM, SKIN_MM
-from reskin.live.session import GUIDED_MM
+from reskin.live.session import GuidedPresses
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
@@ -57,7 +57,7 @@ def test_errors_by_choice_of_labelled_places():
 
 def strategies(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
     """Return functions that choose the next press to label; `fixed` labels the places that `reskin live` shows."""
-    live_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
+    live_mm = np.array(sorted(GuidedPresses().place_mm.tolist(), key=lambda place: place[::-1])) - CENTRE_MM
     fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(live_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()
 

@@ -29,7 +29,7 @@ from reskin.universal.training import train_networks
 from tests.benchmarks import FULL, size
 
 ROOT = Path(__file__).resolve().parents[2]
-SIDE_MM = map.PITCH_MM * map.STEPS_N
+SIDE_MM = map.PITCH_MM * len(map.lattice_mm())
 PITCHES_MM, FORCES_N = size((1.6, 0.8, 0.6), (3.2,)), size((4, 9, 17), (3,))
 SKINS_N, STEPS_N = size((125, 500, 2000), (8,)), size((300, 1200), (5,))
 TESTED_N, SEED = size(24, 2), 2021
@@ -84,8 +84,8 @@ def test_error_against_time_of_map_and_network(monkeypatch):
 
 def make_lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
     """Tabulate the fields on a lattice of this pitch and number of forces; return the tables and the seconds taken."""
-    monkeypatch.setattr(map, "PITCH_MM", pitch_mm)
-    monkeypatch.setattr(map, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
+    steps_n = 2 * round(SIDE_MM / pitch_mm / 2)
+    monkeypatch.setattr(map, "lattice_mm", lambda _: pitch_mm * (np.arange(steps_n) - (steps_n - 1) / 2))
     forces_N = np.geomspace(map.FORCES_N[0], map.FORCES_N[-1], forces_n)
     start_s = time.process_time()
     return tabulate(NOMINAL, NOMINAL_SPREADS, setup, forces_N), time.process_time() - start_s

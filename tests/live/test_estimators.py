@@ -182,7 +182,7 @@ def test_short_contact_is_not_a_press():
 def test_universal_model_is_refused_for_other_chips():
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
-    assert "no place or force: the universal model is for five chips. Use a model for this board." in skin.alarms()
+    assert "no place or force: the universal model is for 5 chips. Use a model for this board." in skin.alarms()
     assert all(np.isnan(batch.target).all() for batch in readings)
 
 

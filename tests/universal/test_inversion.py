@@ -8,9 +8,8 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal import inversion
 from reskin.universal.inversion import LEAST, PARAMETERS, STEP_MM, _JointFit, chart, fit_unlabelled, search
-from reskin.universal.law import at_rest_uT, simulate_uT
+from reskin.universal.law import COARSE, at_rest_uT, simulate_uT
 from reskin.universal.map import NOMINAL, lattice_mm
-from reskin.universal.population import COARSE
 from tests.universal.skins import SETUP
 
 COARSE_SETUP = replace(SETUP, rule=COARSE)

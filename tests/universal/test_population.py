@@ -7,6 +7,7 @@ import pytest
 
 from reskin.seeds import rng_for
 from reskin.universal import population
+from reskin.universal.law import COARSE as COARSE_RULE
 from reskin.universal.law import at_rest_uT, inside, simulate_uT
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import (
@@ -22,13 +23,13 @@ from reskin.universal.population import (
 )
 from tests.universal.skins import SETUP
 
-COARSE = replace(SETUP, rule=population.COARSE)
+COARSE = replace(SETUP, rule=COARSE_RULE)
 
 
 def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     # a single thickness, because tables for each thickness and tip take seconds
-    monkeypatch.setattr(population, "THICKNESSES_MM", {2.0: 1.0})
-    monkeypatch.setattr(population, "TIPS_MM", {2.0: 1.0})
+    monkeypatch.setattr(population, "THICKNESSES", {1.0: 1.0})
+    monkeypatch.setattr(population, "TIPS", {1.0: 1.0})
     one, two = (draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
     for field in fields(one):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name)[:1])

@@ -132,7 +132,7 @@ def test_repr_of_models_is_one_line(skin):
     skin.zero(to_chips(skin.tables.rest_uT[None]))
     skin.label(PLACES_MM, np.ones(4), pokes(skin) + skin.noload_uT).see(pokes(skin)[:2] + skin.noload_uT)
     assert repr(skin) == (
-        "Universal(five chips of the paper's board, trained on simulated skins, no-load reading taken, "
+        "Universal(board reskin, 5 chips, trained on simulated skins, no-load reading taken, "
         "2 presses at unknown places, 4 labelled)"
     )
     prior = PriorModel(skin.skin, skin.networks)

@@ -12,7 +12,7 @@ from tests.universal.skins import SETUP
 
 
 def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
-    monkeypatch.setattr(map, "lattice_mm", lambda: np.array([-4.0, 1.0]))
+    monkeypatch.setattr(map, "lattice_mm", lambda _: np.array([-4.0, 1.0]))
     found = tabulate(NOMINAL, {"amplitude": 0.2, "label_x_mm": 0.5}, SETUP)
     at_mm = np.array([[-4.0, 1.0]])
     for i, force_N in enumerate(found.force_N):

@@ -1,0 +1,202 @@
+"""The layout of a board for which the universal model is made: chips, skin, tip and area of presses.
+
+A user writes a layout as a YAML file like those in the folder `layouts`, which explain each key.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field, model_validator
+
+from reskin.config import Strict, parse, read_yaml
+from reskin.errors import ParamsError, did_you_mean
+from reskin.physics import slide
+from reskin.physics.board import CHIPS_MAX_N
+from reskin.physics.magnet import Polarity, Quadrature
+from reskin.physics.skin import SkinDesign
+from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
+from reskin.simulation.defaults import nominal
+from reskin.universal.law import COARSE, RULE, Area, Law, Setup, to_board, to_chips, with_parameters
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
+from reskin.universal.population import THICKNESSES, TIPS, Forces
+
+FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
+FORCES_N = 9  # number of tabulated forces
+SIDE_MM = 20.0  # side of the paper's skin; the cells of larger skins are larger by the same factor
+
+Coordinate = Annotated[float, Field(ge=-200, le=200)]
+Length = Annotated[float, Field(gt=0, le=200)]
+
+
+class ChipPlace(Strict):
+    """Position of a chip relative to the board's centre, and the rotation of its axes about z.
+
+    The rotation is counterclockwise, seen from above the skin: with 90, the chip's x axis is along the board's y axis.
+    """
+
+    x_mm: Coordinate
+    y_mm: Coordinate
+    turn_deg: Literal[0, 90, 180, 270]
+
+
+class SkinStack(Strict):
+    """The nominal skin. The model is also trained on skins that differ from it."""
+
+    size_mm: tuple[Length, Length]
+    thickness_mm: Annotated[float, Field(gt=0, le=20)]
+    polarity: Polarity
+    flipped: bool  # the polarity of all magnets is reversed
+    magnetisation: Annotated[float, Field(gt=0, le=100)]  # relative to the filler in nominal.yaml: saturation 0.123 T
+    modulus_MPa: Annotated[float, Field(gt=0, le=100)]
+
+
+class PressArea(Strict):
+    """The places that may be pressed: a rectangle around the board's centre, without its corners if `octagon`."""
+
+    half_x_mm: Length
+    half_y_mm: Length
+    octagon: bool
+
+
+class BoardLayout(Strict):
+    """Everything that the universal model must know about a board and its skin before it is trained."""
+
+    name: Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    chips: Annotated[tuple[ChipPlace, ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
+    centre_mm: tuple[Coordinate, Coordinate]  # the board's centre in the coordinates of labels and estimates
+    gap_mm: Annotated[float, Field(ge=0.8, le=20)]  # from the chips' sensing plane to the skin
+    skin: SkinStack
+    tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
+    area: PressArea
+    force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]  # least, largest
+    # Standard deviations of parameters of the law that replace those in `map.NOMINAL_SPREADS`.
+    spreads: dict[str, Annotated[float, Field(gt=0, le=100)]]
+
+    @model_validator(mode="after")
+    def _check(self) -> "BoardLayout":
+        places = [(chip.x_mm, chip.y_mm) for chip in self.chips]
+        for i, place in enumerate(places):
+            if place in places[:i]:
+                raise ValueError(f"chips {places.index(place)} and {i} are at the same place {place} mm")
+        for axis, half_mm, side_mm in zip("xy", self.half_mm, self.skin.size_mm, strict=True):
+            if 2 * half_mm > side_mm:
+                raise ValueError(f"area.half_{axis}_mm is {half_mm:g}, but half the skin's size is {side_mm / 2:g}")
+        deepest_mm = slide.DEEPEST * max(THICKNESSES) * self.skin.thickness_mm
+        least_mm = deepest_mm / min(TIPS)
+        if self.tip_radius_mm <= least_mm:
+            problem = f"tip_radius_mm is {self.tip_radius_mm:g}, but must be above {least_mm:.3g}"
+            raise ValueError(
+                f"{problem} for a skin of {self.skin.thickness_mm:g} mm: use a larger tip or a thinner skin"
+            )
+        if not 2 * self.force_N[0] <= self.force_N[1]:
+            raise ValueError(f"force_N is {list(self.force_N)}; the largest must be at least twice the least")
+        for name in self.spreads:
+            if name not in NOMINAL_SPREADS:
+                known = ", ".join(NOMINAL_SPREADS)
+                guess = did_you_mean(name, NOMINAL_SPREADS)
+                raise ValueError(f"spreads: {name} is not a parameter of the law ({known}).{guess}")
+        return self
+
+    @property
+    def channels_n(self) -> int:
+        """Number of values of a reading: three per chip."""
+        return 3 * len(self.chips)
+
+    @property
+    def half_mm(self) -> tuple[float, float]:
+        """Largest |x| and |y| of presses, relative to the board's centre."""
+        return self.area.half_x_mm, self.area.half_y_mm
+
+    @property
+    def chips_mm(self) -> Float[np.ndarray, "k 2"]:
+        """Positions of the chips relative to the board's centre."""
+        return np.array([(chip.x_mm, chip.y_mm) for chip in self.chips])
+
+    @property
+    def turns_deg(self) -> tuple[float, ...]:
+        """Rotations of the chips about z."""
+        return tuple(float(chip.turn_deg) for chip in self.chips)
+
+    @property
+    def reach_mm(self) -> Float[np.ndarray, "2 2"]:
+        """Edges of the skin relative to the board's centre; rows: least and largest x and y."""
+        return np.array([[-0.5], [0.5]]) * self.skin.size_mm
+
+    @property
+    def tabulated_N(self) -> Float[np.ndarray, " q"]:
+        """Forces at which the map tabulates fields."""
+        least, largest = np.log(self.force_N)
+        return np.exp(np.linspace(least, largest, FORCES_N))
+
+    @property
+    def forces(self) -> Forces:
+        """Distribution of forces in training; a fifth of the presses is lighter than ten times the least force."""
+        least_N, largest_N = self.force_N
+        between_N = min(10 * least_N, (least_N * largest_N) ** 0.5)
+        return Forces(between_N, largest_N / 0.95, light_N=least_N, light_share=0.2)
+
+    @property
+    def law(self) -> Law:
+        """The central law: the nominal one, with this layout's gap, magnetisation and modulus."""
+        own = {"gap_mm": self.gap_mm, "amplitude": self.skin.magnetisation, "modulus_MPa": self.skin.modulus_MPa}
+        return with_parameters(NOMINAL, tuple(own), np.array(list(own.values())))
+
+    @property
+    def all_spreads(self) -> dict[str, float]:
+        """Standard deviations of the law's parameters."""
+        return NOMINAL_SPREADS | self.spreads
+
+    def setup(self) -> Setup:
+        """Return the nominal skin on this board, for simulations."""
+        skin = self.skin.model_dump(include={"thickness_mm", "polarity", "flipped"})
+        changes = skin | {"tip_radius_mm": self.tip_radius_mm}
+        design = parse(SkinDesign, nominal("skin", changes), f"{NOMINAL_FILE}: skin")
+        factor = max(1.0, max(self.skin.size_mm) / SIDE_MM)
+        rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
+        area = Area(*self.half_mm, self.area.octagon)
+        return Setup(
+            design, self.chips_mm, self.gap_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse,
+            area,
+        )  # fmt: skip
+
+    def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+        """Rotate readings from the chips' axes to the board's axes."""
+        return to_board(b_uT, self.turns_deg)
+
+    def to_chips(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
+        """Rotate readings from the board's axes to the chips' axes."""
+        return to_chips(b_uT, self.turns_deg)
+
+
+def read_layout(file: Path | str) -> BoardLayout:
+    """Read a layout from a YAML file, or one that comes with the project, by name: reskin, anyskin or eflesh.
+
+    Raises
+    ------
+    ParamsError : the file is missing or is not YAML, or a key is missing, unknown or wrong
+    """
+    path = Path(file)
+    if path.suffix not in (".yaml", ".yml"):
+        known = sorted(own.stem for own in FOLDER.glob("*.yaml"))
+        if str(file) not in known:
+            guess = did_you_mean(file, known)
+            raise ParamsError(
+                f"{file}: not a YAML file, and not a layout of the project ({', '.join(known)}).{guess} Write a layout "
+                f"file: copy {FOLDER / 'reskin.yaml'} and edit it."
+            )
+        path = FOLDER / f"{file}.yaml"
+    return as_layout(read_yaml(path), str(path))
+
+
+def as_layout(value: Any, where: str) -> BoardLayout:
+    """Create a layout from plain values; raise ParamsError that starts with `where`."""
+    return parse(BoardLayout, value, where)
+
+
+@lru_cache(maxsize=1)
+def paper_layout() -> BoardLayout:
+    """Return the layout of the paper's board."""
+    return read_layout("reskin")

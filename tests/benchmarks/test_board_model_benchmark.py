@@ -1,0 +1,261 @@
+"""Accuracy of a model made for a layout: on simulated skins of the layout, and on recorded eFlesh pads.
+
+Run it with the folders of the recordings, which are not part of the project (docs/learning.md, "Models for other
+boards"); six minutes:
+
+    RESKIN_BENCHMARKS=full RESKIN_EFLESH=DATASETS RESKIN_EFLASH7=FOLDER \
+        pytest -s tests/benchmarks/test_board_model_benchmark.py
+
+Labels are drawn from presses that come before all tested presses. The published errors of eFlesh, 0.5 mm and 0.27 N,
+are those of networks that were trained on most of a recording.
+"""
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from jaxtyping import Float, Int64
+from scipy.spatial.transform import Rotation
+
+from pipeline.training.shipping import make_model, read_inputs
+from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins
+from reskin.config import parse
+from reskin.models.classical import RbfRidge, fit
+from reskin.models.inputs import VIEW
+from reskin.recordings.readers import READERS
+from reskin.schema import Readings
+from reskin.seeds import rng_for
+from reskin.universal.law import simulate_uT
+from reskin.universal.layout import read_layout
+from reskin.universal.model import Universal, load_universal
+from reskin.universal.network import FULL_SET_N
+from reskin.universal.presses import cosines, magnitudes_uT
+from tests.benchmarks import FULL, size
+from tests.recordings.headers import DEFAULT_POLICY, PARAMS, make_header
+
+ROOT = Path(__file__).resolve().parents[2]
+LABELS_N, SEEDS_N, SKINS_N = size((0, 10, 40), (0, 10)), size(5, 1), size(12, 1)
+CLASSICAL = parse(RbfRidge, PARAMS["methods"]["few-labels"]["rbf-shape"], "params.yaml")  # not tuned on any pad
+FORCE_MIN_N = 0.3  # least force of the layout; weaker readings are not used
+PITCH_MM = 8.0  # assumed distance between the nine places of `eflash7`, which the recordings do not state
+
+
+@dataclass(frozen=True)
+class Presses:
+    """Presses with places in the coordinates of the layout; unknown forces are NaN."""
+
+    db_uT: Float[np.ndarray, "n ch"]
+    place_mm: Float[np.ndarray, "n 2"]
+    force_N: Float[np.ndarray, " n"]
+    noload_uT: Float[np.ndarray, " ch"]
+
+    def __getitem__(self, which: Int64[np.ndarray, " k"]) -> "Presses":
+        return Presses(self.db_uT[which], self.place_mm[which], self.force_N[which], self.noload_uT)
+
+
+def by_model(model: Universal, pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
+    """Calibrate a model to 65 unlabelled presses of a pool, and to labels of the first of them."""
+    noload_uT = pool.noload_uT
+    model.zero(noload_uT).see(noload_uT + pool.db_uT[:FULL_SET_N])
+    if labels_n:
+        labels = pool[np.arange(labels_n)]
+        known = np.isfinite(labels.force_N).all()
+        model.label(labels.place_mm, labels.force_N if known else None, noload_uT + labels.db_uT)
+    return model.predict(noload_uT + tested.db_uT)
+
+
+def by_ridge(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
+    """Fit RBF kernel ridge to the first labels of a pool."""
+    target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].astype(np.float32)
+    train, test = (VIEW[CLASSICAL.inputs](presses.db_uT.astype(np.float32)) for presses in (pool, tested))
+    return fit(CLASSICAL, train[:labels_n], target, rng_for(0, "ridge"), weight=None).predict(test)
+
+
+def by_mean(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
+    """Predict the mean of the labels for all presses: what an estimate must be better than."""
+    target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].mean(axis=0)
+    return np.tile(target, (len(tested.db_uT), 1))
+
+
+class Score(NamedTuple):
+    """Errors of places or of forces (mm or N), and the percentage of places within 1 mm along both axes."""
+
+    within: float
+    median: float
+    rms: float
+
+
+def score_places(predicted: Float[np.ndarray, "m 3"], tested: Presses) -> Score:
+    off_mm = predicted[:, :2] - tested.place_mm
+    distance_mm = np.linalg.norm(off_mm, axis=1)
+    within = 100 * float((np.abs(off_mm) <= 1).all(axis=1).mean())
+    return Score(within, float(np.median(distance_mm)), float(np.sqrt((distance_mm**2).mean())))
+
+
+def score_forces(predicted: Float[np.ndarray, "m 3"], tested: Presses) -> Score:
+    off_N = predicted[:, 2] - tested.force_N
+    return Score(np.nan, float(np.median(np.abs(off_N))), float(np.sqrt((off_N**2).mean())))
+
+
+def say(name: str, scores: Sequence[Score], unit: str) -> None:
+    """Print the mean of scores as a row of a table."""
+    within, median, rms = np.mean(scores, axis=0)
+    places = f"{within:.1f} % within 1 mm, " if unit == "mm" else ""
+    print(f"{name} | {places}median {median:.2f} {unit}, rms {rms:.2f} {unit}")
+    assert np.isfinite([median, rms]).all()
+
+
+def compare(name: str, model: Universal, pool: Presses, tested: Presses, unit: str) -> None:
+    """Print the scores of all methods for each number of labels, as means over draws of the labels."""
+    score, misfits = (score_places if unit == "mm" else score_forces), []
+    for labels_n in (*LABELS_N, len(pool.force_N)):
+        rows: dict[str, list[Score]] = {}
+        for seed in range(SEEDS_N):
+            drawn = pool[rng_for(seed, name).permutation(len(pool.force_N))]
+            if labels_n <= max(LABELS_N):
+                rows.setdefault("universal", []).append(score(by_model(model, drawn, tested, labels_n), tested))
+                misfits.append(model.misfit)
+            if labels_n:
+                rows.setdefault("kernel ridge", []).append(score(by_ridge(drawn, tested, labels_n), tested))
+                rows.setdefault("mean of the labels", []).append(score(by_mean(drawn, tested, labels_n), tested))
+        for method, scores in rows.items():
+            say(f"{name} | {labels_n} labels | {method}", scores, unit)
+    print(f"{name}: median misfit of the unlabelled presses {np.median(misfits):.2f}")
+
+
+def read(recording: Path, layout: str, options: dict[str, str]) -> tuple[Readings, dict[str, int]]:
+    """Read a recording with the project's reader."""
+    reader = READERS[layout]
+    files = reader.collect(recording)
+    header = make_header(layout=layout, chips_n=reader.count_chips(files), options=options)
+    with TemporaryDirectory() as folder:  # the reader needs the names that files have in a capture
+        for name, file in files.items():
+            shutil.copy(file, Path(folder) / name)
+        return reader.read(Path(folder), header, DEFAULT_POLICY)
+
+
+def presses_of(
+    readings: Readings, place_mm: np.ndarray, kept: np.ndarray, rest_uT: np.ndarray | None = None
+) -> Presses:
+    """Return the kept readings as presses; the no-load field is a mean over all readings, unless it is given."""
+    db_uT = (readings.b_uT - readings.noload_uT).astype(float)[kept]
+    noload_uT = readings.noload_uT.astype(float).mean(axis=0) if rest_uT is None else rest_uT
+    return Presses(db_uT, np.broadcast_to(place_mm, (len(kept), 2))[kept], readings.Fz_N.astype(float)[kept], noload_uT)
+
+
+@cache
+def model_for(name: str) -> Universal:
+    """Make the model for a layout of the project; at tiny size and for the paper's board, load the shipped model."""
+    if not FULL or name == "reskin":
+        return load_universal()
+    layout = read_layout(name)
+    return make_model(layout, read_inputs(layout=layout))
+
+
+@pytest.fixture
+def model() -> Universal:
+    """Return the model for the eFlesh pad."""
+    return model_for("eflesh")
+
+
+@pytest.mark.parametrize("name", ["reskin", "anyskin", "eflesh"])
+def test_simulated_skins_of_the_layout(name: str) -> None:
+    """Score the model on simulated skins of its layout, with errors of the law as in training."""
+    model = model_for(name)
+    inputs = read_inputs(layout=model.layout)
+    skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", LAW_ERRORS[AS_TRAINED])
+    centre_mm = np.array(model.layout.centre_mm)
+    places: dict[int, list[Score]] = {n: [] for n in LABELS_N}
+    forces: dict[int, list[Score]] = {n: [] for n in LABELS_N}
+    for i in range(len(skins)):
+        own = Presses(
+            model.layout.to_chips(skins.db_uT[i].astype(float)), skins.place_mm[i] + centre_mm,
+            np.maximum(skins.force_N[i].astype(float), model.tables.force_N[0]),
+            model.layout.to_chips(skins.rest_uT[i][None].astype(float))[0],
+        )  # fmt: skip
+        order = rng_for(i, "benchmark").permutation(len(own.force_N))
+        pool, tested = own[order[:FULL_SET_N]], own[order[FULL_SET_N:]]
+        for labels_n in LABELS_N:
+            found = by_model(model, pool, tested, labels_n)
+            places[labels_n].append(score_places(found, tested))
+            forces[labels_n].append(score_forces(found, tested))
+    for labels_n in LABELS_N:
+        say(f"simulated {model.layout.name}, places | {labels_n} labels", places[labels_n], "mm")
+        say(f"simulated {model.layout.name}, forces | {labels_n} labels", forces[labels_n], "N")
+        assert np.mean(places[labels_n], axis=0)[0] > 20  # by chance, less than 1 %
+
+
+def folder_of(variable: str) -> Path:
+    if not FULL or variable not in os.environ:
+        pytest.skip(f"{variable}, the folder of the recordings, is used only at full size")
+    return Path(os.environ[variable])
+
+
+def test_field_changes_of_the_first_pass() -> None:
+    """Print the cosine between simulated and recorded field changes, for the layout and for rotations of its board."""
+    (recording,) = (folder_of("RESKIN_EFLESH") / "spatial_resolution").iterdir()
+    readings, _ = read(recording, "eflesh", {})
+    layout, pressed = read_layout("eflesh"), readings.pass_i == 0
+    recorded_uT = (readings.b_uT - readings.noload_uT).astype(float)[pressed]
+    place_mm = np.column_stack([readings.x_mm, readings.y_mm])[pressed] - layout.centre_mm
+    for turn_deg in (0, 90, 180, 270):
+        # To rotate the board is to rotate the places backwards: the skin and its magnets are symmetric.
+        turned_mm = place_mm @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()[:2, :2]
+        db_uT = simulate_uT(layout.law, layout.setup(), turned_mm, np.full(len(place_mm), 3.0))
+        chips_uT = layout.to_chips(db_uT.reshape(len(db_uT), -1)).reshape(db_uT.shape)
+        cosine = cosines(chips_uT, recorded_uT.reshape(db_uT.shape))
+        size_uT = np.median(magnitudes_uT(db_uT)), np.median(np.linalg.norm(recorded_uT, axis=1))
+        print(
+            f"board turned by {turn_deg} degrees: mean cosine {cosine.mean():.2f}, median |dB| {np.round(size_uT)} uT"
+        )
+        assert abs(cosine.mean()) < 0.5  # the law does not describe the pad; otherwise docs/learning.md is out of date
+
+
+def test_places_on_a_recorded_pad(model: Universal) -> None:
+    """Draw labels from the first four passes over the pad; test the fifth pass."""
+    (recording,) = (folder_of("RESKIN_EFLESH") / "spatial_resolution").iterdir()
+    readings, _ = read(recording, "eflesh", {})
+    place_mm = np.column_stack([readings.x_mm, readings.y_mm]).astype(float)
+    first, last = readings.pass_i < 4, readings.pass_i == 4
+    pool, tested = (
+        presses_of(readings, place_mm, kept, readings.noload_uT[first].mean(axis=0)) for kept in (first, last)
+    )
+    compare("places, eflesh", model, pool, tested, "mm")
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_forces_on_a_recorded_pad(model: Universal, i: int) -> None:
+    """Draw labels from the first eight strokes of a force gauge at one place; test the last two strokes."""
+    recording = sorted((folder_of("RESKIN_EFLESH") / "normal_force").iterdir())[i]
+    readings, _ = read(recording, "eflesh", {"force_axis": "z"})
+    touched, last = readings.Fz_N >= FORCE_MIN_N, readings.pass_i >= readings.pass_i.max() - 1
+    place_mm = np.array(model.layout.centre_mm)  # the place is not stated; the middle is assumed
+    pool, tested = (presses_of(readings, place_mm, touched & kept) for kept in (~last, last))
+    compare(f"forces, eflesh {i}", model, pool, tested, "N")
+
+
+def test_forces_on_a_pad_of_nine_places(model: Universal) -> None:
+    """Draw labels from the first 60 % of each recording of one place; test the last 40 %."""
+    pools, tests = [], []
+    for n in range(1, 10):
+        (recording,) = folder_of("RESKIN_EFLASH7").glob(f"position_{n}_*.csv")
+        readings, _ = read(recording, "eflash7", {})
+        place_mm = model.layout.centre_mm + PITCH_MM * (np.array([(n - 1) % 3, (n - 1) // 3]) - 1)
+        touched, early = readings.Fz_N >= FORCE_MIN_N, np.arange(len(readings)) < 0.6 * len(readings)
+        # The recorder subtracted an unknown field, so the no-load field of the model's central law replaces it.
+        rest_uT = model.layout.to_chips(model.tables.rest_uT[None])[0]
+        pools.append(presses_of(readings, place_mm, touched & early, rest_uT))
+        tests.append(presses_of(readings, place_mm, touched & ~early, rest_uT))
+    compare("forces, eflash7", model, *(_joined(parts) for parts in (pools, tests)), "N")
+
+
+def _joined(parts: Sequence[Presses]) -> Presses:
+    fields = [np.concatenate([getattr(part, name) for part in parts]) for name in ("db_uT", "place_mm", "force_N")]
+    return Presses(*fields, parts[0].noload_uT)
