@@ -56,6 +56,7 @@ FAULT = (
     "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
+EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -215,6 +216,7 @@ def live(
     ] = "127.0.0.1",
     http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
+    external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
 ) -> None:
     """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
@@ -231,7 +233,7 @@ def live(
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
-    models = read_models(model or ())
+    models = read_models(model or (), external_uT)
     with ExitStack() as stack:
         description = "a board"
         if source := replay or emulate:

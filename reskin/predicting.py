@@ -136,14 +136,19 @@ def _read_capture(folder: Path) -> sd_card.Log:
     return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
 
 
-def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
-    """Read trained networks, or one calibration of the universal model; without files, the uncalibrated model."""
+def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Network] | Universal:
+    """Read trained networks, or one calibration of the universal model; without files, the uncalibrated model.
+
+    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0.
+    """
     calibrations = [file for file in files if file.is_file() and _is_calibration(file)]
     if not calibrations:
-        return [read_network(file) for file in files] or load_universal()
+        if files and external_uT:
+            raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
+        return [read_network(file) for file in files] or load_universal(external_uT=external_uT)
     if len(files) > 1:
         raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Use it alone.")
-    return load_universal(calibrations[0])
+    return load_universal(calibrations[0], external_uT=external_uT)
 
 
 def _is_calibration(file: Path) -> bool:

@@ -34,6 +34,7 @@ from reskin.live.health import LIVE_POLICY, Health
 from reskin.logs import CONTACT_SDS, quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
+from reskin.physics import external
 from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
@@ -109,6 +110,11 @@ class UniversalEstimator:
         self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
         self._calibrate()
+
+    @property
+    def external_uT(self) -> float:
+        """Expected size of external fields."""
+        return self._given_model.external_uT
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate."""
@@ -478,7 +484,8 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # readings with a larger |dB| are in contact
+        self._contact_uT = np.inf  # readings with a larger |dB|, without external fields, are in contact
+        self._suppressor: Float64[np.ndarray, "ch ch"] | None = None  # removes external fields, if they are expected
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
         self._noload_requested = False  # set last: this call also fulfils a request that arrives during it
@@ -501,9 +508,22 @@ class LiveSkin:
                 self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
             noise_uT = b_uT - noload_uT
-            magnitude_uT = np.median(np.linalg.norm(noise_uT, axis=1))
-            self._contact_uT = float(magnitude_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean()))
+            rms_uT = float(np.sqrt((noise_uT**2).mean()))
+            if self.external_uT:
+                layout = self.layout
+                self._suppressor = external.suppressor(layout.chips_mm - CENTRE_MM, layout.turn, self.external_uT, rms_uT)
+            self._contact_uT = float(np.median(self._strengths_uT(noise_uT)) + CONTACT_SDS * rms_uT)
             self.noload_uT = noload_uT
+
+    @property
+    def external_uT(self) -> float:
+        """Size of external fields that the model expects; 0 for networks and without a model."""
+        return self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
+
+    def _strengths_uT(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, " f"]:
+        """Return |dB| of each reading, without external fields if they are expected."""
+        suppressor = self._suppressor
+        return np.linalg.norm(db_uT if suppressor is None else db_uT @ suppressor, axis=1)
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
         target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
@@ -511,14 +531,14 @@ class LiveSkin:
             unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
             return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, contact)
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - self.noload_uT).astype(np.float32)
-        contact = np.linalg.norm(db_uT, axis=1) > self._contact_uT  # False for NaN
+        contact = self._strengths_uT(db_uT) > self._contact_uT  # False for NaN
         if self.estimator is not None:
             target[sound & ~contact, 2] = 0.0
             if contact.any():
                 target[contact], sd_mm[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
-            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1])
+            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], self.external_uT)
         return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, contact)
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:

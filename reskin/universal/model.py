@@ -23,6 +23,7 @@ from reskin import io
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.display import one_line
 from reskin.errors import SchemaError
+from reskin.physics import external
 from reskin.universal import network
 from reskin.universal.calibration import (
     CalibrationData,
@@ -44,7 +45,7 @@ from reskin.universal.calibration import (
 )
 from reskin.universal.force import ESTIMATORS, FEW_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
-from reskin.universal.law import to_board, to_chips
+from reskin.universal.law import CHIPS_MM, to_board, to_chips
 from reskin.universal.map import (
     ROUNDS_N,
     Estimate,
@@ -73,6 +74,7 @@ FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `n
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
+EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, single precision is not sufficient
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
@@ -189,9 +191,11 @@ class CalibratedModel:
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
-        """Evaluate map and networks on a block of readings."""
+        """Evaluate map and networks on a block of readings; networks receive them without the external field."""
         evaluator, few = self.skin.evaluator, self.few
-        own = evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line
+        likelihoods = evaluator.evaluate(db_uT)
+        networks = self.evaluate_networks(evaluator.without_external(db_uT, likelihoods))
+        own = evaluator, likelihoods, networks, self.line
         return Evaluation(*own, few, None if few is None else few.skin.evaluator.evaluate(db_uT))
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
@@ -334,16 +338,23 @@ class Universal:
     tables : the map's prior
     networks : weights of the networks
     powers : likelihood powers by numbers of presses and labels
+    external_uT : expected size of external fields (see `load_universal`)
     """
 
     tables: Tables
     networks: Sequence[Weights]
     powers: LikelihoodPowers
+    external_uT: float = 0.0
 
     def __post_init__(self) -> None:
-        """Start without any calibration data."""
+        """Start without any calibration data; raise SchemaError if `external_uT` is out of range."""
+        if not 0 <= self.external_uT <= EXTERNAL_MAX_uT:
+            rule = f"0 to {EXTERNAL_MAX_uT:,.0f} uT"
+            remedy = "Pass the size of the fields that change while the skin moves; the earth's field has about 50 uT."
+            raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
-        self._prior_map = new_map(self.tables)
+        cov = external.covariance(np.array(CHIPS_MM), self.external_uT) if self.external_uT else None
+        self._prior_map = new_map(self.tables, external_cov=cov)
         self._noload_map: SkinMap
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
@@ -358,7 +369,8 @@ class Universal:
         presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
         return (
             f"Universal(five chips of the paper's board, trained on simulated skins, {noload}, "
-            f"{presses_n} presses at unknown places, {labels_n} labelled)"
+            f"{presses_n} presses at unknown places, {labels_n} labelled"
+            f"{f', external fields of {self.external_uT:g} uT' if self.external_uT else ''})"
         )
 
     @property
@@ -581,9 +593,21 @@ class Universal:
         return self
 
 
-def load_universal(calibration: Path | str | None = None, *, file: Path = FILE) -> Universal:
-    """Load the model that comes with the project, calibrated to a skin if `calibration` is a file from `save`."""
-    model = Universal(*_read_parts(file))
+def load_universal(
+    calibration: Path | str | None = None, *, file: Path = FILE, external_uT: float = 0.0
+) -> Universal:
+    """Load the model that comes with the project, calibrated to a skin if `calibration` is a file from `save`.
+
+    external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change
+    since the no-load reading. Each reading may then contain an unknown external field: a uniform one, and its gradient.
+    About 30 for the earth's field; 100 or more if other skins or magnets move nearby. With 0, no external field is
+    expected, and estimates are more accurate if there is none.
+
+    Raises
+    ------
+    SchemaError : a file is damaged, or `external_uT` is not from 0 to `EXTERNAL_MAX_uT`
+    """
+    model = Universal(*_read_parts(file), external_uT=external_uT)
     return model if calibration is None else model.remember(calibration)
 
 
