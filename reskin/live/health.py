@@ -89,7 +89,11 @@ class Health:
         return np.asarray(~faulty & (not self._stuck))
 
     def feed_change(
-        self, db_uT: Float[np.ndarray, " ch"], turn: Float64[np.ndarray, "k 3 3"], now_s: float, expected_uT: float = 0.0
+        self,
+        db_uT: Float[np.ndarray, " ch"],
+        turn: Float64[np.ndarray, "k 3 3"],
+        now_s: float,
+        expected_uT: float = 0.0,
     ) -> None:
         """Raise an alarm if all chips measure nearly the same field change.
 

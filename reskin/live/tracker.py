@@ -39,6 +39,7 @@ from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.universal.calibration import CHANNELS_N, check_presses
+from reskin.universal.law import to_board
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
@@ -113,8 +114,13 @@ class UniversalEstimator:
 
     @property
     def external_uT(self) -> float:
-        """Expected size of external fields."""
+        """Expected size of external fields; 0 if none are expected."""
         return self._given_model.external_uT
+
+    def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
+        """Return a matrix that removes external fields from readings along the board's axes, if they are expected."""
+        cov = self._given_model.external_cov
+        return None if cov is None else external.suppressor(cov, noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate."""
@@ -509,21 +515,15 @@ class LiveSkin:
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
             noise_uT = b_uT - noload_uT
             rms_uT = float(np.sqrt((noise_uT**2).mean()))
-            if self.external_uT:
-                layout = self.layout
-                self._suppressor = external.suppressor(layout.chips_mm - CENTRE_MM, layout.turn, self.external_uT, rms_uT)
+            if isinstance(self.estimator, UniversalEstimator):
+                self._suppressor = self.estimator.suppressor(rms_uT)
             self._contact_uT = float(np.median(self._strengths_uT(noise_uT)) + CONTACT_SDS * rms_uT)
             self.noload_uT = noload_uT
-
-    @property
-    def external_uT(self) -> float:
-        """Size of external fields that the model expects; 0 for networks and without a model."""
-        return self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
 
     def _strengths_uT(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, " f"]:
         """Return |dB| of each reading, without external fields if they are expected."""
         suppressor = self._suppressor
-        return np.linalg.norm(db_uT if suppressor is None else db_uT @ suppressor, axis=1)
+        return np.linalg.norm(db_uT if suppressor is None else to_board(db_uT) @ suppressor, axis=1)
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
         target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
@@ -538,7 +538,8 @@ class LiveSkin:
                 target[contact], sd_mm[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
-            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], self.external_uT)
+            expected_uT = self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
+            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], expected_uT)
         return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, contact)
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:

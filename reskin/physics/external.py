@@ -1,53 +1,54 @@
-"""External fields over a board: the earth's field, magnets and other skins, while a robot moves the board.
+"""External fields over a board that a robot moves: the earth's field, magnets, and other skins.
 
-Their sources are far away compared with the board, so the field is described by its value at the board's centre and by
-its gradient. Without currents in the board, the gradient is symmetric. Chips are in one plane, so the derivatives with
-respect to z have no effect, except those that are equal to others by this symmetry.
+The change of an external field since the no-load reading is unknown. Its prior is the field of one magnetic dipole, at
+a known distance from the board's centre, in an unknown direction and with an unknown moment. Such fields are nearly
+uniform over the board; how much they vary depends on the distance.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-# Standard deviation of the gradient's elements per mm, relative to that of the field: a magnet about 7 cm away, whose
-# field decreases as distance^-3, has such gradients. Recording `fullnocontact1` of a moving hand has 0.039 per mm.
-GRADIENT_PER_MM = 0.04
-UNIFORM_N = 3  # the first columns of `basis` are the uniform field
+# Distance of the dipole. On recording `fullnocontact1` of a moving hand whose fingers have skins (data/leaphand), 40 mm
+# is the most likely distance. A larger distance makes the map more accurate on simulated skins if sources are farther.
+DISTANCE_MM = 50.0
+DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
 
 
-def basis(chips_mm: Float[np.ndarray, "k 2"]) -> Float[np.ndarray, "ch 8"]:
-    """Return the readings of all chips, along the board's axes, for a unit of each component of an external field.
-
-    The columns are Bx, By, Bz at the centre, then the gradient's elements xx, yy, xy, xz and yz (per mm).
-    """
-    columns = np.zeros((len(chips_mm), 3, 8))
-    columns[:, :, :UNIFORM_N] = np.eye(3)
-    x_mm, y_mm = chips_mm.T
-    columns[:, 0, 3], columns[:, 1, 4] = x_mm, y_mm
-    columns[:, 0, 5], columns[:, 1, 5] = y_mm, x_mm
-    columns[:, 2, 6], columns[:, 2, 7] = x_mm, y_mm
-    return columns.reshape(-1, 8)
-
-
-def covariance(chips_mm: Float[np.ndarray, "k 2"], sd_uT: float) -> Float[np.ndarray, "ch ch"]:
+def covariance(
+    chips_mm: Float[np.ndarray, "k 2"], sd_uT: float, distance_mm: float = DISTANCE_MM
+) -> Float[np.ndarray, "ch ch"]:
     """Return the covariance of readings in an unknown external field, along the board's axes.
 
-    sd_uT: standard deviation of each of the three components of the field at the board's centre.
+    chips_mm: positions of the chips relative to the board's centre; all must be much closer than `distance_mm`. sd_uT:
+    standard deviation of each component of the field at the board's centre.
     """
-    components = basis(chips_mm) * (sd_uT * np.where(np.arange(8) < UNIFORM_N, 1.0, GRADIENT_PER_MM))
-    return components @ components.T
+    at_mm = np.column_stack([chips_mm, np.zeros(len(chips_mm))])
+    dipoles_mm = distance_mm * _directions(DIRECTIONS_N)
+    fields, at_centre = (_per_moment(places_mm, dipoles_mm) for places_mm in (at_mm, np.zeros((1, 3))))
+    return 3 * sd_uT**2 / (at_centre**2).sum() * fields @ fields.T
 
 
-def suppressor(
-    chips_mm: Float[np.ndarray, "k 2"], turn: Float[np.ndarray, "k 3 3"], sd_uT: float, noise_uT: float
-) -> Float[np.ndarray, "ch ch"]:
-    """Return a symmetric matrix that shrinks external fields in readings (along the chips' axes) to the noise.
+def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
+    """Return a symmetric matrix that shrinks external fields in a reading to the size of its noise.
 
     It is the whitening matrix of external field and noise, times the standard deviation of the noise. The part of a
-    reading that no external field explains is unchanged; with `sd_uT` = 0, everything is. `turn` rotates the axes of
-    each chip to those of the board.
+    reading that no external field explains is unchanged.
     """
-    chips_n = len(chips_mm)
-    cov = covariance(chips_mm, sd_uT).reshape(chips_n, 3, chips_n, 3)
-    cov = np.einsum("aji,ajbk,bkl->aibl", turn, cov, turn).reshape(3 * chips_n, 3 * chips_n)
-    variances, axes = np.linalg.eigh(cov)
+    variances, axes = np.linalg.eigh(external_cov)
     return (axes * (noise_uT / np.sqrt(np.maximum(variances, 0) + noise_uT**2))) @ axes.T
+
+
+def _per_moment(at_mm: Float[np.ndarray, "o 3"], dipoles_mm: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "o3 s3"]:
+    """Return the field at points per unit of each component of each dipole's moment (arbitrary unit)."""
+    off_mm = at_mm[:, None] - dipoles_mm
+    distance_mm = np.linalg.norm(off_mm, axis=2)[..., None, None]
+    tensor = 3 * off_mm[..., None] * off_mm[..., None, :] / distance_mm**5 - np.eye(3) / distance_mm**3
+    return tensor.transpose(0, 2, 1, 3).reshape(3 * len(at_mm), -1)
+
+
+def _directions(n: int) -> Float[np.ndarray, "n 3"]:
+    """Return n unit vectors that are evenly spread over the sphere, on a spiral with golden-angle steps."""
+    i = np.arange(n) + 0.5
+    z, angle = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
+    radius = np.sqrt(1 - z**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])

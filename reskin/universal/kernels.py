@@ -47,9 +47,7 @@ class Gaussians:
         _chi2(self.row, read, chi2)
         return chi2, chi2 + self.log_det
 
-    def solve(
-        self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]
-    ) -> Float32[np.ndarray, "n ch"]:
+    def solve(self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n ch"]:
         """Return C^-1 (d - m) for each reading d, with mean m and covariance C of one Gaussian per reading."""
         row, solved, f = self.row[:, which], np.zeros_like(read), 0
         for i in range(read.shape[1]):

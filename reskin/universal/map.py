@@ -228,9 +228,7 @@ class Hypotheses:
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
 
-def lattice(
-    tables: Tables, residual: Residual, external_cov: Float[np.ndarray, "ch ch"] | None = None
-) -> Hypotheses:
+def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, "ch ch"] | None = None) -> Hypotheses:
     """Return the hypotheses: all tabulated places that are on the skin, each with all tabulated forces."""
     place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     on_skin = inside(place_mm)

@@ -353,8 +353,7 @@ class Universal:
             remedy = "Pass the size of the fields that change while the skin moves; the earth's field has about 50 uT."
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
-        cov = external.covariance(np.array(CHIPS_MM), self.external_uT) if self.external_uT else None
-        self._prior_map = new_map(self.tables, external_cov=cov)
+        self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
@@ -382,6 +381,11 @@ class Universal:
     def skin(self) -> SkinMap:
         """The map, conditioned on all calibration data."""
         return self._model.skin
+
+    @property
+    def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
+        """Covariance of external fields along the board's axes; None if no external fields are expected."""
+        return external.covariance(np.array(CHIPS_MM), self.external_uT) if self.external_uT else None
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
@@ -593,15 +597,13 @@ class Universal:
         return self
 
 
-def load_universal(
-    calibration: Path | str | None = None, *, file: Path = FILE, external_uT: float = 0.0
-) -> Universal:
+def load_universal(calibration: Path | str | None = None, *, file: Path = FILE, external_uT: float = 0.0) -> Universal:
     """Load the model that comes with the project, calibrated to a skin if `calibration` is a file from `save`.
 
     external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change
-    since the no-load reading. Each reading may then contain an unknown external field: a uniform one, and its gradient.
-    About 30 for the earth's field; 100 or more if other skins or magnets move nearby. With 0, no external field is
-    expected, and estimates are more accurate if there is none.
+    since the no-load reading: about 30 for the earth's field, 100 or more if other skins or magnets move nearby. Each
+    reading may then contain an unknown external field, nearly uniform over the board (`reskin.physics.external`). With
+    0, no external field is expected, and estimates are more accurate if there is none.
 
     Raises
     ------

@@ -105,8 +105,7 @@ def test_chi2_is_the_mahalanobis_distance(h):
     expected, spread = expected + length * residual, slope @ root
     read = expected[0] + rng.normal(0, 50, (5, 6))
     mean, slope, number, root, residual, share, error_cov, noise_cov, read = (
-        part.astype(np.float32)
-        for part in (mean, slope, number, root, residual, share, error_cov, noise_cov, read)
+        part.astype(np.float32) for part in (mean, slope, number, root, residual, share, error_cov, noise_cov, read)
     )
     gaussians = whiten(in_blocks(mean, slope), (number, root), residual, share, error_cov, noise_cov)
     chi2, deviance = gaussians.evaluate(read)

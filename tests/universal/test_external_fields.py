@@ -1,0 +1,107 @@
+"""Tests of the universal model's option for external fields, on pokes of its nominal skin and of a simulated one."""
+
+import numpy as np
+import pytest
+
+import reskin
+from reskin.errors import ParamsError, SchemaError
+from reskin.predicting import read_models
+from reskin.universal.law import CHIPS_MM, to_board, to_chips
+from reskin.universal.map import NOISE_uT, new_map
+from reskin.universal.model import EXTERNAL_MAX_uT, Universal, load_universal
+from tests.live.boards import write_model
+from tests.universal.skins import make_tables
+from tests.universal.test_shipped import pokes
+
+UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
+
+FORCE_I = 4  # index of the pokes' force; their field changes are 220 to 410 uT (norm), the uniform fields 224 uT
+
+
+def nominal(external_uT: float) -> tuple[Universal, np.ndarray]:
+    """Return the model, zeroed on its nominal skin, and readings of four pokes on that skin."""
+    model = load_universal(external_uT=external_uT)
+    rest_uT = to_chips(model.tables.rest_uT[None])
+    return model.zero(rest_uT), pokes(model, FORCE_I) + rest_uT
+
+
+def moved_mm(model: Universal, b_uT: np.ndarray) -> np.ndarray:
+    """Return how far each of three uniform fields moves the estimates of pokes: [field, poke]."""
+    before_mm = model.estimate(b_uT).place_mm
+    after_mm = np.stack([model.estimate(b_uT + uniform_uT).place_mm for uniform_uT in UNIFORM_uT])
+    return np.linalg.norm(after_mm - before_mm, axis=2)
+
+
+def test_uniform_field_of_100_uT_does_not_move_estimates_with_the_option():
+    with_mm, without_mm = moved_mm(*nominal(100.0)), moved_mm(*nominal(0.0))
+    assert with_mm.max() < 0.2
+    assert without_mm.max() > 1.0
+
+
+def test_estimates_on_a_moving_simulated_skin_are_closer_with_the_option():
+    places = np.column_stack([np.random.default_rng(0).uniform(3, 13, (40, 2)), np.full(40, 1.0)])
+    noload_uT, b_uT, _ = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
+    uniform_uT = 100 * np.random.default_rng(1).standard_normal((40, 3))
+    moving_uT = b_uT + to_chips(np.tile(uniform_uT, 5))
+
+    def error_mm(external_uT: float, readings_uT: np.ndarray) -> float:
+        found = load_universal(external_uT=external_uT).zero(noload_uT).predict(readings_uT)
+        return float(np.median(np.linalg.norm(found[:, :2] - places[:, :2], axis=1)))
+
+    assert error_mm(100.0, moving_uT) < error_mm(0.0, moving_uT)
+    assert error_mm(0.0, b_uT) < error_mm(100.0, b_uT)  # without external fields, the option costs accuracy
+
+
+def test_standard_deviations_of_places_grow_with_the_expected_field():
+    sd_mm = [model.estimate(b_uT).sd_mm.mean() for model, b_uT in map(nominal, (0.0, 30.0, 140.0))]
+    assert sd_mm[0] < sd_mm[1] < sd_mm[2]
+
+
+def test_expected_external_field_is_close_to_the_true_one():
+    model, b_uT = nominal(100.0)
+    db_uT = to_board(b_uT - model.noload_uT)
+    uniform_uT = to_board(UNIFORM_uT[:1])
+    evaluator = model.skin.evaluator
+    cleaned_uT = [
+        evaluator.without_external(read_uT, evaluator.evaluate(read_uT)) for read_uT in (db_uT, db_uT + uniform_uT)
+    ]
+    # Of the 224 uT (norm), less than a tenth remains, because prior and noise share the rest.
+    assert np.linalg.norm(cleaned_uT[1] - cleaned_uT[0], axis=1).max() < 0.1 * np.linalg.norm(uniform_uT)
+
+
+def test_without_the_option_the_model_is_unchanged():
+    skin = new_map(make_tables())
+    db_uT = np.random.default_rng(0).normal(0, 300, (3, 15))
+    assert skin.evaluator.without_external(db_uT, skin.evaluator.evaluate(db_uT)) is db_uT
+    np.testing.assert_array_equal(skin.hypotheses.noise_cov, NOISE_uT**2 * np.eye(15))
+    assert load_universal().external_cov is None
+    assert "external" not in repr(load_universal())
+
+
+def test_calibration_file_can_be_used_with_the_option(tmp_path):
+    model, b_uT = nominal(0.0)
+    model.see(b_uT).save(tmp_path / "skin.safetensors")
+    loaded = load_universal(tmp_path / "skin.safetensors", external_uT=100.0)
+    assert loaded.presses_n == len(b_uT)
+    assert loaded.external_uT == 100.0
+    assert moved_mm(loaded, b_uT).max() < 0.5
+
+
+@pytest.mark.parametrize("wrong", [-1.0, np.nan, np.inf, EXTERNAL_MAX_uT + 1])
+def test_wrong_size_of_external_fields_is_an_error(wrong):
+    with pytest.raises(SchemaError, match=r"external_uT must be 0 to 1,000 uT"):
+        load_universal(external_uT=wrong)
+
+
+def test_networks_have_no_option_for_external_fields(tmp_path):
+    with pytest.raises(ParamsError, match="networks have no option for external fields"):
+        read_models([write_model(tmp_path)], 30.0)
+    assert read_models([], 30.0).external_uT == 30.0
+
+
+def test_largest_field_is_evaluated_accurately_enough_in_single_precision():
+    skin = load_universal(external_uT=EXTERNAL_MAX_uT)
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    found = skin.zero(rest_uT).predict(pokes(skin) + rest_uT)
+    assert np.isfinite(found).all()
+    assert len(CHIPS_MM) == 5
