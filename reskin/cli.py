@@ -267,12 +267,13 @@ def predict(
     rate_hz: Annotated[
         float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
     ] = 400.0,
+    external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
 ) -> None:
     """Estimate contacts, places and forces from a log that begins with at least 0.5 s without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
-    counts = write(log, model, out, rate_hz=rate_hz)
+    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT)
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
     for sentence in warnings(counts):
         typer.echo(sentence)

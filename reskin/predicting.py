@@ -28,7 +28,9 @@ FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the mod
 PARQUET_MAGIC = b"PAR1"
 
 
-def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+def predict(
+    log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0, external_uT: float = 0.0
+) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
     Parameters
@@ -37,13 +39,14 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     model : a network or a calibration of the universal model; None for the uncalibrated universal model
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
+    external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
 
     Returns
     -------
     A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
     of readings in contact: with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range.
     """
-    models = read_models([] if model is None else [model])
+    models = read_models([] if model is None else [model], external_uT)
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in inputs}:
         raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
@@ -57,9 +60,10 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     if isinstance(models, Universal):
         models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)
         estimators = [universal := _UniversalOfLog(models)]
+        find_suppressor = models.suppressor
     else:
-        estimators, universal = models, None
-    estimates = estimate(t_s, b_uT, estimators, where=str(log))
+        estimators, universal, find_suppressor = models, None, None
+    estimates = estimate(t_s, b_uT, estimators, where=str(log), find_suppressor=find_suppressor)
     io.write_text(out, render(estimates))
     return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | counts
 

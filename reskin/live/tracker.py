@@ -31,15 +31,13 @@ from reskin.config import parse
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
-from reskin.logs import CONTACT_SDS, quiet_start
+from reskin.logs import CONTACT_SDS, magnitudes_uT, quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
-from reskin.physics import external
 from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.universal.calibration import CHANNELS_N, check_presses
-from reskin.universal.law import to_board
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
@@ -118,9 +116,8 @@ class UniversalEstimator:
         return self._given_model.external_uT
 
     def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
-        """Return a matrix that removes external fields from readings along the board's axes, if they are expected."""
-        cov = self._given_model.external_cov
-        return None if cov is None else external.suppressor(cov, noise_uT)
+        """Return the matrix of `Universal.suppressor`."""
+        return self._given_model.suppressor(noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate."""
@@ -517,13 +514,8 @@ class LiveSkin:
             rms_uT = float(np.sqrt((noise_uT**2).mean()))
             if isinstance(self.estimator, UniversalEstimator):
                 self._suppressor = self.estimator.suppressor(rms_uT)
-            self._contact_uT = float(np.median(self._strengths_uT(noise_uT)) + CONTACT_SDS * rms_uT)
+            self._contact_uT = float(np.median(magnitudes_uT(noise_uT, self._suppressor)) + CONTACT_SDS * rms_uT)
             self.noload_uT = noload_uT
-
-    def _strengths_uT(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, " f"]:
-        """Return |dB| of each reading, without external fields if they are expected."""
-        suppressor = self._suppressor
-        return np.linalg.norm(db_uT if suppressor is None else to_board(db_uT) @ suppressor, axis=1)
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
         target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
@@ -531,7 +523,7 @@ class LiveSkin:
             unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
             return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, contact)
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - self.noload_uT).astype(np.float32)
-        contact = self._strengths_uT(db_uT) > self._contact_uT  # False for NaN
+        contact = magnitudes_uT(db_uT, self._suppressor) > self._contact_uT  # False for NaN
         if self.estimator is not None:
             target[sound & ~contact, 2] = 0.0
             if contact.any():

@@ -26,6 +26,7 @@ from reskin.errors import SchemaError
 from reskin.physics import external
 from reskin.universal import network
 from reskin.universal.calibration import (
+    CHANNELS_N,
     CalibrationData,
     LabelledPresses,
     LikelihoodPowers,
@@ -386,6 +387,15 @@ class Universal:
     def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
         """Covariance of external fields along the board's axes; None if no external fields are expected."""
         return external.covariance(np.array(CHIPS_MM), self.external_uT) if self.external_uT else None
+
+    def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
+        """Return a matrix that shrinks external fields in readings to the size of their noise; None without the option.
+
+        Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result tells
+        contacts from external fields, which |dB| does not.
+        """
+        cov = self.external_cov
+        return None if cov is None else to_board(np.eye(CHANNELS_N)) @ external.suppressor(cov, noise_uT)
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
