@@ -75,6 +75,9 @@ FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `n
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
+# With external fields, the errors of map and networks are more strongly correlated. The power is divided by 1 +
+# external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Chosen so that intervals on simulated skins cover 90 %.
+POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
 EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, single precision is not sufficient
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
@@ -434,6 +437,8 @@ class Universal:
             power = lower_by_misfit(tabulated, self.misfit)
             if len(data.labels):
                 power = lower_by_residuals(power, *self.variance_inflations([power]))
+            if self.external_uT:
+                power /= 1 + self.external_uT / (POWER_uT + POWER_PER_LABEL_uT * len(data.labels))
             self._power = power
         return self._power
 

@@ -24,6 +24,7 @@ from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
 from reskin.universal.batches import SkinPrior
 from reskin.universal.calibration import CalibrationData, LabelledPresses
+from reskin.universal.force import NORMAL_90
 from reskin.universal.law import CHIPS_MM, to_board, to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import CalibratedModel, Evaluation, PriorModel, Universal, load_universal
@@ -152,6 +153,34 @@ def test_networks_and_distance_on_simulated_skins():
         assert on[0] < off[0]
 
 
+def test_coverage_on_simulated_skins():
+    """Compute the coverage of 90 % intervals, in fields of magnets that have the expected size.
+
+    `POWER_uT` and `POWER_PER_LABEL_uT` were chosen on other skins, with the name "external powers".
+    """
+    skins_n = size(24, 1)
+    prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
+    skins = draw_prior_skins(prior, skins_n, SEED, "external powers, test", LAW_ERRORS[AS_TRAINED])
+    print(f"\nSIMULATED, {skins_n} skins, magnets at 60 mm: coverage of 90 % intervals")
+    for sd_uT in size((0.0, 10.0, 30.0, 70.0, 140.0, 300.0), (0.0, 30.0)):
+        for labels_n in (0, 10, 40):
+            covered = []
+            for i in range(skins_n):
+                pool, tested = split_presses(skins, i, SEED)
+                model = load_universal(external_uT=sd_uT).zero(to_chips(skins.rest_uT[i][None].astype(float)))
+                model.see(model.noload_uT + to_chips(pool.db_uT))
+                if labels_n:
+                    labels = raise_forces(pool[:labels_n])
+                    labelled_uT = model.noload_uT + to_chips(labels.db_uT)
+                    model.label(labels.place_mm + CENTRE_MM, labels.force_N, labelled_uT)
+                external_uT = magnets_uT(60.0, sd_uT, len(tested), rng_for(SEED, "coverage", i))
+                found = model.estimate(model.noload_uT + to_chips(tested.db_uT + external_uT))
+                error_mm = np.abs(found.place_mm - CENTRE_MM - tested.place_mm)
+                covered.append(100 * float((error_mm <= NORMAL_90 * found.sd_mm).mean()))
+            print(f"external_uT {sd_uT:3.0f}, {labels_n:2} labels: {np.mean(covered):.0f} %")
+            assert not FULL or 84 < np.mean(covered) < 96
+
+
 def place_scores(error_mm: np.ndarray) -> tuple[float, float]:
     return 100 * float((np.abs(error_mm) <= 1).all(axis=1).mean()), float((error_mm**2).mean())
 
@@ -161,6 +190,25 @@ PADS = {  # name: recording for the threshold, tested recording, pads
     "with neighbours": ("fullnocontact1", "fullnocontact2", [1, 2, 3]),
 }
 OPTIONS_uT = (0.0, 30.0, 100.0, 140.0)
+
+
+def test_distance_of_magnets_on_recordings(shared_data):
+    """Print the most likely distance and size of external fields, by recording; `DISTANCE_MM` is from the first one."""
+    found = {}
+    for name in ("fullnocontact1", "fullnocontact2", "0skin", "1skinnocontact"):
+        hand, pads = read_hand(shared_data, name), PADS["with neighbours" if name.startswith("full") else "alone"][2]
+        db_uT = to_board(hand.db_uT[:, pads].reshape(-1, 15))
+        second_uT2 = db_uT.T @ db_uT / len(db_uT)
+        likelihoods = {}
+        for distance_mm in (30, 35, 40, 45, 50, 60, 70, 85, 100, 150, 300):
+            unit = external.covariance(np.array(CHIPS_MM), 1.0, distance_mm)
+            for sd_uT in (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 280):
+                cov = sd_uT**2 * unit + hand.noise_uT**2 * np.eye(15)
+                deviance = np.linalg.slogdet(cov)[1] + np.trace(np.linalg.solve(cov, second_uT2))
+                likelihoods[distance_mm, sd_uT] = -len(db_uT) / 2 * deviance
+        found[name] = max(likelihoods, key=lambda pair: likelihoods[pair])
+    print("\nRECORDED, most likely distance / mm and size / uT:", found)
+    assert found["fullnocontact1"][1] > found["0skin"][1]
 
 
 def test_false_contacts(shared_data, lab_boards):
@@ -240,7 +288,7 @@ def test_places_on_recorded_boards(shared_data, lab_boards):
         for where, (_, second, pads) in PADS.items()
     }
     draws_n = size(10, 1)
-    print(f"\nmean of both boards, {draws_n} draws: % within 1 mm / MSE_xy in mm2 / error factor of force")
+    print(f"\nmean of both boards, {draws_n} draws: % within 1 mm / MSE_xy in mm2 / force factor / % of 90 % intervals")
     within = {}
     for labels_n in (0, 10):
         for sd_uT in (0.0, 30.0, 140.0):
@@ -250,11 +298,10 @@ def test_places_on_recorded_boards(shared_data, lab_boards):
                     for board in lab_boards.values()
                     for draw_i in range(draws_n)
                 ]
-                pct, mse, factor = np.mean(scores, axis=0)
+                pct, mse, factor, covered = np.mean(scores, axis=0)
                 within[field, sd_uT, labels_n] = pct
-                print(
-                    f"{labels_n:2} labels, external_uT {sd_uT:3.0f}, {field:26} {pct:5.1f} / {mse:5.2f} / {factor:.2f}"
-                )
+                scores_text = f"{pct:5.1f} / {mse:5.2f} / {factor:.2f} / {covered:.0f}"
+                print(f"{labels_n:2} labels, external_uT {sd_uT:3.0f}, {field:26} {scores_text}")
     if FULL:
         for labels_n in (0, 10):
             on, off = (within["hand, pad with neighbours", sd_uT, labels_n] for sd_uT in (140.0, 0.0))
@@ -263,7 +310,7 @@ def test_places_on_recorded_boards(shared_data, lab_boards):
 
 def score_draw(
     board: BoardPresses, sd_uT: float, field: str, hand_uT: Mapping[str, np.ndarray], labels_n: int, draw_i: int
-) -> tuple[float, float, float]:
+) -> tuple[float, float, float, float]:
     """Calibrate to 65 presses at random places without external field; score readings in external fields."""
     draw = draw_presses(board, CHECKERBOARD, 65, SEED, draw_i)
     model: Universal = load_universal(external_uT=sd_uT).zero(board.rest_uT)
@@ -285,4 +332,6 @@ def score_draw(
         change_uT = recorded_uT[rng.integers(len(recorded_uT), size=n)]
     found = model.estimate(board.rest_uT + tested.db_uT + change_uT)
     factor = float(np.exp(np.abs(np.log(found.force_N / tested.force_N)).mean()))
-    return *place_scores(found.place_mm - CENTRE_MM - tested.place_mm), factor
+    error_mm = found.place_mm - CENTRE_MM - tested.place_mm
+    covered = 100 * float((np.abs(error_mm) <= NORMAL_90 * found.sd_mm).mean())
+    return *place_scores(error_mm), factor, covered

@@ -9,7 +9,7 @@ from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import NOISE_uT, new_map
 from reskin.universal.model import EXTERNAL_MAX_uT, Universal, load_universal
 from tests.universal.skins import make_tables
-from tests.universal.test_shipped import pokes
+from tests.universal.test_shipped import PLACES_MM, pokes
 
 UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
 
@@ -53,6 +53,17 @@ def test_estimates_on_a_moving_simulated_skin_are_closer_with_the_option():
 def test_standard_deviations_of_places_grow_with_the_expected_field():
     sd_mm = [model.estimate(b_uT).sd_mm.mean() for model, b_uT in map(nominal, (0.0, 30.0, 140.0))]
     assert sd_mm[0] < sd_mm[1] < sd_mm[2]
+
+
+def test_power_is_lower_with_larger_fields_and_less_so_with_labels():
+    powers = {}
+    for external_uT in (0.0, 30.0, 140.0):
+        model, b_uT = nominal(external_uT)
+        powers[external_uT, 0] = model.power
+        powers[external_uT, 4] = model.label(PLACES_MM, np.full(4, model.tables.force_N[FORCE_I]), b_uT).power
+    assert powers[0.0, 0] > powers[30.0, 0] > powers[140.0, 0]
+    ratio = {n: powers[140.0, n] / powers[0.0, n] for n in (0, 4)}
+    assert ratio[4] > ratio[0]
 
 
 def test_expected_external_field_is_close_to_the_true_one():
