@@ -386,7 +386,8 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
         A serial port or `socket://host:port`; a list for several boards at once.
     model : optional
         One or more trained networks (files or `Model` objects), or one universal model (a calibration file or a
-        `Universal` object; the object is not modified). Default: the uncalibrated universal model.
+        `Universal` object; the object is not modified). Default: the uncalibrated universal model. For a board that a
+        robot moves, pass `load_universal(external_uT=...)`.
     baud : int
         Baud rate; USB ports ignore it.
 
