@@ -391,6 +391,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     model : optional
         One or more trained networks (files or `Model` objects), or one universal model: a `Universal` object, which
         is not modified, or the files of a model, of a calibration, or of both. Default: the shipped universal model.
+        For a board that a robot moves, pass `load_universal(external_uT=...)`.
     baud : int
         Baud rate; USB ports ignore it.
 

@@ -26,6 +26,8 @@ CONTACT_SDS = 6.0
 POINTS_MAX_N = 1500  # largest number of points per series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+# Function that returns, for the noise in uT, a matrix that removes external fields from readings, or None.
+FindSuppressor = Callable[[float], Float64[np.ndarray, "ch ch"] | None]
 
 
 @dataclass(frozen=True)
@@ -44,26 +46,36 @@ class LogEstimates:
 
 
 def estimate(
-    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str
-) -> LogEstimates:
+    t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str,
+    find_suppressor: FindSuppressor | None = None,
+) -> LogEstimates:  # fmt: skip
     """Find the quiet start of a log, subtract its mean field from all readings, and estimate place and force for each.
 
-    Raises CaptureError, with `where` in its message, if the log does not start without contact.
+    `find_suppressor` is for the detection of contact. Raises CaptureError, with `where` in its message, if the log does
+    not start without contact.
     """
-    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models)
+    return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models, find_suppressor)
 
 
 def estimate_after(
-    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator]
-) -> LogEstimates:
+    quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator],
+    find_suppressor: FindSuppressor | None = None,
+) -> LogEstimates:  # fmt: skip
     """Subtract the mean field of the first `quiet_n` readings, detect contact, and estimate place and force."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
-    magnitude_uT = np.linalg.norm(db_uT, axis=1)
+    magnitude_uT = magnitudes_uT(db_uT, None if find_suppressor is None else find_suppressor(noise_uT))
     contact = magnitude_uT > np.median(magnitude_uT[:quiet_n]) + CONTACT_SDS * noise_uT
     targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
     return LogEstimates(t_s, targets, contact, quiet_n, noise_uT)
+
+
+def magnitudes_uT(
+    db_uT: Float[np.ndarray, "f ch"], suppressor: Float64[np.ndarray, "ch ch"] | None
+) -> Float[np.ndarray, " f"]:
+    """Return |dB| of each reading, by which contact is detected; external fields are removed with the suppressor."""
+    return np.linalg.norm(db_uT if suppressor is None else db_uT @ suppressor, axis=1)
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:

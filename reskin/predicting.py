@@ -28,7 +28,9 @@ FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the mod
 PARQUET_MAGIC = b"PAR1"
 
 
-def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
+def predict(
+    log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0, external_uT: float = 0.0
+) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
     Parameters
@@ -37,6 +39,7 @@ def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_h
     model : a network; a universal model, a calibration, or both; None for the shipped universal model
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
+    external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
 
     Returns
     -------
@@ -45,7 +48,7 @@ def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_h
     the skin is turned by a quarter, and the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
-    models = read_models(files)
+    models = read_models(files, external_uT)
     if len(files) > 1 and not isinstance(models, Universal):
         raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
@@ -61,9 +64,10 @@ def predict(log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_h
     if isinstance(models, Universal):
         models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)
         estimators = [universal := _UniversalOfLog(models)]
+        find_suppressor = models.suppressor
     else:
-        estimators, universal = models, None
-    estimates = estimate(t_s, b_uT, estimators, where=str(log))
+        estimators, universal, find_suppressor = models, None, None
+    estimates = estimate(t_s, b_uT, estimators, where=str(log), find_suppressor=find_suppressor)
     io.write_text(out, render(estimates))
     return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | counts
 
@@ -145,20 +149,24 @@ def _read_capture(folder: Path) -> sd_card.Log:
     return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
 
 
-def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
+def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Network] | Universal:
     """Read trained networks, or one universal model, one calibration of it, or both.
 
     Without a universal model, a calibration is for the shipped one; without any file, the model is the shipped one.
+    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
     if not (made or calibrations):
-        return [read_network(file) for file in files] or load_universal()
+        if files and external_uT:
+            raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
+        return [read_network(file) for file in files] or load_universal(external_uT=external_uT)
     if max(len(made), len(calibrations)) > 1 or len(made) + len(calibrations) < len(files):
         kind = "universal model" if made else "calibration"
         remedy = "Use it alone, or a universal model with one calibration."
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
-    return load_universal(calibrations[0] if calibrations else None, file=made[0] if made else FILE)
+    calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
+    return load_universal(calibration, file=model, external_uT=external_uT)
 
 
 def _is_calibration(file: Path) -> bool:

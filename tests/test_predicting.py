@@ -17,6 +17,7 @@ from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import read_log, render
 from reskin.seeds import rng_for
+from reskin.universal.law import to_chips
 from reskin.universal.model import FILE
 from tests.recordings.headers import make_header
 
@@ -78,6 +79,22 @@ def test_stream_decoded_table_and_log_give_the_same_csv(tmp_path, model, wire):
         counts = predict(source, model, out, rate_hz=RATE_HZ)
         assert counts["rows_n"] == QUIET_N + TOUCHED_N
     assert outs[0].read_text() == outs[1].read_text() == outs[2].read_text()
+
+
+@pytest.mark.parametrize("external_uT", [0.0, 50.0])
+def test_uniform_field_is_no_contact_if_external_fields_are_expected(tmp_path, external_uT):
+    t_s, b_uT, temperature_degC = log_of()
+    touched = np.arange(len(t_s)) >= QUIET_N
+    turning_uT = to_chips(np.tile([40.0, -30.0, 60.0], 5)[None]) - 200  # instead of the equal changes along all axes
+    b_uT = (b_uT + touched[:, None] * turning_uT).astype(np.float32)
+    (tmp_path / "log.csv").write_text(render(t_s, b_uT, temperature_degC))
+    counts = predict(tmp_path / "log.csv", None, tmp_path / "out.csv", external_uT=external_uT)
+    assert counts["contact_readings_n"] == (0 if external_uT else TOUCHED_N)
+
+
+def test_networks_cannot_expect_external_fields(tmp_path, model):
+    with pytest.raises(ReskinError, match="networks have no option for external fields"):
+        predict(write_log(tmp_path), model, tmp_path / "out.csv", external_uT=50.0)
 
 
 def test_fields_in_mT_are_refused(tmp_path, model):

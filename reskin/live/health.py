@@ -19,6 +19,7 @@ ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrenc
 # presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
 COMMON_MIN_uT = 50.0  # smallest external field that raises an alarm; about the strength of the earth's field
+EXTERNAL_SDS = 3.0  # if external fields are expected, larger ones than this multiple of their size raise an alarm
 
 # Default policy for live readings. Saturated readings are dropped, because a controller would use a wrong estimate.
 LIVE_POLICY = FaultPolicy(
@@ -87,17 +88,25 @@ class Health:
             self._note_batch(self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
         return np.asarray(~faulty & (not self._stuck))
 
-    def feed_change(self, db_uT: Float[np.ndarray, " ch"], turn: Float64[np.ndarray, "k 3 3"], now_s: float) -> None:
+    def feed_change(
+        self,
+        db_uT: Float[np.ndarray, " ch"],
+        turn: Float64[np.ndarray, "k 3 3"],
+        now_s: float,
+        expected_uT: float = 0.0,
+    ) -> None:
         """Raise an alarm if all chips measure nearly the same field change.
 
         The cause is then an external field or a rotation of the board, and not a press.
 
-        `turn` rotates the axes of each chip to those of the board.
+        `turn` rotates the axes of each chip to those of the board. External fields of size `expected_uT` are expected
+        and raise no alarm.
         """
         b_uT = np.einsum("kij,kj->ki", turn, db_uT.reshape(-1, 3).astype(np.float64))
         common_uT = b_uT.mean(axis=0)
         residual = ((b_uT - common_uT) ** 2).sum() / max((b_uT**2).sum(), 1e-9)
-        external = len(b_uT) > 1 and residual < RESIDUAL_FRACTION_MAX and np.linalg.norm(common_uT) > COMMON_MIN_uT
+        least_uT = max(COMMON_MIN_uT, EXTERNAL_SDS * expected_uT)
+        external = len(b_uT) > 1 and residual < RESIDUAL_FRACTION_MAX and np.linalg.norm(common_uT) > least_uT
         self.note("external field: a magnet or iron is near, or the board was rotated", int(external), now_s)
 
     def _note_batch(self, faults: Faults, now_s: float) -> None:

@@ -31,7 +31,7 @@ from reskin.config import parse
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
-from reskin.logs import CONTACT_SDS, quiet_start
+from reskin.logs import CONTACT_SDS, magnitudes_uT, quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
@@ -109,6 +109,15 @@ class UniversalEstimator:
         self._presses_uT = np.zeros((0, self.channels_n))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, self.channels_n))
         self._calibrate()
+
+    @property
+    def external_uT(self) -> float:
+        """Expected size of external fields; 0 if none are expected."""
+        return self._given_model.external_uT
+
+    def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
+        """Return the matrix of `Universal.suppressor`."""
+        return self._given_model.suppressor(noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate.
@@ -494,7 +503,8 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # readings with a larger |dB| are in contact
+        self._contact_uT = np.inf  # readings with a larger |dB|, without external fields, are in contact
+        self._suppressor: Float64[np.ndarray, "ch ch"] | None = None  # removes external fields, if they are expected
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
         self._noload_requested = False  # set last: this call also fulfils a request that arrives during it
@@ -517,8 +527,10 @@ class LiveSkin:
                 self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
             noise_uT = b_uT - noload_uT
-            magnitude_uT = np.median(np.linalg.norm(noise_uT, axis=1))
-            self._contact_uT = float(magnitude_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean()))
+            rms_uT = float(np.sqrt((noise_uT**2).mean()))
+            if isinstance(self.estimator, UniversalEstimator):
+                self._suppressor = self.estimator.suppressor(rms_uT)
+            self._contact_uT = float(np.median(magnitudes_uT(noise_uT, self._suppressor)) + CONTACT_SDS * rms_uT)
             self.noload_uT = noload_uT
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
@@ -527,14 +539,15 @@ class LiveSkin:
             unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
             return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, contact)
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - self.noload_uT).astype(np.float32)
-        contact = np.linalg.norm(db_uT, axis=1) > self._contact_uT  # False for NaN
+        contact = magnitudes_uT(db_uT, self._suppressor) > self._contact_uT  # False for NaN
         if self.estimator is not None:
             target[sound & ~contact, 2] = 0.0
             if contact.any():
                 target[contact], sd_mm[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
-            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1])
+            expected_uT = self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
+            self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], expected_uT)
         return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, contact)
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:

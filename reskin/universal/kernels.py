@@ -47,6 +47,16 @@ class Gaussians:
         _chi2(self.row, read, chi2)
         return chi2, chi2 + self.log_det
 
+    def solve(self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n ch"]:
+        """Return C^-1 (d - m) for each reading d, with mean m and covariance C of one Gaussian per reading."""
+        row, solved, f = self.row[:, which], np.zeros_like(read), 0
+        for i in range(read.shape[1]):
+            to_mean, white = row[f], row[f + 1 : f + 2 + i].T
+            deviation = (white * read[:, : i + 1]).sum(axis=1) - to_mean
+            solved[:, : i + 1] += deviation[:, None] * white
+            f += i + 2
+        return solved
+
 
 def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
     """Arrange means and slopes of Gaussians in blocks of `LANES_N`."""
@@ -58,17 +68,17 @@ def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h c
 def whiten(
     means: LinearMeans, parameters: tuple[Float32[np.ndarray, " t"], Float32[np.ndarray, "t t"]],
     residual: Float32[np.ndarray, "h ch"], share: Float32[np.ndarray, " h"], error_cov: Float32[np.ndarray, "ch ch"],
-    noise_var: float,
+    noise_cov: Float32[np.ndarray, "ch ch"],
 ) -> Gaussians:  # fmt: skip
     """Whiten Gaussians for normally distributed parameters.
 
     `parameters` has the mean of the parameters and the lower Cholesky factor L of their covariance. With
     M = mean + slope @ (mean of the parameters), a Gaussian has the mean M + |M| residual and the covariance
-    (slope L)(slope L)' + |M|^2 share error_cov + noise_var I, where I is the identity matrix.
+    (slope L)(slope L)' + |M|^2 share error_cov + noise_cov.
     """
     channels_n = len(error_cov)
     row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
-    _fill((means.mean, means.slope), parameters, (residual, share), error_cov, np.float32(noise_var), row)
+    _fill((means.mean, means.slope), parameters, (residual, share), error_cov, noise_cov, row)
     return Gaussians(row[:-1], row[-1])
 
 
@@ -89,7 +99,7 @@ def _chi2(row, read, chi2):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _fill(of, parameters, errors, error_cov, noise_var, row):
+def _fill(of, parameters, errors, error_cov, noise_cov, row):
     (mean, slope), (value, root) = of, parameters
     c, t = slope.shape[1:3]
     m, s = np.empty((c, LANES_N), np.float32), np.empty((c, t, LANES_N), np.float32)
@@ -98,7 +108,7 @@ def _fill(of, parameters, errors, error_cov, noise_var, row):
     for k in range(len(mean)):
         _expect((mean[k], slope[k]), value, errors, k * LANES_N, m, var)
         _spread(slope[k], root, s)
-        _cov(s, var, error_cov, noise_var, a)
+        _cov(s, var, error_cov, noise_cov, a)
         _root(a, log_det)
         _inverse(a, b)
         _write(b, m, log_det, row[:, k * LANES_N : (k + 1) * LANES_N])
@@ -135,13 +145,12 @@ def _spread(slope, root, s):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _cov(s, var, error_cov, noise_var, a):
+def _cov(s, var, error_cov, noise_cov, a):
     # Compute the lower triangle of the covariance s s' + var error_cov + noise_var I.
     for i in range(len(a)):
         for j in range(i + 1):
-            noise = noise_var if i == j else np.float32(0)
             for lane in range(LANES_N):
-                a[i, j, lane] = var[lane] * error_cov[i, j] + noise
+                a[i, j, lane] = var[lane] * error_cov[i, j] + noise_cov[i, j]
             for p in range(s.shape[1]):
                 _add(a[i, j], s[i, p], s[j, p])
 

@@ -202,7 +202,7 @@ class Hypotheses:
     """Hypotheses about a press: all pairs of a place and a force, each with its expected field change.
 
     The force index varies fastest. residual: the law's expected relative error. error_cov: covariance of the relative
-    error between channels.
+    error between channels. external_cov: covariance of a reading's external field, or None if there is no such field.
     """
 
     place_mm: Float[np.ndarray, "p 2"]
@@ -211,8 +211,15 @@ class Hypotheses:
     slope_uT: Float32[np.ndarray, "h ch t"]
     residual: Float32[np.ndarray, "h ch"]
     error_cov: Float[np.ndarray, "ch ch"]
+    external_cov: Float[np.ndarray, "ch ch"] | None = None
 
     __repr__ = one_line
+
+    @cached_property
+    def noise_cov(self) -> Float[np.ndarray, "ch ch"]:
+        """Covariance of everything in a reading that is not the skin's: noise, and the external field if any."""
+        noise = NOISE_uT**2 * np.eye(len(self.error_cov))
+        return noise if self.external_cov is None else noise + self.external_cov
 
     @property
     def at(self) -> tuple[Float[np.ndarray, "h 2"], Float[np.ndarray, " h"]]:
@@ -229,7 +236,7 @@ class Hypotheses:
         """Information from an unlabelled press; the law's error (before conditioning) is treated as noise."""
         slope_uT, h = self.slope_uT.astype(float), len(self.mean_uT)
         squared_uT2 = (self.mean_uT.astype(float) ** 2).sum(axis=1)
-        cov = with_noise(squared_uT2[:, None, None] * self.error_cov)
+        cov = squared_uT2[:, None, None] * self.error_cov + self.noise_cov
         per_uT = np.linalg.solve(cov, slope_uT)
         matrix = (per_uT.transpose(0, 2, 1) @ slope_uT).reshape(h, -1)
         return Information(matrix.astype(np.float32), per_uT.astype(np.float32))
@@ -240,7 +247,7 @@ class Hypotheses:
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
 
-def lattice(tables: Tables, residual: Residual) -> Hypotheses:
+def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, "ch ch"] | None = None) -> Hypotheses:
     """Return the hypotheses: all tabulated places that are on the skin, each with all tabulated forces."""
     place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     on_skin = inside(place_mm, tables.area)
@@ -250,12 +257,8 @@ def lattice(tables: Tables, residual: Residual) -> Hypotheses:
     place_mm = place_mm[on_skin]
     expected = residual.at(np.repeat(place_mm, len(log_N), axis=0), np.tile(log_N, len(place_mm)))
     mean_uT, slope_uT, expected = (part.astype(np.float32) for part in (mean_uT, slope_uT, expected))
-    return Hypotheses(place_mm, log_N, mean_uT, slope_uT, expected, LAW_ERROR**2 * residual.channel_cov)
-
-
-def with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch ch"]:
-    """Add the variance of a reading's noise to the diagonals of covariance matrices."""
-    return cov_uT2 + NOISE_uT**2 * np.eye(cov_uT2.shape[1])
+    error_cov = LAW_ERROR**2 * residual.channel_cov
+    return Hypotheses(place_mm, log_N, mean_uT, slope_uT, expected, error_cov, external_cov)
 
 
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
@@ -355,7 +358,8 @@ class MapEvaluator:
         self.lattice = Lattice(skin.hypotheses.place_mm, skin.hypotheses.log_N)
         parameters = skin.mean.astype(np.float32), np.linalg.cholesky(skin.cov).astype(np.float32)
         error_cov = skin.error_cov.astype(np.float32)
-        self._gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, NOISE_uT**2)
+        noise_cov = skin.hypotheses.noise_cov.astype(np.float32)
+        self._gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
         invalid = ~np.isfinite(self._gaussians.log_det)
         if invalid.any():
             what = f"{int(invalid.sum())} covariances of its hypotheses are not positive definite"
@@ -380,6 +384,13 @@ class MapEvaluator:
         chi2, deviance = self._gaussians.evaluate(db_uT.astype(np.float32))
         return Likelihoods(chi2, deviance, deviance.argmin(axis=1), db_uT.shape[1])
 
+    def without_external(self, db_uT: Float[np.ndarray, "n ch"], likelihoods: Likelihoods) -> Float[np.ndarray, "n ch"]:
+        """Subtract the external field, as expected under the most likely hypothesis about each press."""
+        external_cov = self._hypotheses.external_cov
+        if external_cov is None:
+            return db_uT
+        return db_uT - self._gaussians.solve(db_uT.astype(np.float32), likelihoods.best) @ external_cov
+
     def mean(self, likelihoods: Likelihoods, power: float) -> Estimate:
         """Estimate places and forces as means over all hypotheses, weighted by a power of their likelihoods."""
         moments = means(likelihoods.deviance, likelihoods.best, self.lattice, power)
@@ -391,10 +402,16 @@ class MapEvaluator:
         return concatenate([self.mean(self.evaluate(db_uT[i : i + block_n]), 1.0) for i in starts])
 
 
-def new_map(tables: Tables, residual: Residual | None = None) -> SkinMap:
-    """Return the prior map; `residual` predicts the law's errors from its errors on other boards of the rig."""
+def new_map(
+    tables: Tables, residual: Residual | None = None, external_cov: Float[np.ndarray, "ch ch"] | None = None
+) -> SkinMap:
+    """Return the prior map.
+
+    residual: predicts the law's errors from its errors on other boards of the rig. external_cov: covariance of an
+    unknown external field that each reading may contain; without it, readings contain only the press and noise.
+    """
     t, expected = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
-    return SkinMap(tables, expected, lattice(tables, expected), np.zeros(t), np.eye(t))
+    return SkinMap(tables, expected, lattice(tables, expected, external_cov), np.zeros(t), np.eye(t))
 
 
 def condition_on_noload(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> SkinMap:

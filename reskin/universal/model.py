@@ -22,6 +22,7 @@ from jaxtyping import Float
 from reskin import io
 from reskin.display import one_line
 from reskin.errors import SchemaError
+from reskin.physics import external
 from reskin.universal import network
 from reskin.universal.calibration import (
     CalibrationData,
@@ -73,6 +74,10 @@ FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `n
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
+# With external fields, the errors of map and networks are more strongly correlated. The power is divided by 1 +
+# external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Chosen so that intervals on simulated skins cover 90 %.
+POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
+EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, single precision is not sufficient
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
@@ -189,9 +194,11 @@ class CalibratedModel:
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
-        """Evaluate map and networks on a block of readings."""
+        """Evaluate map and networks on a block of readings; networks receive them without the external field."""
         evaluator, few = self.skin.evaluator, self.few
-        own = evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line
+        likelihoods = evaluator.evaluate(db_uT)
+        networks = self.evaluate_networks(evaluator.without_external(db_uT, likelihoods))
+        own = evaluator, likelihoods, networks, self.line
         return Evaluation(*own, few, None if few is None else few.skin.evaluator.evaluate(db_uT))
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
@@ -336,6 +343,7 @@ class Universal:
     powers : likelihood powers by numbers of presses and labels
     layout : the board and the skin that the model was made for
     card : how the model was trained, and what it must not be used for
+    external_uT : expected size of external fields (see `load_universal`)
     """
 
     tables: Tables
@@ -343,11 +351,16 @@ class Universal:
     powers: LikelihoodPowers
     layout: BoardLayout = field(default_factory=paper_layout)
     card: Mapping[str, Any] = field(default_factory=dict)
+    external_uT: float = 0.0
 
     def __post_init__(self) -> None:
-        """Start without any calibration data."""
+        """Start without any calibration data; raise SchemaError if `external_uT` is out of range."""
+        if not 0 <= self.external_uT <= EXTERNAL_MAX_uT:
+            rule = f"0 to {EXTERNAL_MAX_uT:,.0f} uT"
+            remedy = "Pass the size of the fields that change while the skin moves; the earth's field has about 50 uT."
+            raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
-        self._prior_map = new_map(self.tables)
+        self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
@@ -364,7 +377,8 @@ class Universal:
         board = f"board {self.layout.name}, {len(self.layout.chips)} chips"
         return (
             f"Universal({board}, trained on simulated skins, {noload}, "
-            f"{presses_n} presses at unknown places, {labels_n} labelled)"
+            f"{presses_n} presses at unknown places, {labels_n} labelled"
+            f"{f', external fields of {self.external_uT:g} uT' if self.external_uT else ''})"
         )
 
     @property
@@ -376,6 +390,22 @@ class Universal:
     def skin(self) -> SkinMap:
         """The map, conditioned on all calibration data."""
         return self._model.skin
+
+    @property
+    def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
+        """Covariance of external fields along the board's axes; None if no external fields are expected."""
+        return external.covariance(self.layout.chips_mm, self.external_uT) if self.external_uT else None
+
+    def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
+        """Return a matrix that shrinks external fields in readings to the size of their noise; None without the option.
+
+        Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result tells
+        contacts from external fields, which |dB| does not.
+        """
+        cov = self.external_cov
+        return (
+            None if cov is None else self.layout.to_board(np.eye(self.channels_n)) @ external.suppressor(cov, noise_uT)
+        )
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
@@ -442,6 +472,8 @@ class Universal:
             power = lower_by_misfit(tabulated, self.misfit)
             if len(data.labels):
                 power = lower_by_residuals(power, *self.variance_inflations([power]))
+            if self.external_uT:
+                power /= 1 + self.external_uT / (POWER_uT + POWER_PER_LABEL_uT * len(data.labels))
             self._power = power
         return self._power
 
@@ -640,12 +672,22 @@ class Universal:
         return self
 
 
-def load_universal(calibration: Path | str | None = None, *, file: Path | str = FILE) -> Universal:
+def load_universal(
+    calibration: Path | str | None = None, *, file: Path | str = FILE, external_uT: float = 0.0
+) -> Universal:
     """Load a universal model, calibrated to a skin if `calibration` is a file from `save`.
 
     file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
+    external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change
+    since the no-load reading: about 30 for the earth's field, 100 or more if other skins or magnets move nearby. Each
+    reading may then contain an unknown external field, nearly uniform over the board (`reskin.physics.external`). With
+    0, no external field is expected, and estimates are more accurate if there is none.
+
+    Raises
+    ------
+    SchemaError : a file is damaged, or `external_uT` is not from 0 to `EXTERNAL_MAX_uT`
     """
-    model = Universal(*_read_parts(Path(file)))
+    model = Universal(*_read_parts(Path(file)), external_uT=external_uT)
     return model if calibration is None else model.remember(calibration)
 
 

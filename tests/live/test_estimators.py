@@ -13,6 +13,7 @@ from reskin.live.session import PRESSES_N, GuidedPresses, Presses, Session
 from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
+from reskin.universal.law import to_chips
 from reskin.universal.model import load_universal
 from tests.live.boards import ScriptReader, make_script, play_to_skin
 
@@ -53,6 +54,41 @@ def test_universal_model_estimates_places_and_their_standard_deviation(random_po
 def test_board_with_swapped_chips_raises_the_alarm_unknown_skin(random_pokes):
     skin, _ = play_to_skin(make_poke_script(random_pokes, rotated_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
+
+
+def turn_in_uniform_field(script: Script, size_uT: float) -> Script:
+    """Add the change of a uniform field while the board turns about its x axis, once in two seconds after the start."""
+    angle = np.where(script.t_s < QUIET_N / 400, 0.0, np.pi * (script.t_s - QUIET_N / 400))
+    change_uT = size_uT * np.column_stack([np.zeros(len(script)), np.sin(angle), np.cos(angle) - 1])
+    script.frames.b_uT[:] += to_chips(np.tile(change_uT, 5)).astype(np.float32)
+    return Script("simulated", "binary", script.frames, encode_pieces(script.frames, "binary"), script.t_s)
+
+
+def test_turning_board_has_only_true_contacts_if_external_fields_are_expected(random_pokes):
+    poked = (np.arange(QUIET_N + 2 * POKED_N * PRESSES_N) - QUIET_N) % (2 * POKED_N) < POKED_N
+    poked[:QUIET_N] = False
+    true_mm = np.repeat(random_pokes[2], POKED_N, axis=0)
+    for external_uT in (0.0, 50.0):
+        script = turn_in_uniform_field(make_poke_script(random_pokes), 50.0)
+        skin, readings = play_to_skin(script, load_universal(external_uT=external_uT))
+        contact = np.concatenate([batch.contact for batch in readings])
+        target = np.concatenate([batch.target for batch in readings])
+        false_fraction, found_fraction = contact[~poked][QUIET_N:].mean(), contact[poked].mean()
+        assert found_fraction > 0.99
+        alarms = {name.split(":")[0] for name in skin.health.alarms}
+        if external_uT:
+            assert false_fraction == 0.0
+            assert alarms == set()
+            assert np.nanmedian(np.linalg.norm(target[poked, :2] - true_mm, axis=1)) < 1.0
+        else:
+            assert false_fraction > 0.5
+            assert "external field" in alarms
+
+
+def test_stronger_external_fields_than_expected_raise_the_alarm(random_pokes):
+    script = turn_in_uniform_field(make_poke_script(random_pokes), 300.0)
+    skin, _ = play_to_skin(script, load_universal(external_uT=50.0))
+    assert "external field" in {name.split(":")[0] for name in skin.health.alarms}
 
 
 def test_model_adapts_to_collected_presses(random_pokes):

@@ -99,16 +99,20 @@ def test_chi2_is_the_mahalanobis_distance(h):
         rng.uniform(0.5, 1, h),
         np.cov(rng.normal(0, 0.1, (6, 20))),
     )
+    noise_cov = 20.0 * np.eye(6) + np.cov(rng.normal(0, 30, (6, 20)))
     expected = mean + slope @ number
     length = np.linalg.norm(expected, axis=1, keepdims=True)
     expected, spread = expected + length * residual, slope @ root
     read = expected[0] + rng.normal(0, 50, (5, 6))
-    mean, slope, number, root, residual, share, error_cov, read = (
-        part.astype(np.float32) for part in (mean, slope, number, root, residual, share, error_cov, read)
+    mean, slope, number, root, residual, share, error_cov, noise_cov, read = (
+        part.astype(np.float32) for part in (mean, slope, number, root, residual, share, error_cov, noise_cov, read)
     )
-    chi2, deviance = whiten(in_blocks(mean, slope), (number, root), residual, share, error_cov, 20.0).evaluate(read)
-    cov = spread @ spread.transpose(0, 2, 1) + (length[:, 0] ** 2 * share)[:, None, None] * error_cov + 20.0 * np.eye(6)
-    off = read[:, None] - expected
+    gaussians = whiten(in_blocks(mean, slope), (number, root), residual, share, error_cov, noise_cov)
+    chi2, deviance = gaussians.evaluate(read)
+    cov = spread @ spread.transpose(0, 2, 1) + (length[:, 0] ** 2 * share)[:, None, None] * error_cov + noise_cov
+    off, which = read[:, None] - expected, np.arange(5) % h
+    solved = np.stack([np.linalg.solve(cov[j], off[i, j]) for i, j in enumerate(which)])
+    np.testing.assert_allclose(gaussians.solve(read, which), solved, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(chi2, np.einsum("nhi,hij,nhj->nh", off, np.linalg.inv(cov), off), rtol=1e-4, atol=0.01)
     np.testing.assert_allclose(
         deviance - chi2, np.tile(np.linalg.slogdet(cov)[1], (5, 1)), atol=1e-3

@@ -1,0 +1,54 @@
+"""External fields over a board that a robot moves: the earth's field, magnets, and other skins.
+
+The change of an external field since the no-load reading is unknown. Its prior is the field of one magnetic dipole, at
+a known distance from the board's centre, in an unknown direction and with an unknown moment. Such fields are nearly
+uniform over the board; how much they vary depends on the distance.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+# Distance of the dipole. On recording `fullnocontact1` of a moving hand whose fingers have skins (data/leaphand), 40 mm
+# is the most likely distance. A larger distance makes the map more accurate on simulated skins if sources are farther.
+DISTANCE_MM = 50.0
+DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
+
+
+def covariance(
+    chips_mm: Float[np.ndarray, "k 2"], sd_uT: float, distance_mm: float = DISTANCE_MM
+) -> Float[np.ndarray, "ch ch"]:
+    """Return the covariance of readings in an unknown external field, along the board's axes.
+
+    chips_mm: positions of the chips relative to the board's centre; all must be much closer than `distance_mm`. sd_uT:
+    standard deviation of each component of the field at the board's centre.
+    """
+    at_mm = np.column_stack([chips_mm, np.zeros(len(chips_mm))])
+    dipoles_mm = distance_mm * _directions(DIRECTIONS_N)
+    fields, at_centre = (_per_moment(places_mm, dipoles_mm) for places_mm in (at_mm, np.zeros((1, 3))))
+    return 3 * sd_uT**2 / (at_centre**2).sum() * fields @ fields.T
+
+
+def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
+    """Return a symmetric matrix that shrinks external fields in a reading to the size of its noise.
+
+    It is the whitening matrix of external field and noise, times the standard deviation of the noise. The part of a
+    reading that no external field explains is unchanged.
+    """
+    variances, axes = np.linalg.eigh(external_cov)
+    return (axes * (noise_uT / np.sqrt(np.maximum(variances, 0) + noise_uT**2))) @ axes.T
+
+
+def _per_moment(at_mm: Float[np.ndarray, "o 3"], dipoles_mm: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "o3 s3"]:
+    """Return the field at points per unit of each component of each dipole's moment (arbitrary unit)."""
+    off_mm = at_mm[:, None] - dipoles_mm
+    distance_mm = np.linalg.norm(off_mm, axis=2)[..., None, None]
+    tensor = 3 * off_mm[..., None] * off_mm[..., None, :] / distance_mm**5 - np.eye(3) / distance_mm**3
+    return tensor.transpose(0, 2, 1, 3).reshape(3 * len(at_mm), -1)
+
+
+def _directions(n: int) -> Float[np.ndarray, "n 3"]:
+    """Return n unit vectors that are evenly spread over the sphere, on a spiral with golden-angle steps."""
+    i = np.arange(n) + 0.5
+    z, angle = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
+    radius = np.sqrt(1 - z**2)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
