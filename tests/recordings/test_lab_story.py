@@ -26,7 +26,15 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
     settings |= {"experiments": ["lobo"], "split": {}}  # only one experiment: scene ci tests the others
-    for section in ("few_labels", "audit", "compare", "universal", "reference_methods", "random_presses"):
+    for section in (
+        "few_labels",
+        "audit",
+        "compare",
+        "universal",
+        "reference_methods",
+        "random_presses",
+        "recorded_limits",
+    ):
         del settings[section]
     with scene.open("w") as stream:
         YAML().dump(settings, stream)

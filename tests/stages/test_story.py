@@ -41,6 +41,7 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
     "reference_methods",
     "random_presses",
+    "recorded_limits",
     "touches",
     "population",
     "worlds",
