@@ -118,8 +118,8 @@ def number_places(place_mm: Float[np.ndarray, "m 2"]) -> Int64[np.ndarray, " m"]
 # --- Rigid registration with presses at known places ---
 
 CANDIDATES_N = 100  # random sets of places, of which the one with the largest least distance is used
-UNCHANGED, RIGID = "none", "rigid registration"
-LABELS, LABELS_RIGID = "labels of the model", "labels of the model, then rigid registration"
+# Uses of the presses at known places.
+UNCHANGED, SHIFT, RIGID, LABELS = "not used", "shift only", "rigid registration", "labels of the model"
 NETWORK = "network of the paper, other board"
 
 
@@ -138,6 +138,11 @@ class RigidMotion:
     def apply(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Move places."""
         return place_mm @ self.rotation.T + self.shift_mm
+
+
+def fit_shift(from_mm: Float[np.ndarray, "m 2"], to_mm: Float[np.ndarray, "m 2"]) -> RigidMotion:
+    """Fit a shift without rotation: the mean difference."""
+    return RigidMotion(np.eye(2), (to_mm - from_mm).mean(axis=0))
 
 
 def fit_rigid(from_mm: Float[np.ndarray, "m 2"], to_mm: Float[np.ndarray, "m 2"]) -> RigidMotion:
@@ -224,10 +229,9 @@ def score_draw(
     rows = []
     for method, predictions in regressors:
         for place_mm in predictions:
-            moves = fit_rigid(mean_by(board.press_i, place_mm)[draw.known], known_mm)
             keys = where | {"method": method, "presses_n": 0}
-            rows.append(keys | {"known": UNCHANGED} | score_unmoved(place_mm[draw.tested], true_mm))
-            rows.append(keys | {"known": RIGID} | score_moved(place_mm[draw.tested], true_mm, moves))
+            estimated_mm = mean_by(board.press_i, place_mm)[draw.known]
+            rows += [keys | scores for scores in score_motions(place_mm[draw.tested], true_mm, estimated_mm, known_mm)]
     for way, variant in {"rig": variants.rig[board.board], "nominal": variants.nominal}.items():
         for unlabelled in (draw.unlabelled[:0], draw.unlabelled):
             keys = where | {"method": f"universal, {WAYS[way]}", "presses_n": len(unlabelled)}
@@ -237,25 +241,16 @@ def score_draw(
 
 def score_universal(
     model: PriorModel, board: BoardPresses, draw: Draw, unlabelled: Int64[np.ndarray, " n"]
-) -> Iterator[dict[str, Any]]:
-    """Score the universal model: without known places, with registration, with labels, and with both.
-
-    With both, the motion is fitted to places that are estimated with the labels of the other known presses.
-    """
+) -> list[dict[str, Any]]:
+    """Score the universal model without known places, with motions that are fitted to them, and with labels."""
     true_mm, tested_uT = board.readings.place_mm[draw.tested], board.readings.db_uT[draw.tested]
     known, presses_uT = raise_forces(board.presses[draw.known]), board.presses.db_uT[unlabelled]
     calibration = model.calibrate(CalibrationData(board.rest_uT, presses_uT, area_uT=presses_uT))
     without, labelled = calibration.with_labels(no_labels()), calibration.with_labels(known)
-    place_mm = estimate_places(without, tested_uT)
-    yield {"known": UNCHANGED} | score_unmoved(place_mm, true_mm)
-    moves = fit_rigid(estimate_places(without, known.db_uT), known.place_mm)
-    yield {"known": RIGID} | score_moved(place_mm, true_mm, moves)
-    place_mm = estimate_places(labelled, tested_uT)
-    yield {"known": LABELS} | place_scores(place_mm - true_mm)
-    folds = list(calibration.held_out(known))
-    held_out_mm = np.concatenate([fold.evaluation.combined(1.0).place_mm for fold in folds])
-    moves = fit_rigid(held_out_mm, np.concatenate([fold.labels.place_mm for fold in folds]))
-    yield {"known": LABELS_RIGID} | score_moved(place_mm, true_mm, moves)
+    estimated_mm = estimate_places(without, known.db_uT)
+    scores = score_motions(estimate_places(without, tested_uT), true_mm, estimated_mm, known.place_mm)
+    error_mm = estimate_places(labelled, tested_uT) - true_mm
+    return [*scores, {"known": LABELS} | place_scores(error_mm)]
 
 
 def estimate_places(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n 2"]:
@@ -263,18 +258,25 @@ def estimate_places(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"]) ->
     return model.estimate(db_uT, [1.0])[0].place_mm
 
 
-def score_unmoved(place_mm: Float[np.ndarray, "t 2"], true_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
-    """Score places; also return the least squared error of any rigid motion, which is fitted to the tested readings."""
+def score_motions(
+    place_mm: Float[np.ndarray, "t 2"],
+    true_mm: Float[np.ndarray, "t 2"],
+    estimated_mm: Float[np.ndarray, "k 2"],
+    known_mm: Float[np.ndarray, "k 2"],
+) -> list[dict[str, Any]]:
+    """Score places of tested readings before and after motions from the estimated to the known places of presses.
+
+    `rigid_limit_mm2` is the least squared error of any rigid motion, which is fitted to the tested readings.
+    """
     best_mm = fit_rigid(place_mm, true_mm).apply(place_mm)
-    return place_scores(place_mm - true_mm) | {"rigid_limit_mm2": float(((best_mm - true_mm) ** 2).mean())}
-
-
-def score_moved(
-    place_mm: Float[np.ndarray, "t 2"], true_mm: Float[np.ndarray, "t 2"], motion: RigidMotion
-) -> dict[str, float]:
-    """Score places after a motion; also return its angle and the length of its shift."""
-    size = {"angle_deg": abs(motion.angle_deg), "shift_mm": float(np.linalg.norm(motion.shift_mm))}
-    return place_scores(motion.apply(place_mm) - true_mm) | size
+    limit = {"rigid_limit_mm2": float(((best_mm - true_mm) ** 2).mean())}
+    rows: list[dict[str, Any]] = [{"known": UNCHANGED} | place_scores(place_mm - true_mm) | limit]
+    for name, fit_motion in {SHIFT: fit_shift, RIGID: fit_rigid}.items():
+        motion = fit_motion(estimated_mm, known_mm)
+        size = {"shift_mm": float(np.linalg.norm(motion.shift_mm))}
+        size |= {"angle_deg": abs(motion.angle_deg)} if name == RIGID else {}
+        rows.append({"known": name} | place_scores(motion.apply(place_mm) - true_mm) | size)
+    return rows
 
 
 GROUP = ("method", "presses_n", "known")
@@ -721,11 +723,10 @@ REGISTRATION_MEANING = (
     "selects {known_n} presses at known places that are far from each other, and {presses_n} unlabelled presses. All "
     "rows are tested on the same readings: those of presses that are neither unlabelled nor at one of the known "
     "places. Rigid registration: the least-squares rotation and shift, without reflection, from the estimated to the "
-    "known places of the {known_n} presses. Labels: the universal model is conditioned on the {known_n} presses, with "
-    "their forces; a registration is then fitted to estimates of each of them from the labels of the others. Least "
-    "MSE_xy of a rigid motion: of one that is fitted to the tested readings themselves (a diagnostic, not a result). "
-    "Rotation and shift (at the middle of the skin): mean sizes. sd over draws: standard deviation of the percentage "
-    "within 1 mm."
+    "known places of the {known_n} presses. Shift only: the mean difference of these places. Labels: the universal "
+    "model is conditioned on the {known_n} presses, with their forces. Least MSE_xy of a rigid motion: of one that is "
+    "fitted to the tested readings themselves (a diagnostic, not a result). Rotation and shift (at the middle of the "
+    "skin): mean sizes. sd over draws: standard deviation of the percentage within 1 mm."
 )
 FORCES_MEANING = (
     "Mean ± standard deviation over the presses of a recording; in brackets, the standard deviation of the readings "
@@ -786,7 +787,7 @@ def tabulate_registration(numbers: Mapping[str, Any], source: str) -> pd.DataFra
     """Tabulate the scores of all methods without and with the presses at known places."""
     lines = []
     for row in numbers["registration"]["rows"]:
-        line = {"method": row["method"], "unlabelled presses": row["presses_n"], "known presses": row["known"]}
+        line = {"method": row["method"], "unlabelled presses": row["presses_n"], "known places": row["known"]}
         line |= {title: show(row.get(name)) for name, title in REGISTRATION_TITLES.items()}
         lines.append(line | {"source": source})
     used = {name: numbers[name] for name in ("draws_n", "known_n", "presses_n")}
@@ -798,7 +799,7 @@ def show_force(force_N: float | None, least_N: float, mark: str) -> str:
     """Write a force; `mark` is the format of forces that are not above the smallest recorded force."""
     if force_N is None:
         return "–"
-    return mark.format(f"{force_N:.2g}") if force_N <= least_N else f"{force_N:.2g}"
+    return mark.format(f"{force_N:.3g}") if force_N <= least_N else f"{force_N:.3g}"
 
 
 def force_line(line: Mapping[str, Any]) -> dict[str, Any]:
@@ -841,8 +842,8 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
     by_force = [
         {
             "board": line["board"], "force, N": f"{line['low_N']:g} to {line['high_N']:g}",
-            "readings": line["readings_n"], "median field change, µT": f"{line['median_uT']:.4g}",
-            "least field change, µT": f"{line['least_uT']:.3g}",
+            "readings": line["readings_n"], "median field change, µT": f"{line['median_uT']:.0f}",
+            "least field change, µT": f"{line['least_uT']:.0f}",
         }
         | {f"detected, %, baseline {name}": f"{pct:.4g}" for name, pct in line["detected_pct"].items()}
         | {"source": source}
@@ -866,7 +867,7 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot the field change of each press against its force, with the thresholds and both extrapolations."""
-    with drawing(3.8 * len(drawn), 3.8) as figure:
+    with drawing(3.8 * len(drawn), 4.4) as figure:
         panels = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
         for axes, (board, of_board) in zip(panels, drawn.items(), strict=True):
             force_N, change_uT = np.array(of_board["force_N"]), np.array(of_board["change_uT"])
@@ -874,8 +875,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             recorded_N = np.array([force_N.min(), force_N.max()])
             smaller_N = np.array([FIGURE_MIN_N, force_N.min()])
             law = of_board["factor_uT"], of_board["exponent"]
-            axes.plot(recorded_N, law[0] * recorded_N ** law[1], color=COLOURS[0], label="power law")
-            axes.plot(smaller_N, law[0] * smaller_N ** law[1], ":", color=COLOURS[0], label="extrapolated")
+            axes.plot(recorded_N, law[0] * recorded_N ** law[1], color=COLOURS[0], label="power law, median place")
+            axes.plot(smaller_N, law[0] * smaller_N ** law[1], ":", color=COLOURS[0], label="power law, extrapolated")
             weakest_uT = law[0] * force_N.min() ** law[1]
             axes.plot(
                 smaller_N, weakest_uT * smaller_N / force_N.min(), "--", color="0.5", label="extrapolated in proportion"
@@ -884,7 +885,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
                 axes.axhline(threshold_uT, color=colour, linewidth=1, label=f"threshold, baseline {name}")
             axes.set(xscale="log", yscale="log", xlabel="force / N", title=board)
         panels[0].set(ylabel="|dB| / µT", ylim=(10, None))
-        panels[-1].legend(fontsize=7, loc="lower right")
+        figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=2)
         figure.suptitle(
             f"Field change of presses, and thresholds of detection ({source})", x=0.01, ha="left", fontsize=11
         )

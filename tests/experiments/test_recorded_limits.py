@@ -78,6 +78,12 @@ def test_no_other_rotation_has_smaller_squared_distances():
     assert fitted == pytest.approx(searched, rel=1e-4)  # the grid of angles has steps of 0.1 degrees
 
 
+def test_a_shift_is_the_mean_difference():
+    motion = limits.fit_shift(np.array([[0.0, 0.0], [2.0, 1.0]]), np.array([[1.0, 0.0], [2.0, 3.0]]))
+    np.testing.assert_allclose(motion.apply(np.array([[5.0, 5.0]])), [[5.5, 6.0]])
+    assert motion.angle_deg == 0
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 99))
 def test_tested_readings_are_at_other_places_and_unlabelled_presses_are_not_tested(draw_i):
@@ -128,14 +134,14 @@ def test_registration_removes_a_rigid_error(scores):
 def test_a_registration_on_tested_readings_bounds_all_others(scores):
     """No rigid motion has a smaller squared error than the one that is fitted to the tested readings."""
     for row in scores:
-        if row["known"] == limits.RIGID:
+        if row["known"] in (limits.SHIFT, limits.RIGID):
             keys = {name: row[name] for name in ("method", "presses_n", "draw_i")} | {"known": limits.UNCHANGED}
             bound = next(other for other in scores if all(other[name] == value for name, value in keys.items()))
             assert bound["rigid_limit_mm2"] <= row["mse_xy_mm2"] + 1e-12
 
 
 def test_universal_model_is_scored_with_all_uses_of_the_known_presses(scores):
-    uses = {limits.UNCHANGED, limits.RIGID, limits.LABELS, limits.LABELS_RIGID}
+    uses = {limits.UNCHANGED, limits.SHIFT, limits.RIGID, limits.LABELS}
     for presses_n in (0, 20):
         for method in ("universal, boards of the rig", "universal, simulated alone"):
             found = {row["known"] for row in scores if row["method"] == method and row["presses_n"] == presses_n}
@@ -372,7 +378,7 @@ def test_tables_and_figure_show_all_results(scores, detection):
         assert (table["source"] == "recorded").all()
         assert not any("|" in str(column) for column in table.columns)  # a column separator of Markdown
     registration = tables["limits_registration"]
-    assert len(registration) == 2 + 2 * 2 * 4  # one regressor; two variants, with and without unlabelled presses
+    assert len(registration) == 3 + 2 * 2 * 4  # one regressor; two variants, with and without unlabelled presses
     assert "20 unlabelled presses" in registration.attrs["meaning"]
     forces = tables["limits_detection"]["force by power law, N"]
     assert forces[0].endswith("(extrapolated)")
