@@ -26,7 +26,8 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
     settings |= {"experiments": ["lobo"], "split": {}}  # only one experiment: scene ci tests the others
-    for section in ("few_labels", "audit", "compare", "universal", "reference_methods", "random_presses", "mounting"):
+    recorded = ("compare", "universal", "reference_methods", "random_presses", "mounting", "recorded_limits")
+    for section in ("few_labels", "audit", *recorded):
         del settings[section]
     with scene.open("w") as stream:
         YAML().dump(settings, stream)

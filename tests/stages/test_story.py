@@ -42,6 +42,7 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "reference_methods",
     "random_presses",
     "mounting",
+    "recorded_limits",
     "touches",
     "population",
     "worlds",

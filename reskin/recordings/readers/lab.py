@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int
 
 from reskin.errors import CaptureError
-from reskin.recordings.fault_policy import FaultPolicy, check_rows
+from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
 from reskin.recordings.header import Header
 from reskin.recordings.tables import (
     check_columns,
@@ -71,14 +71,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Return the contact rows as readings; the no-load field is the mean over the `noload` rows of the same press."""
     where = f"{header.capture}/{READINGS}"
-    table = _read_table(folder / READINGS, where)
-    if table.temperature_degC.shape[1] != header.chips_n:
-        chips_n = table.temperature_degC.shape[1]
-        raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
-            "header."
-        )
-    rows = check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
+    table, rows = _read_checked(folder, header, policy, where)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
     noload_uT = mean_by_group(table.b_uT[noload], table.press[noload], int(table.press[-1]) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
@@ -112,6 +105,27 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         **rows.account(),
         "ignored_columns_n": table.ignored_columns_n,
     }
+
+
+def read_noload(
+    folder: Path, header: Header, policy: FaultPolicy
+) -> tuple[Int[np.ndarray, " a"], Float64[np.ndarray, "a ch"]]:
+    """Return the fields of the single `noload` rows without faults, and the press of each, numbered as in `read`."""
+    table, rows = _read_checked(folder, header, policy, f"{header.capture}/{READINGS}")
+    noload = ~table.contact & rows.keep
+    return table.press[noload], table.b_uT[noload]
+
+
+def _read_checked(folder: Path, header: Header, policy: FaultPolicy, where: str) -> tuple[_Table, CheckedRows]:
+    """Read the file of a capture, and find its faulty rows."""
+    table = _read_table(folder / READINGS, where)
+    if table.temperature_degC.shape[1] != header.chips_n:
+        chips_n = table.temperature_degC.shape[1]
+        raise CaptureError(
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
+            "header."
+        )
+    return table, check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
 
 
 def _read_table(path: Path, where: str) -> _Table:

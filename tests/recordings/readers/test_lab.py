@@ -48,6 +48,14 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
+def test_single_noload_rows_are_read_with_their_press(tmp_path: Path) -> None:
+    press_i, b_uT = lab.read_noload(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
+    assert press_i.tolist() == [0, 0, 1]
+    assert b_uT[:, 0].tolist() == [100, 104, 90]
+    readings, _ = lab.read(tmp_path, HEADER, DEFAULT_POLICY)
+    np.testing.assert_allclose(readings.noload_uT[0], b_uT[press_i == 0].mean(axis=0))
+
+
 def test_contact_rows_become_readings(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.indentation.tolist() == [0, 0, 0, 1]
