@@ -193,7 +193,7 @@ OPTIONS_uT = (0.0, 30.0, 100.0, 140.0)
 
 
 def test_distance_of_magnets_on_recordings(shared_data):
-    """Print the most likely distance and size of external fields, by recording; `DISTANCE_MM` is from the first one."""
+    """Print the most likely distance and size of external fields, by recording (`DISTANCE_MM`)."""
     found = {}
     for name in ("fullnocontact1", "fullnocontact2", "0skin", "1skinnocontact"):
         hand, pads = read_hand(shared_data, name), PADS["with neighbours" if name.startswith("full") else "alone"][2]
