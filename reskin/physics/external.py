@@ -8,8 +8,8 @@ uniform over the board; how much they vary depends on the distance.
 import numpy as np
 from jaxtyping import Float
 
-# Distance of the dipole. On recording `fullnocontact1` of a moving hand whose fingers have skins (data/leaphand), 40 mm
-# is the most likely distance. A larger distance makes the map more accurate on simulated skins if sources are farther.
+# Distance of the dipole, chosen on recordings of a moving hand whose fingers have skins (data/leaphand), where 40 mm is
+# most likely, and on simulated skins, where a larger distance makes the map more accurate if sources are farther away.
 DISTANCE_MM = 50.0
 DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
 

@@ -128,7 +128,7 @@ def test_networks_and_distance_on_simulated_skins():
     ]
     print(f"\nSIMULATED, {skins_n} skins: % within 1 mm / MSE_xy in mm2; columns: {', '.join(FIELDS)}")
     within = {}
-    for sd_uT, distance_mm, networks in variants:
+    for sd_uT, distance_mm, networks in size(variants, variants[:3]):
         cov = external.covariance(np.array(CHIPS_MM), sd_uT, distance_mm) if sd_uT else None
         prior_model = PriorModel(new_map(shipped.tables, external_cov=cov), shipped.networks)
         scores = np.zeros((2, len(FIELDS), skins_n, 2))
@@ -163,7 +163,7 @@ def test_coverage_on_simulated_skins():
     skins = draw_prior_skins(prior, skins_n, SEED, "external powers, test", LAW_ERRORS[AS_TRAINED])
     print(f"\nSIMULATED, {skins_n} skins, magnets at 60 mm: coverage of 90 % intervals")
     for sd_uT in size((0.0, 10.0, 30.0, 70.0, 140.0, 300.0), (0.0, 30.0)):
-        for labels_n in (0, 10, 40):
+        for labels_n in size((0, 10, 40), (10,)):
             covered = []
             for i in range(skins_n):
                 pool, tested = split_presses(skins, i, SEED)
@@ -193,16 +193,16 @@ OPTIONS_uT = (0.0, 30.0, 100.0, 140.0)
 
 
 def test_distance_of_magnets_on_recordings(shared_data):
-    """Print the most likely distance and size of external fields, by recording; `DISTANCE_MM` is from the first one."""
+    """Print the most likely distance and size of external fields, by recording (`DISTANCE_MM`)."""
     found = {}
     for name in ("fullnocontact1", "fullnocontact2", "0skin", "1skinnocontact"):
         hand, pads = read_hand(shared_data, name), PADS["with neighbours" if name.startswith("full") else "alone"][2]
         db_uT = to_board(hand.db_uT[:, pads].reshape(-1, 15))
         second_uT2 = db_uT.T @ db_uT / len(db_uT)
         likelihoods = {}
-        for distance_mm in (30, 35, 40, 45, 50, 60, 70, 85, 100, 150, 300):
+        for distance_mm in (30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 85.0, 100.0, 150.0, 300.0):
             unit = external.covariance(np.array(CHIPS_MM), 1.0, distance_mm)
-            for sd_uT in (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 280):
+            for sd_uT in (5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0, 140.0, 200.0, 280.0):
                 cov = sd_uT**2 * unit + hand.noise_uT**2 * np.eye(15)
                 deviance = np.linalg.slogdet(cov)[1] + np.trace(np.linalg.solve(cov, second_uT2))
                 likelihoods[distance_mm, sd_uT] = -len(db_uT) / 2 * deviance
