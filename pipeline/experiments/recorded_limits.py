@@ -496,22 +496,19 @@ class Changes(NamedTuple):
 def changes(recording: Recording, baseline: str) -> Changes:
     """Subtract a baseline from the readings of a recording.
 
-    From a no-load reading, the mean of the other no-load readings of its press is subtracted if the baseline is that of
-    each press. The first press has no earlier one, so it is left out for the other baselines.
+    If the baseline is that of each press, the mean of the other no-load readings of its press is subtracted from a
+    no-load reading; a single reading is left out. The first press is left out for the other baselines.
     """
     mean_uT = mean_by(recording.noload_press_i, recording.noload_uT)
     base_uT = {EACH: mean_uT, PREVIOUS: np.roll(mean_uT, 1, axis=0), START: np.broadcast_to(mean_uT[0], mean_uT.shape)}
     noload_uT = recording.noload_uT - base_uT[baseline][recording.noload_press_i]
-    if baseline == EACH:
-        count_n = np.bincount(recording.noload_press_i)[recording.noload_press_i, None]
-        noload_uT = noload_uT * count_n / (count_n - 1)
-    odd = recording.noload_press_i % 2 == 1
-    used = (recording.noload_press_i > 0) | (baseline == EACH)
-    pressed = (recording.press_i > 0) | (baseline == EACH)
     contact_uT = recording.b_uT - base_uT[baseline][recording.press_i]
-    return Changes(
-        noload_uT[odd & used], noload_uT[~odd & used], contact_uT[pressed], recording.force_N[pressed]
-    )  # fmt: skip
+    used, pressed, odd = recording.noload_press_i > 0, recording.press_i > 0, recording.noload_press_i % 2 == 1
+    if baseline == EACH:
+        count_n = np.bincount(recording.noload_press_i)[recording.noload_press_i]
+        noload_uT *= (count_n / np.maximum(count_n - 1, 1))[:, None]
+        used, pressed = count_n > 1, np.ones_like(pressed)
+    return Changes(noload_uT[odd & used], noload_uT[~odd & used], contact_uT[pressed], recording.force_N[pressed])
 
 
 def join_changes(parts: Sequence[Changes]) -> Changes:

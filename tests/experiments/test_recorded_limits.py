@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,20 @@ from hypothesis.extra.numpy import arrays
 from sklearn.metrics import r2_score
 
 from pipeline.experiments import recorded_limits as limits
+from pipeline.experiments.compare import Compare, chip_rotations
 from pipeline.experiments.random_presses import BoardPresses
 from pipeline.experiments.recorded_limits import Predictions, RecordedLimits, Recording
-from pipeline.training.universal_variants import Variant, Variants
-from reskin.data.rows import Rows
+from pipeline.settings import read_settings
+from pipeline.stages.ingest import ingest
+from pipeline.training.universal_variants import Frame, Variant, Variants
+from reskin import io
+from reskin.data.rows import Rows, Selection, load_rows
+from reskin.data.splits import render_folds
 from reskin.errors import SchemaError
 from reskin.logs import estimate_after
 from reskin.models.classical import Ridge
+from reskin.recordings.header import HEADER_FILE, render
+from reskin.recordings.readers.lab import READINGS
 from reskin.seeds import rng_for
 from reskin.universal.batches import SkinPrior
 from reskin.universal.calibration import LabelledPresses
@@ -25,7 +33,8 @@ from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import PriorModel
 from reskin.universal.network import draw_weights
 from reskin.universal.population import grid
-from tests.universal.skins import SETUP, make_tables, poked_uT
+from tests.recordings.headers import make_header
+from tests.universal.skins import ROOT, SETUP, make_tables, poked_uT
 
 SECTION = RecordedLimits(
     known_n=5, presses_n=20, draws_n=2, methods={"ridge": Ridge(method="ridge", inputs="raw", alpha=1e-3)},
@@ -104,12 +113,17 @@ def test_too_few_places_are_an_error():
         limits.draw_presses(board, SECTION.model_copy(update={"known_n": 65}), 2021, 0)
 
 
+def make_variant() -> Variant:
+    """Return a model with the map of the synthetic skin, and networks that are not trained."""
+    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "recorded limits"))])
+    return Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
+
+
 @pytest.fixture(scope="module")
 def scores() -> list[dict]:
     """Return the scores of a regressor whose errors are a rigid motion, and of both variants of an untrained model."""
     board = make_board()
-    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "recorded limits"))])
-    variant = Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
+    variant = make_variant()
     moved_mm = board.readings.place_mm @ rotation(10).T + [2, -1]
     regressors = [Predictions("moved", [moved_mm, moved_mm])]
     variants = Variants(variant, {"b1": variant})
@@ -236,7 +250,7 @@ def test_presses_without_a_known_shear_force_are_an_error():
 def test_presses_at_one_place_are_in_the_same_fold():
     presses = limits.force_presses(make_rows(True))
     own = np.flatnonzero(presses.board == "b2")
-    folds = limits.split_places(presses, own, 5, 2021)
+    folds = limits.split_places(presses, own, 4, 2021)
     assert sorted(np.concatenate([test for _, test in folds])) == sorted(own)
     for train, test in folds:
         places = [{tuple(place) for place in presses.place_mm[part]} for part in (train, test)]
@@ -383,3 +397,70 @@ def test_tables_and_figure_show_all_results(scores, detection):
     forces = tables["limits_detection"]["force by power law, N"]
     assert forces[0].endswith("(extrapolated)")
     assert "threshold, baseline before each press" in limits.figures(results, drawn, "recorded")["recorded_limits.svg"]
+
+
+# --- The whole stage ---
+
+COLUMNS = ["indent", "phase", "x_mm", "y_mm"]
+COLUMNS += [f"{name}{chip}" for chip in range(5) for name in ("T", "Bx", "By", "Bz")] + ["Fx", "Fy", "Fz"]
+
+
+def write_capture(folder: Path, frame: Frame, board: str, force_N: float) -> None:
+    """Write a made-up recording of layout lab: one press at each place of the grid, with noise but without drift."""
+    rng, place_mm = rng_for(0, board, force_N), grid()
+    number = {"board1": np.array([0.5, -0.5, 0.3]), "board2": np.array([-0.5, 0.2, -0.3])}[board]
+    force_N = force_N * rng.uniform(0.8, 1.2, len(place_mm))
+    change_uT = poked_uT(place_mm, force_N, number).reshape(-1, 5, 3)
+    change_uT = np.einsum("kji,nkj->nki", frame.turn, change_uT)  # from the board's axes to the chips'
+    lines = [",".join(COLUMNS)]
+    for i, (label_mm, force) in enumerate(zip(frame.label(place_mm), force_N, strict=True)):
+        for phase in ["noload"] * 3 + ["contact"] * 2:
+            pressed = float(phase == "contact")
+            b_uT = pressed * change_uT[i] + 100 * np.arange(15).reshape(5, 3) + 4 * rng.standard_normal((5, 3))
+            fields = [f"21.5,{','.join(f'{value:.3f}' for value in chip_uT)}" for chip_uT in b_uT]
+            forces = f"{0.1 * pressed * label_mm[0]:.3f},{0.02 * pressed * i:.3f},{-pressed * force:.3f}"
+            lines.append(f"{i},{phase},{label_mm[0]:g},{label_mm[1]:g},{','.join(fields)},{forces}")
+    folder.mkdir(parents=True)
+    (folder / READINGS).write_text("\n".join(lines) + "\n")
+    header = make_header(capture=folder.name, board=board, skin=f"skin of {board}".replace(" ", "-"))
+    (folder / HEADER_FILE).write_text(render(header))
+
+
+def test_stage_runs_on_two_made_up_boards(tmp_path, monkeypatch):
+    settings = read_settings("lab", ROOT)
+    content = {name: settings.of_scene[name] for name in ("seed", "selection", "compare", "recorded_limits")}
+    changed = {"draws_n": 2, "presses_n": 12, "methods": "tiny", "false_alarm_fraction": 0.01}
+    content["recorded_limits"] = content["recorded_limits"] | changed
+    settings = replace(settings, of_scene=content, captures=())
+    section = settings.section(Compare, "compare")
+    frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
+    for board in ("board1", "board2"):
+        for force_N in (1.0, 4.0):
+            name = f"{board}_{force_N:g}N"
+            write_capture(tmp_path / "raw" / name, frame, board, force_N)
+            ingest(settings, tmp_path / "raw" / name, tmp_path / "indentations" / f"{name}.parquet")
+    files = sorted((tmp_path / "indentations").glob("*.parquet"))
+    rows = load_rows(files, settings.section(Selection, "selection"))
+    io.write_json(tmp_path / "folds.json", render_folds([file.stem for file in files], rows, []))
+    variant = make_variant()
+    variants = Variants(variant, {"board1": variant, "board2": variant})
+    monkeypatch.setattr(limits, "read_variants", lambda known, models: variants)
+    middle = [lambda db_uT: np.full((len(db_uT), 3), 8, np.float32)]  # "networks" that always predict the middle
+    monkeypatch.setattr(limits, "networks_held_out", lambda networks, board: middle)
+    limits.recorded_limits(
+        settings, settings.section(RecordedLimits, "recorded_limits"), tmp_path / "indentations", tmp_path / "raw",
+        tmp_path / "folds.json", tmp_path, tmp_path, tmp_path / "results.json",
+    )  # fmt: skip
+    results = io.read_json(tmp_path / "results.json")
+    numbers = results["numbers"]
+    assert all(len(table) for table in limits.tables(numbers, "recorded").values())
+    assert limits.figures(numbers, results["drawn"], "recorded")["recorded_limits.svg"].startswith("<?xml")
+    registration = {(row["method"], row["presses_n"], row["known"]): row for row in numbers["registration"]["rows"]}
+    constant = registration[limits.NETWORK, 0, limits.UNCHANGED]
+    assert constant["accuracy_pct"]["mean"] < 5  # only presses in the middle
+    labelled = registration["universal, simulated alone", 12, limits.LABELS]
+    assert labelled["accuracy_pct"]["mean"] > 90  # the made-up skins follow the formula of the map
+    (each, *_) = [row for row in numbers["detection"]["rows"] if row["board"] == "board2"]
+    assert each["detected_pct"] == 100
+    forces = {line["recording"]: line for line in numbers["shear"]["forces"]}
+    assert forces["board1_4N"]["Fx"]["mean_N"] == pytest.approx(-0.8, abs=1e-3)  # -0.1 N per mm, mean of x: 8 mm
