@@ -238,9 +238,6 @@ def _clear(value):
 CELL_SD_MM = 0.2  # least standard deviation of a place: positions within a cell of the lattice are not distinguished
 TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
 LEAST = math.log(TINY)
-# Power of the map's probabilities of forces if the map alone estimates forces. It is small, because the map is too sure
-# of forces that the law hardly distinguishes. Chosen on both boards of scene lab.
-FORCE_POWER = 0.3
 FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one
 
 
@@ -269,16 +266,16 @@ def means(
 
 def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
-    map_power: float, power: float,
+    map_power: float, power: float, force_power: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Multiply the map's marginal probabilities of place and of force by normal distributions; return the moments.
 
-    The fourth array contains the mean log forces of the map alone, weighted by the power `FORCE_POWER` of its
+    The fourth array contains the mean log forces of the map alone, weighted by the power `force_power` of its
     probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
     likelihoods. power: power of the product; it affects standard deviations only.
     """
     moments = np.empty((len(deviance), 6))
-    _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), moments)
+    _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power, force_power), moments)
     return moments[:, :2], moments[:, 2:4], moments[:, 4], moments[:, 5]
 
 
@@ -320,7 +317,7 @@ def _products(deviance, best, at, normals, powers, found):
             of_place[p] -= 0.5 * ((off_x / sd_x) ** 2 + (off_y / sd_y) ** 2)
         for q in range(len(of_force)):
             combined[q] = of_force[q] - 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
-            of_force[q] *= FORCE_POWER
+            of_force[q] *= powers[2]
         x, y, _, _ = _moments(of_place, place_mm, (0.0, 0.0), 1.0, likely)
         _, _, xx, yy = _moments(of_place, place_mm, (x, y), powers[1], likely)
         found[r, 0], found[r, 1], found[r, 2], found[r, 3] = x, y, _sd_mm(xx), _sd_mm(yy)

@@ -69,6 +69,9 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
+# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map is too sure
+# of forces. The best of four values on simulated skins (tests/benchmarks/test_force_benchmark.py).
+FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
@@ -144,7 +147,7 @@ class Evaluation:
         np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
         np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
         place_mm, sd_mm, force_N, map_log_N = products(
-            likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power
+            likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power, FORCE_POWER
         )
         return place_mm, sd_mm, (np.log(force_N), map_log_N)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reskin.seeds import rng_for
-from reskin.universal.kernels import CELL_SD_MM, FORCE_POWER, LANES_N, Lattice, in_blocks, means, products, whiten
+from reskin.universal.kernels import CELL_SD_MM, LANES_N, Lattice, in_blocks, means, products, whiten
 
 AXIS_mm = np.arange(-8, 8.01, 0.4)
 AT = Lattice(np.stack(np.meshgrid(AXIS_mm, AXIS_mm, indexing="ij"), axis=-1).reshape(-1, 2), np.log([0.5, 1, 2, 4, 8]))
@@ -51,7 +51,7 @@ def test_product_equals_marginal_distribution_times_normal_distributions(power):
     normals = np.column_stack(
         [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
     )
-    place_mm, sd_mm, force_N, map_log_N = products(*with_best(total()), AT, normals, 0.6, power)
+    place_mm, sd_mm, force_N, map_log_N = products(*with_best(total()), AT, normals, 0.6, power, 0.3)
     off = (AT.place_mm - normals[:, None, :2]) / normals[:, None, 2:4]
     of_place = probabilities(0.6).sum(axis=2) * np.exp(-0.5 * (off**2).sum(axis=2))
     of_force = probabilities(0.6).sum(axis=1) * np.exp(-0.5 * ((AT.log_N - normals[:, 4:5]) / normals[:, 5:]) ** 2)
@@ -60,14 +60,14 @@ def test_product_equals_marginal_distribution_times_normal_distributions(power):
     np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)
     np.testing.assert_allclose(sd_mm, spread(raised, place_mm), atol=1e-6)
     np.testing.assert_allclose(np.log(force_N), of_force @ AT.log_N, atol=1e-6)
-    of_map = probabilities(0.6).sum(axis=1) ** FORCE_POWER
+    of_map = probabilities(0.6).sum(axis=1) ** 0.3
     np.testing.assert_allclose(map_log_N, of_map / of_map.sum(axis=1, keepdims=True) @ AT.log_N, atol=1e-6)
 
 
 def test_product_of_two_gaussians():
     second_mm, second_sd = np.array([2.5, 0.0]), np.array([1.0, 0.8])
     second = np.concatenate([second_mm, second_sd, np.ones(2)])[None]
-    place_mm, sd_mm, *_ = products(*with_best(total()[:1]), AT, second, 1.0, 1.0)
+    place_mm, sd_mm, *_ = products(*with_best(total()[:1]), AT, second, 1.0, 1.0, 1.0)
     var = 1 / (1 / FIRST_SD_mm**2 + 1 / second_sd**2)
     np.testing.assert_allclose(place_mm[0], var * (FIRST_mm / FIRST_SD_mm**2 + second_mm / second_sd**2), atol=1e-4)
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
@@ -77,7 +77,7 @@ def test_excluded_place_keeps_the_minimum_probability():
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0
     normals = np.array([[8.0, 8.0, 0.1, 0.1, 1.0, 1.0]])
-    place_mm, sd_mm, *_ = products(*with_best(far), AT, normals, 1.0, 1.0)
+    place_mm, sd_mm, *_ = products(*with_best(far), AT, normals, 1.0, 1.0, 1.0)
     np.testing.assert_allclose(place_mm, [[8.0, 8.0]], atol=0.05)
     assert np.isfinite(sd_mm).all()
 
@@ -85,7 +85,7 @@ def test_excluded_place_keeps_the_minimum_probability():
 def test_nan_gives_nan():
     none = np.full((1, total().shape[1]), np.nan, np.float32)
     normals = np.ones((1, 6))
-    for found in (means(*with_best(none), AT, 1.0), products(*with_best(none), AT, normals, 1.0, 1.0)):
+    for found in (means(*with_best(none), AT, 1.0), products(*with_best(none), AT, normals, 1.0, 1.0, 1.0)):
         assert all(np.isnan(part).all() for part in found)
 
 
