@@ -141,6 +141,10 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
     say("1 of 3: simulating the map ...")
     tables = tabulate(layout.law, layout.all_spreads, inputs.prior.setup, layout.tabulated_N)
     times_s.append(time.process_time())
+    largest_mT = (
+        float(np.abs(layout.to_chips(tables.rest_uT + tables.mean_uT.reshape(-1, layout.channels_n))).max()) / 1e3
+    )
+    say(f"fields up to {largest_mT:.1f} mT are expected on the nominal skin: your chips must measure twice that")
     say("2 of 3: training the network on simulated skins ...")
     networks = train_networks(inputs.prior, inputs.training, inputs.seed)
     times_s.append(time.process_time())

@@ -111,6 +111,11 @@ class BoardLayout(Strict):
         return self.area.half_x_mm, self.area.half_y_mm
 
     @property
+    def places(self) -> Area:
+        """The places that may be pressed."""
+        return Area(*self.half_mm, self.area.octagon)
+
+    @property
     def chips_mm(self) -> Float[np.ndarray, "k 2"]:
         """Positions of the chips relative to the board's centre."""
         return np.array([(chip.x_mm, chip.y_mm) for chip in self.chips])
@@ -156,10 +161,9 @@ class BoardLayout(Strict):
         design = parse(SkinDesign, nominal("skin", changes), f"{NOMINAL_FILE}: skin")
         factor = max(1.0, max(self.skin.size_mm) / SIDE_MM)
         rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
-        area = Area(*self.half_mm, self.area.octagon)
         return Setup(
             design, self.chips_mm, self.gap_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse,
-            area,
+            self.places,
         )  # fmt: skip
 
     def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:

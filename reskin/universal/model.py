@@ -719,7 +719,7 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
         field.name: parts.pop(field.name).astype(float) for field in fields(Tables) if field.name not in UNSTORED
     }
     layout = as_layout(card["layout"], f"{card_file}: layout")
-    tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.setup().area)
+    tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.places)
     if len(tables.rest_uT) != layout.channels_n:
         chips_n, remedy = len(tables.rest_uT) // 3, "Use the card that was written with the model."
         raise SchemaError(card_file, "layout", f"of {chips_n} chips", f"{len(layout.chips)} chips", remedy)

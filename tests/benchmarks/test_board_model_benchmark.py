@@ -1,9 +1,9 @@
-"""Accuracy of a model made for a layout: on simulated skins of the layout, and on recorded eFlesh pads.
+"""Accuracy of models made for layouts: on simulated skins, on recorded eFlesh pads and boards with fewer chips.
 
 Run it with the folders of the recordings, which are not part of the project (docs/learning.md, "Models for other
-boards"); six minutes:
+boards"); ten minutes:
 
-    RESKIN_BENCHMARKS=full RESKIN_EFLESH=DATASETS RESKIN_EFLASH7=FOLDER \
+    RESKIN_BENCHMARKS=full RESKIN_EFLESH=DATASETS RESKIN_EFLASH7=FOLDER RESKIN_LAB=FOLDER \
         pytest -s tests/benchmarks/test_board_model_benchmark.py
 
 Labels are drawn from presses that come before all tested presses. The published errors of eFlesh, 0.5 mm and 0.27 N,
@@ -33,10 +33,11 @@ from reskin.recordings.readers import READERS
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from reskin.universal.law import simulate_uT
-from reskin.universal.layout import read_layout
+from reskin.universal.layout import BoardLayout, read_layout
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.presses import cosines, magnitudes_uT
+from reskin.universal.presses import pool as pool_captures
 from tests.benchmarks import FULL, size
 from tests.recordings.headers import DEFAULT_POLICY, PARAMS, make_header
 
@@ -60,10 +61,12 @@ class Presses:
         return Presses(self.db_uT[which], self.place_mm[which], self.force_N[which], self.noload_uT)
 
 
-def by_model(model: Universal, pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
+def by_model(
+    model: Universal, pool: Presses, tested: Presses, labels_n: int, *, area: bool = False
+) -> Float[np.ndarray, "m 3"]:
     """Calibrate a model to 65 unlabelled presses of a pool, and to labels of the first of them."""
     noload_uT = pool.noload_uT
-    model.zero(noload_uT).see(noload_uT + pool.db_uT[:FULL_SET_N])
+    model.zero(noload_uT).see(noload_uT + pool.db_uT[:FULL_SET_N], area=area)
     if labels_n:
         labels = pool[np.arange(labels_n)]
         known = np.isfinite(labels.force_N).all()
@@ -150,13 +153,16 @@ def presses_of(
     return Presses(db_uT, np.broadcast_to(place_mm, (len(kept), 2))[kept], readings.Fz_N.astype(float)[kept], noload_uT)
 
 
+def make(layout: BoardLayout) -> Universal:
+    return make_model(layout, read_inputs(layout=layout))
+
+
 @cache
 def model_for(name: str) -> Universal:
     """Make the model for a layout of the project; at tiny size and for the paper's board, load the shipped model."""
     if not FULL or name == "reskin":
         return load_universal()
-    layout = read_layout(name)
-    return make_model(layout, read_inputs(layout=layout))
+    return make(read_layout(name))
 
 
 @pytest.fixture
@@ -254,6 +260,51 @@ def test_forces_on_a_pad_of_nine_places(model: Universal) -> None:
         pools.append(presses_of(readings, place_mm, touched & early, rest_uT))
         tests.append(presses_of(readings, place_mm, touched & ~early, rest_uT))
     compare("forces, eflash7", model, *(_joined(parts) for parts in (pools, tests)), "N")
+
+
+@pytest.mark.parametrize("omitted", [None, 4, 0])
+def test_recorded_boards_with_fewer_chips(omitted: int | None) -> None:
+    """Omit a chip of the paper's board from layout and recordings, as if the board had four chips; test both boards.
+
+    Labels are drawn from a third of the presses of a board; the others are tested.
+    """
+    folder, layout = folder_of("RESKIN_LAB"), read_layout("reskin")
+    kept = [i for i in range(len(layout.chips)) if i != omitted]
+    fewer = layout.model_copy(update={"name": "fewer", "chips": tuple(layout.chips[i] for i in kept)})
+    model = load_universal() if omitted is None else make(fewer)
+    rows: dict[tuple[int, str], list[tuple[Score, Score]]] = {}
+    misfits = []
+    for board in ("board1", "board2"):
+        parts = [read(file, "lab", {})[0] for file in sorted(folder.glob(f"{board}_depth*.csv"))]
+        recorded = pool_captures(parts)
+        place_mm = recorded.place_mm * (1, -1) + (
+            0,
+            2 * layout.centre_mm[1],
+        )  # y of the labels is opposite to the board's
+        channels = (len(place_mm), 3 * len(kept))
+        all_presses = Presses(
+            recorded.db_uT[:, kept].reshape(channels), place_mm, recorded.force_N,
+            recorded.noload_uT[:, kept].reshape(channels).mean(axis=0),
+        )  # fmt: skip
+        for seed in range(SEEDS_N):
+            order = rng_for(seed, "fewer", board).permutation(len(place_mm))
+            pool, tested = all_presses[order[:FULL_SET_N]], all_presses[order[FULL_SET_N:]]
+            for labels_n in LABELS_N:
+                found = {"universal": by_model(model, pool, tested, labels_n, area=True)}
+                misfits.append(model.misfit)
+                if labels_n:
+                    found |= {"kernel ridge": by_ridge(pool, tested, labels_n)}
+                for method, predicted in found.items():
+                    scores = score_places(predicted, tested), score_forces(predicted, tested)
+                    rows.setdefault((labels_n, method), []).append(scores)
+    for (labels_n, method), scores in rows.items():
+        for i, unit in enumerate(("mm", "N")):
+            say(
+                f"paper's board without chip {omitted} | {labels_n} labels | {method}",
+                [each[i] for each in scores],
+                unit,
+            )
+    print(f"median misfit of the unlabelled presses {np.median(misfits):.2f}")
 
 
 def _joined(parts: Sequence[Presses]) -> Presses:

@@ -1,5 +1,6 @@
 """Tests of a universal model that is made for another board: its file, its accuracy on simulated skins, refusals."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 from reskin.universal.batches import TrainingSettings
 from reskin.universal.layout import read_layout
-from reskin.universal.model import FILE, load_universal
+from reskin.universal.model import FILE, Universal, load_universal
 from tests.live.boards import make_script, play_to_skin
 
 SPREADS, CHIP = parse(Spreads, nominal("spreads"), "spreads"), parse(ChipDesign, nominal("chip"), "chip")
@@ -44,7 +45,7 @@ skin:
   thickness_mm: 2.5
   polarity: checkerboard
   flipped: false
-  magnetisation: 1.0
+  magnetisation: 0.6
   modulus_MPa: 0.19
 tip_radius_mm: 3.0
 area: {half_x_mm: 5.0, half_y_mm: 4.0, octagon: false}
@@ -67,7 +68,10 @@ def made(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shipping, "CALIBRATION_SKINS_N", 1)
         patch.setattr(shipping, "read_inputs", few)
-        shipping.make(folder / "square.yaml", folder / "square.safetensors", lambda _: None)
+        said: list[str] = []
+        shipping.make(folder / "square.yaml", folder / "square.safetensors", said.append)
+    (fields,) = [line for line in said if "mT" in line]
+    assert 1.0 < float(re.findall(r"up to ([0-9.]+) mT", fields)[0]) < 6.5
     return folder / "square.safetensors"
 
 
@@ -86,13 +90,17 @@ def test_simulated_presses_of_the_board_are_placed_within_1_mm(made, labels_n, l
 
 
 def test_presses_of_the_simulator_of_boards_are_placed_within_1_mm(made):
-    # This simulator has its own code for positions and turns of chips.
+    # This simulator has its own code for positions and turns of chips. With a wrong turn of one chip, places are wrong.
     model = load_universal(file=made)
-    layout, rng, within = model.layout, rng_for(0, "square"), []
+    layout, rng, within, with_wrong_turn = model.layout, rng_for(0, "square"), [], []
+    turned = (layout.chips[0].model_copy(update={"turn_deg": 270}), *layout.chips[1:])
+    wrong = Universal(model.tables, model.networks, model.powers, layout.model_copy(update={"chips": turned}))
     design = BoardDesign(
         chips_xy_mm=tuple(map(tuple, layout.chips_mm.tolist())), chips_turn_deg=layout.turns_deg, gap_mm=layout.gap_mm
     )
-    skin_design = layout.setup().design.model_copy(update={"modulus_kPa": 190.0})
+    usual = layout.setup().design
+    strength_T = layout.skin.magnetisation * usual.saturation_T  # with a stronger magnetisation, some chips saturate
+    skin_design = usual.model_copy(update={"modulus_kPa": 190.0, "saturation_T": strength_T})
     for name in ("b0", "b1", "b2"):
         board = draw_board(design, SPREADS, seed=5, name=name)
         skin = draw_skin(
@@ -103,10 +111,12 @@ def test_presses_of_the_simulator_of_boards_are_placed_within_1_mm(made):
         rest_T, change_T = changes_of_field(board, skin, np.column_stack([place_mm, depth_mm]) * milli)
         noload_uT, _ = read_field(rest_T[None], board, design=CHIP, rng=rng)
         b_uT, _ = read_field(rest_T + change_T, board, design=CHIP, rng=rng)
-        model.zero(noload_uT).see(b_uT[:40])
-        off_mm = model.predict(b_uT[40:])[:, :2] - layout.centre_mm - place_mm[40:]
-        within.append((np.abs(off_mm) <= 1).all(axis=1).mean())
-    assert np.mean(within) > 0.6
+        for each, found in ((model, within), (wrong, with_wrong_turn)):
+            each.zero(noload_uT).see(b_uT[:40])
+            off_mm = each.predict(b_uT[40:])[:, :2] - layout.centre_mm - place_mm[40:]
+            found.append((np.abs(off_mm) <= 1).all(axis=1).mean())
+    assert np.mean(within) > 0.8
+    assert np.mean(with_wrong_turn) < 0.5
 
 
 def test_readings_of_another_number_of_chips_are_refused(made):

@@ -85,7 +85,7 @@ def test_saved_networks_predict_the_same(tmp_path):
 
 @pytest.fixture(autouse=True)
 def _synthetic_skins(monkeypatch):
-    draw = lambda centre, spreads, setup, n, rng: make_population(n, rng)  # noqa: E731
+    draw = lambda centre, spreads, setup, n, rng, forces: make_population(n, rng)  # noqa: E731
     monkeypatch.setattr(universal, "draw_population", draw)
 
 
