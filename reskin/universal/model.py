@@ -69,8 +69,8 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
-# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map is too sure
-# of forces. The best of four values on simulated skins (tests/benchmarks/test_force_benchmark.py).
+# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map is too
+# sure of forces. The best of four values on simulated skins (tests/benchmarks/test_force_benchmark.py).
 FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
