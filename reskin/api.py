@@ -336,7 +336,9 @@ def load_model(file: Path | str) -> Model:
     return Model(read_network(Path(file)))
 
 
-def load_universal(calibration: Path | str | None = None, *, file: Path | str | None = None) -> Universal:
+def load_universal(
+    calibration: Path | str | None = None, *, file: Path | str | None = None, external_uT: float = 0.0
+) -> Universal:
     """Load the universal model for the paper's board, or one for another board. It needs no data from your skin.
 
     Its methods calibrate the model to a skin: `zero` accepts readings without contact, `see` accepts presses at unknown
@@ -350,6 +352,9 @@ def load_universal(calibration: Path | str | None = None, *, file: Path | str | 
     file : path, optional
         A model (.safetensors, with its JSON card) that `reskin model make` made for a board. Default: the model for
         the paper's board, which comes with the library.
+    external_uT : float
+        For a board that a robot moves: standard deviation in uT of each component of the external field's change since
+        the no-load reading, about 30 for the earth's field. Default: 0, no external field.
 
     Returns
     -------
@@ -358,7 +363,8 @@ def load_universal(calibration: Path | str | None = None, *, file: Path | str | 
     Raises
     ------
     ReskinError
-        If a file is missing or is not a calibration or a model, or the calibration is for another board.
+        If a file is missing or is not a calibration or a model, the calibration is for another board, or `external_uT`
+        is out of range.
 
     Examples
     --------
@@ -370,7 +376,7 @@ def load_universal(calibration: Path | str | None = None, *, file: Path | str | 
     from reskin.universal.model import FILE
     from reskin.universal.model import load_universal as load
 
-    return load(calibration, file=FILE if file is None else file)
+    return load(calibration, file=FILE if file is None else file, external_uT=external_uT)
 
 
 @overload

@@ -70,7 +70,10 @@ def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:
     """Return the keys and indices that locate an error, without the names of types that pydantic adds to `loc`."""
     kept = []
     for i, part in enumerate(loc):
-        known = part in value if isinstance(value, dict) else isinstance(value, list | tuple) and isinstance(part, int)
+        if isinstance(value, list | tuple):
+            known = isinstance(part, int) and part < len(value)
+        else:
+            known = isinstance(value, dict) and part in value
         if known or i == len(loc) - 1:
             kept.append(str(part))
         value = value[part] if known else value

@@ -161,6 +161,8 @@ def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Net
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
         return [read_network(file) for file in files] or load_universal(external_uT=external_uT)
+    if missing := [file for file in files if not file.exists()]:
+        raise ParamsError(f"{missing[0]}: file not found. Check the path.")
     if max(len(made), len(calibrations)) > 1 or len(made) + len(calibrations) < len(files):
         kind = "universal model" if made else "calibration"
         remedy = "Use it alone, or a universal model with one calibration."

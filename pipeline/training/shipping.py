@@ -90,7 +90,7 @@ def calibrate(
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
     fields_uT, centre_mm = (skins.rest_uT[i][None], pool.db_uT, tested.db_uT), np.array(model.layout.centre_mm)
     rest_uT, pool_uT, tested_uT = (model.layout.to_chips(db_uT) for db_uT in fields_uT)
-    model.zero(rest_uT)
+    model.zero(rest_uT, turned=False)
     if presses_n:
         model.see(rest_uT + pool_uT[:presses_n], even=even)
     if labels_n:
@@ -172,6 +172,8 @@ def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> No
     for file in (out, out.with_suffix(".json")):
         if file.exists():
             raise ParamsError(f"--out: {file} exists. Choose another name, or delete it.")
+    if layout.name == paper_layout().name and layout != paper_layout():
+        raise ParamsError(f"{layout_file}: name {layout.name} is that of the paper's board. Choose another name there.")
     require("torch", "model make")
     write_model(make_model(layout, read_inputs(layout=layout), say), MADE, out)
 

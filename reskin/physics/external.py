@@ -11,6 +11,8 @@ from jaxtyping import Float
 # Distance of the dipole, chosen on recordings of a moving hand whose fingers have skins (data/leaphand), where 40 mm is
 # most likely, and on simulated skins, where a larger distance makes the map more accurate if sources are farther away.
 DISTANCE_MM = 50.0
+CHIP_RATIO = 3.0  # least distance of the dipole, in units of the distance of the farthest chip; assumed
+NOISE_MIN_uT = 0.1  # least noise for the suppressor; a log may begin with equal readings
 DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
 
 
@@ -19,9 +21,11 @@ def covariance(
 ) -> Float[np.ndarray, "ch ch"]:
     """Return the covariance of readings in an unknown external field, along the board's axes.
 
-    chips_mm: positions of the chips relative to the board's centre; all must be much closer than `distance_mm`. sd_uT:
-    standard deviation of each component of the field at the board's centre.
+    chips_mm: positions of the chips relative to the board's centre. sd_uT: standard deviation of each component of the
+    field at the board's centre. On large boards, the dipole is farther away than `distance_mm`: `CHIP_RATIO` times the
+    distance from the centre to the farthest chip.
     """
+    distance_mm = max(distance_mm, CHIP_RATIO * float(np.linalg.norm(chips_mm, axis=1).max()))
     at_mm = np.column_stack([chips_mm, np.zeros(len(chips_mm))])
     dipoles_mm = distance_mm * _directions(DIRECTIONS_N)
     fields, at_centre = (_per_moment(places_mm, dipoles_mm) for places_mm in (at_mm, np.zeros((1, 3))))
@@ -34,6 +38,7 @@ def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Flo
     It is the whitening matrix of external field and noise, times the standard deviation of the noise. The part of a
     reading that no external field explains is unchanged.
     """
+    noise_uT = max(noise_uT, NOISE_MIN_uT)
     variances, axes = np.linalg.eigh(external_cov)
     return (axes * (noise_uT / np.sqrt(np.maximum(variances, 0) + noise_uT**2))) @ axes.T
 

@@ -102,7 +102,7 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 FORMAT, FORMAT_2, FORMAT_1 = "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
-FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
+FILE_BYTES_MAX_N = 2**22  # a file with a full set of presses and labels on a board with 64 chips has 3.5 MB
 REMEDY = "Use a file that `save` wrote."
 BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in the file; name that files without the key have
 

@@ -25,6 +25,7 @@ from reskin.universal.population import THICKNESSES, TIPS, Forces
 
 FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
 FORCES_N = 9  # number of tabulated forces
+EDGE_MM = 0.5  # least distance from the area of presses to the edge of the skin
 SIDE_MM = 20.0  # side of the paper's skin; the cells of larger skins are larger by the same factor
 
 Coordinate = Annotated[float, Field(ge=-200, le=200)]
@@ -82,8 +83,9 @@ class BoardLayout(Strict):
             if place in places[:i]:
                 raise ValueError(f"chips {places.index(place)} and {i} are at the same place {place} mm")
         for axis, half_mm, side_mm in zip("xy", self.half_mm, self.skin.size_mm, strict=True):
-            if 2 * half_mm > side_mm:
-                raise ValueError(f"area.half_{axis}_mm is {half_mm:g}, but half the skin's size is {side_mm / 2:g}")
+            if half_mm + EDGE_MM > side_mm / 2:
+                problem = f"area.half_{axis}_mm is {half_mm:g}, but half the skin's size is {side_mm / 2:g}"
+                raise ValueError(f"{problem}; the area must end {EDGE_MM:g} mm or more from the edge")
         deepest_mm = slide.DEEPEST * max(THICKNESSES) * self.skin.thickness_mm
         least_mm = deepest_mm / min(TIPS)
         if self.tip_radius_mm <= least_mm:

@@ -18,11 +18,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import milli
 
 from reskin import io
 from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.physics import external
+from reskin.physics.magnet import cubes_along
 from reskin.universal import network
 from reskin.universal.calibration import (
     CalibrationData,
@@ -363,6 +365,7 @@ class Universal:
             remedy = "Pass the size of the fields that change while the skin moves; the earth's field has about 50 uT."
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
+        self._turned_given = False  # whether the user stated the orientation of the skin
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._misfits: np.ndarray  # misfit of each unlabelled press
@@ -424,8 +427,10 @@ class Universal:
 
     @property
     def turnable(self) -> bool:
-        """Whether a quarter turn of the skin reverses the sign of its fields, as with a checkerboard of poles."""
-        return self.layout.skin.polarity == "checkerboard"
+        """Whether a quarter turn of the skin reverses the sign of its fields, as on a checkerboard with even sides."""
+        side_x_mm, side_y_mm = self.layout.skin.size_mm
+        even = side_x_mm == side_y_mm and cubes_along(side_x_mm * milli) % 2 == 0
+        return self.layout.skin.polarity == "checkerboard" and even
 
     @property
     def mounting(self) -> Mounting:
@@ -447,8 +452,11 @@ class Universal:
     @property
     def warnings(self) -> list[str]:
         """Sentences for the user if the orientation of the skin or of the labels' axes is uncertain or wrong."""
-        findings = [self.mounting if self.turnable else None, self.label_frame]
-        return [warning for finding in findings if finding is not None and (warning := finding.warning())]
+        if not self.zeroed:
+            return []
+        frame = self.label_frame
+        of_labels = None if frame is None else frame.warning()
+        return [*self.mounting.warnings(turnable=self.turnable), *([of_labels] if of_labels else [])]
 
     @property
     def presses_n(self) -> int:
@@ -496,25 +504,30 @@ class Universal:
 
         Raises
         ------
-        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; or `keep` is
-            set, and `turned` contradicts the earlier calibration
+        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; a quarter
+            turn does not reverse the fields of the layout's skin, but `turned` is set; or `keep` is set, and `turned`
+            contradicts the earlier calibration
         """
         noload_uT = check_readings(b_uT, self.channels_n)
         if not len(noload_uT):
             raise SchemaError("zero: there are no readings without contact. Read the board before a contact.")
+        if turned and not self.turnable:
+            problem = f"a quarter turn does not reverse the fields of skin {self.layout.name}"
+            raise SchemaError(f"zero: {problem}. Call it without `turned`.")
         kept = keep and self.zeroed
-        if kept and turned not in (None, self._data.turned):
+        bound = kept and (self.presses_n > 0 or self._turned_given)  # otherwise, this may be another skin
+        if bound and turned not in (None, self._data.turned):
             raise SchemaError(
                 "zero: the presses to keep are from a skin in the other orientation. Call it without keep."
             )
         noload_uT = noload_uT.mean(axis=0)
         rest_uT = self.layout.to_board(noload_uT[None])[0]
-        if kept:
-            turned = self._data.turned
-        elif turned is None:
-            turned = self.turnable and find_mounting(self.tables, rest_uT).turned
+        self._turned_given = turned is not None or (kept and self._turned_given)
+        if turned is None:
+            found = self.turnable and find_mounting(self.tables, rest_uT).turned
+            turned = self._data.turned if bound else found
         self._noload_uT, rest_uT = noload_uT, -rest_uT if turned else rest_uT
-        data = replace(self._data if kept else CalibrationData.at_rest(rest_uT), rest_uT=rest_uT, turned=turned)
+        data = replace(self._data if kept else CalibrationData.at_rest(rest_uT), rest_uT=rest_uT, turned=bool(turned))
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
@@ -635,6 +648,9 @@ class Universal:
     def remember(self, file: Path | str) -> "Universal":
         """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`."""
         data = read_calibration(Path(file), self.layout.reach_mm, self.channels_n, self.layout.name)
+        if data.turned and not self.turnable:
+            rule = f"false, because a quarter turn does not reverse the fields of skin {self.layout.name}"
+            raise SchemaError(file, "turned", rule, "true", "Calibrate the skin again.")
         self._noload_uT = (-1 if data.turned else 1) * self.layout.to_chips(data.rest_uT[None])[0]
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 

@@ -19,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from reskin.universal.map import Estimate, OFFSET_uT, Tables
 
 LOG_ODDS_MIN = 2.0  # a smaller log odds of the found orientation is reported as uncertain (odds of 7 to 1)
+NOLOAD_MISFIT_MAX = 12.0  # chi^2 per channel of the no-load field from which it is reported; few skins exceed it
 LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
 FRAME_LOG_ODDS_MIN = 5.0  # log odds from which other axes of the labels are reported (odds of 150 to 1)
 FRAME_SD_MM = 1.0  # standard deviation of errors of places that the estimate does not know of
@@ -45,27 +46,37 @@ class Mounting:
         """Probability of this orientation, if both are equally probable before the no-load reading."""
         return float(1 / (1 + np.exp(-self.log_odds)))
 
-    def warning(self) -> str | None:
-        """Return a sentence for the user if the orientation is uncertain or contradicts the no-load field."""
+    def warnings(self, *, turnable: bool = True) -> list[str]:
+        """Return sentences for the user if the no-load field is unusual, or the orientation is uncertain or unlikely.
+
+        turnable: whether a quarter turn of the skin reverses the sign of its fields.
+        """
+        sentences = []
+        if self.misfit > NOLOAD_MISFIT_MAX:
+            sentences.append(
+                "the no-load field is unlike those of the skins that the model was trained on (chi^2 per channel "
+                f"{self.misfit:.3g}, limit {NOLOAD_MISFIT_MAX:g}). Are the chips in another order, or the skin another?"
+            )
         found = TURNED if self.turned else "not turned"
-        if self.log_odds < -LOG_ODDS_MIN:
-            return (
+        if turnable and self.log_odds < -LOG_ODDS_MIN:
+            sentences.append(
                 f"the skin is taken as {found}, but its no-load field fits the other orientation better (log odds "
-                f"{self.log_odds:.1f}). Call zero without `turned`, or check that nothing touches the skin."
+                f"{self.log_odds:.1f}). Take the no-load reading again, without contact and without `turned`."
             )
-        if self.log_odds < LOG_ODDS_MIN:
-            return (
+        elif turnable and self.log_odds < LOG_ODDS_MIN:
+            sentences.append(
                 f"the skin is taken as {found}, but its no-load field fits both orientations (log odds "
-                f"{self.log_odds:.1f}). Label three presses far from the centre to check it."
+                f"{self.log_odds:.1f}). If you know the orientation, pass it as `turned`. Otherwise, compare errors at "
+                "known places with both."
             )
-        return None
+        return sentences
 
 
 def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
     """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
 
-    The no-load field has a normal distribution under the map's prior. Before the no-load reading, both orientations
-    are equally probable.
+    A skin is taken as turned only if the log odds for it are at least `LOG_ODDS_MIN`. The no-load field has a normal
+    distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
     """
     covariance = _noload_covariance(tables)
     chi2 = {}
@@ -73,7 +84,7 @@ def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: 
         off_uT = sign * rest_uT - tables.rest_uT
         chi2[sign] = float(off_uT @ cho_solve(covariance, off_uT))
     if turned is None:
-        turned = chi2[-1] < chi2[1]
+        turned = (chi2[1] - chi2[-1]) / 2 >= LOG_ODDS_MIN
     sign = -1 if turned else 1
     return Mounting(turned, (chi2[-sign] - chi2[sign]) / 2, chi2[sign] / len(rest_uT))
 
@@ -93,7 +104,7 @@ def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
     quarter, mirror_x = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
     names = ("as given", "turned by 90°", "turned by 180°", "turned by 270°")
-    mirrored = ("mirrored in x", "with x and y exchanged", "mirrored in y", "with -x and -y exchanged")
+    mirrored = ("mirrored in x", "mirrored at the line x = -y", "mirrored in y", "mirrored at the line x = y")
     matrices = dict(zip(names, turns, strict=True)) | dict(
         zip(mirrored, [turn @ mirror_x for turn in turns], strict=True)
     )
@@ -116,7 +127,7 @@ class LabelFrame:
             return None
         return (
             f"the labelled places fit the estimated places better if they are {self.name} (log odds "
-            f"{self.log_odds:.1f}). Check the axes of the labels, and on which side of the board its connector is."
+            f"{self.log_odds:.1f}). Correct the axes of the labels, and call label again."
         )
 
 

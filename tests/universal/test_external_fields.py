@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 import reskin
+from reskin import load_universal
 from reskin.errors import SchemaError
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import NOISE_uT, new_map
-from reskin.universal.model import EXTERNAL_MAX_uT, Universal, load_universal
+from reskin.universal.model import EXTERNAL_MAX_uT, Universal
 from tests.universal.skins import make_tables
 from tests.universal.test_shipped import PLACES_MM, pokes
 

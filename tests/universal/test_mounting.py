@@ -15,7 +15,7 @@ from reskin.physics import magnet
 from reskin.seeds import rng_for
 from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Estimate, OFFSET_uT
-from reskin.universal.model import load_universal
+from reskin.universal.model import Universal, load_universal
 from reskin.universal.mounting import LABELS_MIN_N, LOG_ODDS_MIN, find_label_frame, find_mounting, frames
 from reskin.universal.population import draw_population
 from tests.universal.skins import SETUP
@@ -72,14 +72,15 @@ def test_zero_field_is_reported_as_uncertain():
     found = find_mounting(TABLES, np.zeros(15))
     assert not found.turned
     assert found.log_odds == pytest.approx(0, abs=1e-9)
-    assert "fits both orientations" in found.warning()
+    assert "fits both orientations" in " ".join(found.warnings())
 
 
 def test_wrong_orientation_is_reported():
     found = find_mounting(TABLES, SKINS.rest_uT[0].astype(float), turned=True)
     assert found.turned
     assert found.log_odds < -LOG_ODDS_MIN
-    assert "fits the other orientation better" in found.warning()
+    assert "fits the other orientation better" in " ".join(found.warnings())
+    assert found.warnings(turnable=False) == []
 
 
 def test_turned_skin_has_the_same_estimates():
@@ -103,6 +104,38 @@ def test_given_orientation_is_used_and_kept():
     with pytest.raises(SchemaError, match="presses to keep are from a skin in the other orientation"):
         model.zero(rest_uT, keep=True, turned=False)
     assert not model.zero(rest_uT).mounting.turned  # without `keep`, the orientation is found again
+
+
+def test_orientation_without_presses_is_found_again_unless_it_was_given():
+    rest_uT, *_ = skin(0)
+    assert not load_universal().zero(-rest_uT).zero(rest_uT, keep=True).mounting.turned  # perhaps another skin
+    assert load_universal().zero(-rest_uT, turned=True).zero(rest_uT, keep=True).mounting.turned
+
+
+def test_weak_evidence_does_not_turn_a_skin():
+    weak_uT = -0.1 * SKINS.rest_uT[0].astype(float)
+    found = find_mounting(TABLES, weak_uT)
+    assert 0 < -found.log_odds < LOG_ODDS_MIN  # turned is a little more probable
+    assert not found.turned
+
+
+def test_only_even_square_checkerboards_are_turned():
+    shipped = load_universal()
+    rest_uT, *_ = skin(0)
+    for change in ({"polarity": "same"}, {"size_mm": (15.0, 15.0)}, {"size_mm": (20.0, 25.0)}):
+        layout = shipped.layout.model_copy(update={"skin": shipped.layout.skin.model_copy(update=change)})
+        model = Universal(shipped.tables, shipped.networks, shipped.powers, layout)
+        assert not model.turnable
+        assert not model.zero(-rest_uT).mounting.turned
+        with pytest.raises(SchemaError, match="quarter turn does not reverse the fields of skin reskin"):
+            model.zero(rest_uT, turned=True)
+
+
+def test_unusual_noload_field_is_reported():
+    rest_uT, *_ = skin(0)
+    model = load_universal()
+    assert model.warnings == []  # before the no-load reading
+    assert "the no-load field is unlike" in " ".join(model.zero(5 * rest_uT).warnings)
 
 
 def test_orientation_is_saved(tmp_path):
@@ -138,6 +171,23 @@ def test_wrong_axes_of_labels_are_named(frame):
         assert found.name == frame
         assert f"if they are {frame}" in found.warning()
     assert find_label_frame(estimate, given_mm[: LABELS_MIN_N - 1]) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        (lambda x, y: (-x, y), "mirrored in x"), (lambda x, y: (x, -y), "mirrored in y"),
+        (lambda x, y: (y, x), "mirrored at the line x = y"), (lambda x, y: (-y, -x), "mirrored at the line x = -y"),
+        (lambda x, y: (-x, -y), "turned by 180°"),
+        # labels that were turned clockwise must be turned back counterclockwise
+        (lambda x, y: (y, -x), "turned by 90°"), (lambda x, y: (-y, x), "turned by 270°"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)  # fmt: skip
+def test_names_of_wrong_axes(given, name):
+    estimate = Estimate(PLACES_MM, np.full((4, 2), 0.6), np.ones(4), np.ones(4), np.full(4, np.nan))
+    found = find_label_frame(estimate, np.array([given(*place_mm) for place_mm in PLACES_MM]))
+    assert found.name == name
 
 
 def test_frames_are_all_symmetries_of_a_square():

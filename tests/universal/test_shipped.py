@@ -313,7 +313,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         ({"labelled_mm": np.full((1, 2), 8.0)}, "each press needs x and y"),
         ({"force_known": np.ones(1)}, "force_known must be one value per label"),
         ({"labelled_uT": np.ones((2001, CHANNELS_N))} | repeated_labels(2001), "2001 are too many, at most 2000"),
-        ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "1,08.* bytes are too many for a saved skin .at most 1,048,576"),
+        ({"pokes_uT": np.ones((36000, CHANNELS_N))}, "4,32.* bytes are too many for a saved skin .at most 4,194,304"),
     ]:
         io.write_tensors(file, sound | changed, header)
         with pytest.raises(SchemaError, match=rule):
@@ -327,7 +327,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
     io.write_tensors(file, sound, {"format": "reskin-skin-0"})
     with pytest.raises(SchemaError, match="format must be reskin-skin-3; got reskin-skin-0"):
         load_universal(file)
-    with pytest.raises(SchemaError, match="too many for a saved skin .at most 1,048,576"):
+    with pytest.raises(SchemaError, match="too many for a saved skin .at most 4,194,304"):
         load_universal(FILE)
 
 
