@@ -60,7 +60,8 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
         if first["type"] == "value_error":  # from a validator: its message names the parameters and their values
             place = f"{where}: {name}" if first["loc"] else where
-            raise ParamsError(f"{place}: {rule}. Correct it there.") from None
+            end = "" if rule.endswith("?") else "."
+            raise ParamsError(f"{place}: {rule}{end} Correct it there.") from None
         choices = re.findall("'([^']*)'", rule) if first["type"] == "literal_error" else []
         guess = did_you_mean(first.get("input"), choices)
         raise ParamsError(where, name, rule, got, f"Correct it there.{guess}") from None

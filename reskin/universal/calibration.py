@@ -102,7 +102,7 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 FORMAT, FORMAT_2, FORMAT_1 = "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
-FILE_BYTES_MAX_N = 2**22  # a file with a full set of presses and labels on a board with 64 chips has 3.5 MB
+FILE_BYTES_MAX_N = 2**23  # a full set of presses and labels on a board with 64 chips takes 3.5 MB
 REMEDY = "Use a file that `save` wrote."
 BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in the file; name that files without the key have
 
@@ -208,6 +208,8 @@ def read_calibration(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
+    if "rest_slope_uT" in tensors:
+        raise SchemaError(f"{file}: this is a universal model, not a calibration. Pass it as file=.")
     if (own := metadata.get(BOARD, PAPER_BOARD)) != board:
         remedy = f"Load it with the model that was made for board {own}."
         raise SchemaError(file, "the calibrated board", f"{board}, the board of the model", own, remedy)

@@ -3,6 +3,7 @@
 A user writes a layout as a YAML file like those in the folder `layouts`, which explain each key.
 """
 
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,6 +26,7 @@ from reskin.universal.population import THICKNESSES, TIPS, Forces
 
 FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
 FORCES_N = 9  # number of tabulated forces
+CHIPS_APART_MM = 0.5  # chips are larger than this distance
 EDGE_MM = 0.5  # least distance from the area of presses to the edge of the skin
 SIDE_MM = 20.0  # side of the paper's skin; the cells of larger skins are larger by the same factor
 
@@ -82,6 +84,9 @@ class BoardLayout(Strict):
         for i, place in enumerate(places):
             if place in places[:i]:
                 raise ValueError(f"chips {places.index(place)} and {i} are at the same place {place} mm")
+        apart_mm = [math.dist(place, other) for i, place in enumerate(places) for other in places[:i]]
+        if min(apart_mm, default=CHIPS_APART_MM) < CHIPS_APART_MM:
+            raise ValueError(f"two chips are {min(apart_mm):g} mm apart. Are the positions in mm?")
         for axis, half_mm, side_mm in zip("xy", self.half_mm, self.skin.size_mm, strict=True):
             if half_mm + EDGE_MM > side_mm / 2:
                 problem = f"area.half_{axis}_mm is {half_mm:g}, but half the skin's size is {side_mm / 2:g}"

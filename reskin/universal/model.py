@@ -725,6 +725,9 @@ def _format_of(card: Any) -> str:
 @lru_cache(maxsize=2)
 def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers, BoardLayout, Mapping[str, Any]]:
     card_file = file.with_suffix(".json")
+    if file.is_file() and not card_file.is_file():
+        problem = f"{file}: its card {card_file.name} is missing"
+        raise SchemaError(f"{problem}. Copy the card as well; if the file is a saved calibration, pass it first.")
     card = io.read_json(card_file)
     form = _format_of(card)
     if form != FORMAT:

@@ -74,6 +74,13 @@ def read_text(text):
     [
         ("turn_deg: 180", "turn_deg: 45", "chips.1.turn_deg must be 0, 90, 180 or 270; got 45"),
         ("x_mm: 7.0", "x_mm: 0.0", r"chips 0 and 3 are at the same place \(0.0, 0.0\) mm. Correct it there"),
+        ("x_mm: 7.0", "x_mm: 0.007", "two chips are 0.007 mm apart. Are the positions in mm. Correct it there"),
+        ("centre_mm: [8.0, 8.0]", "centre_mm: [8.0]", "centre_mm.1 is missing. Add it there"),
+        (
+            "half_x_mm: 8.0",
+            "half_x_mm: 9.8",
+            "half the skin's size is 10; the area must end 0.5 mm or more from the edge",
+        ),
         ("gap_mm: 1.6", "gap_mm: 0.1", "gap_mm must be greater than or equal to 0.8; got 0.1"),
         ("gap_mm: 1.6", "gap: 1.6", "gap is not a known parameter"),
         ("tip_radius_mm: 2.0", "", "tip_radius_mm is missing"),

@@ -313,7 +313,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         ({"labelled_mm": np.full((1, 2), 8.0)}, "each press needs x and y"),
         ({"force_known": np.ones(1)}, "force_known must be one value per label"),
         ({"labelled_uT": np.ones((2001, CHANNELS_N))} | repeated_labels(2001), "2001 are too many, at most 2000"),
-        ({"pokes_uT": np.ones((36000, CHANNELS_N))}, "4,32.* bytes are too many for a saved skin .at most 4,194,304"),
+        ({"pokes_uT": np.ones((72000, CHANNELS_N))}, "8,64.* bytes are too many for a saved skin .at most 8,388,608"),
     ]:
         io.write_tensors(file, sound | changed, header)
         with pytest.raises(SchemaError, match=rule):
@@ -321,13 +321,19 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
     io.write_tensors(file, {name: sound[name] for name in sound if name != "rest_uT"}, header)
     with pytest.raises(SchemaError, match="arrays must be rest_uT"):
         load_universal(file)
+    with pytest.raises(SchemaError, match="this is a universal model, not a calibration. Pass it as file="):
+        load_universal(FILE)
+    with pytest.raises(
+        SchemaError, match="its card s0.json is missing.* if the file is a saved calibration, pass it first"
+    ):
+        load_universal(file=file)
     file.write_bytes(b"no such thing")
     with pytest.raises(SchemaError, match="the file is not safetensors"):
         load_universal(file)
     io.write_tensors(file, sound, {"format": "reskin-skin-0"})
     with pytest.raises(SchemaError, match="format must be reskin-skin-3; got reskin-skin-0"):
         load_universal(file)
-    with pytest.raises(SchemaError, match="too many for a saved skin .at most 4,194,304"):
+    with pytest.raises(SchemaError, match="too many for a saved skin .at most 8,388,608"):
         load_universal(FILE)
 
 
