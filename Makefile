@@ -30,7 +30,7 @@ export PYTHONDONTWRITEBYTECODE =
 # Stages run `python`, which must be the one of this environment.
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: repro test test-processors lint ui bench faults time-repro time-install readme constraints licences audit clean
+.PHONY: repro test test-processors compiled lint ui bench faults time-repro time-install readme constraints licences audit clean
 .PHONY: team-server teams cluster-test
 .DEFAULT_GOAL := repro
 
@@ -47,12 +47,16 @@ repro: $(STAMP)
 	@$(BIN)/reskin compare || true # compares with the committed reports; your own scenes have none
 
 # Three workers, for two cores or more: tests of live boards mostly wait.
-test: lint
+test: $(STAMP)
+	@$(MAKE) --no-print-directory --jobs=2 lint compiled
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 # Trains tiny networks on processors that QEMU emulates: weights must equal those from this processor. Needs qemu-user.
 test-processors: $(STAMP)
 	$(BIN)/python -m tests.arithmetic Haswell-v2 Skylake-Client-v1 EPYC-v1
+
+compiled: $(STAMP)
+	$(BIN)/python -m tests.compiled
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

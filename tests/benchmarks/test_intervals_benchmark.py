@@ -31,7 +31,7 @@ from reskin.universal import batches
 from reskin.universal.batches import SkinPrior, TrainingSettings, add_error
 from reskin.universal.force import NORMAL_90
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map, tabulate
-from reskin.universal.model import PriorModel
+from reskin.universal.model import PriorModel, load_universal
 from reskin.universal.population import Population
 from reskin.universal.training import train_networks
 from tests.benchmarks import FULL, size
@@ -83,7 +83,7 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
     if not FULL:
         monkeypatch.setattr(universal, "CALIBRATION_SKINS_N", 1)
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
-    prior_map = new_map(tabulate(NOMINAL, NOMINAL_SPREADS, SETUP))
+    prior_map = new_map(tabulate(NOMINAL, NOMINAL_SPREADS, SETUP) if FULL else load_universal().tables)
     nominal = Variant(prior, PriorModel(prior_map, train_networks(prior, SETTINGS, SEED)))
     by_labels = calibrate_on_simulated(nominal, LABELS_N, SEED)
     print("\npowers by labels:", {n: [round(power, 2) for power in powers] for n, powers in by_labels.items()})

@@ -29,6 +29,7 @@ from pipeline.report.tables import table_2_summary
 from pipeline.scenes import ANALYSES
 from reskin import io
 from reskin.models.inputs import Scaler
+from tests.compiled import compile_kernels
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
 LEARNING = (
@@ -50,14 +51,6 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
 OUTPUT = "output.txt"  # file with the output of the first run
 # time limit for tests that hang; long, because a busy machine needs four times as long
 pytestmark = pytest.mark.timeout(1800)
-
-
-def compile_kernels() -> None:
-    """Compile the Numba kernels of simulated presses and of the universal model once, for all stages."""
-    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), [[8.0, 8.0, 1.0]])
-    universal = reskin.load_universal().zero(noload_uT)
-    universal.label(np.array([[8.0, 8.0]]), force_N, b_uT)
-    universal.predict(b_uT)
 
 
 @pytest.fixture(scope="module")
