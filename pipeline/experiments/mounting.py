@@ -5,7 +5,7 @@ had been glued on after a quarter turn, or as if the chips were connected in ano
 were mirrored or turned.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -15,8 +15,14 @@ from jaxtyping import Float
 from pydantic import Field
 
 from pipeline.experiments.known_boards import read_known_boards
-from pipeline.experiments.random_presses import CHECKERBOARD, BoardPresses, board_presses, draw_presses, place_scores
-from pipeline.experiments.random_presses import raise_forces as raise_to_least_force
+from pipeline.experiments.random_presses import (
+    CHECKERBOARD,
+    BoardPresses,
+    board_presses,
+    draw_presses,
+    place_scores,
+    raise_forces,
+)
 from pipeline.experiments.results import write_results
 from pipeline.report.formatting import show, tabulate
 from pipeline.settings import Settings
@@ -96,7 +102,7 @@ def mounting(settings: Settings, section: Mounting, indentations: Path, folds: P
 
 def skin_of_board(board: BoardPresses) -> Skin:
     """Return the presses of a recorded board as the universal model takes them."""
-    presses = raise_to_least_force(board.presses)
+    presses = raise_forces(board.presses)
     rest_uT, db_uT = to_chips(board.rest_uT[None])[0], to_chips(presses.db_uT)
     return Skin(board.board, rest_uT, db_uT, presses.place_mm + CENTRE_MM, presses.force_N)
 
@@ -131,9 +137,9 @@ def orientations(skins: Sequence[Skin], seed: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def percentage(conditions: Any) -> float:
+def percentage(conditions: Iterable[bool]) -> float:
     """Return the percentage of conditions that are true."""
-    return 100 * float(np.mean([bool(condition) for condition in conditions]))
+    return 100 * float(np.mean([*conditions]))
 
 
 def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int, draws_n: int) -> list[dict[str, Any]]:

@@ -114,18 +114,22 @@ def random_presses(
     write_results(results, {"rows": summarise_rows(rows), "draws_n": section.draws_n}, {})
 
 
+def mean_by(group: Int64[np.ndarray, " f"], values: Float[np.ndarray, "f c"]) -> Float[np.ndarray, "m c"]:
+    """Average rows with equal group numbers, which are counted from 0."""
+    sums = np.stack([np.bincount(group, column) for column in values.T.astype(float)], axis=1)
+    return sums / np.bincount(group)[:, None]
+
+
 def board_presses(known: KnownBoards, board: str) -> BoardPresses:
     """Return the presses of a board that have a force."""
     rows, frame = known.data.rows, known.frame
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
-    _, press_i, counts = np.unique(rows.indentation[own], return_inverse=True, return_counts=True)
+    press_i = np.unique(rows.indentation[own], return_inverse=True)[1]
     place_mm, force_N = frame.place(rows.target[own, :2].astype(float)), rows.target[own, 2].astype(float)
     readings = LabelledPresses(place_mm, force_N, frame.field(rows.db_uT[own]))
 
-    def mean(values: Float[np.ndarray, "f k"]) -> Float[np.ndarray, "m k"]:
-        return np.stack([np.bincount(press_i, column) for column in values.T], axis=1) / counts[:, None]
-
-    presses = LabelledPresses(mean(place_mm), mean(force_N[:, None])[:, 0], mean(readings.db_uT))
+    mean_force_N = mean_by(press_i, force_N[:, None])[:, 0]
+    presses = LabelledPresses(mean_by(press_i, place_mm), mean_force_N, mean_by(press_i, readings.db_uT))
     return BoardPresses(board, known.presses[board].rest_uT.ravel(), presses, readings, press_i)
 
 

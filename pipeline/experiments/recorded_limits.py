@@ -19,7 +19,14 @@ from scipy.spatial.distance import pdist
 
 from pipeline.experiments.detection import thresholds
 from pipeline.experiments.known_boards import read_known_boards
-from pipeline.experiments.random_presses import SPACING_MM, BoardPresses, board_presses, place_scores, raise_forces
+from pipeline.experiments.random_presses import (
+    SPACING_MM,
+    BoardPresses,
+    board_presses,
+    mean_by,
+    place_scores,
+    raise_forces,
+)
 from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import show, show_digits, tabulate
@@ -102,12 +109,6 @@ def recorded_limits(
     registration = {"rows": summarise_draws(scores), "seed": settings.seed}
     numbers = {"registration": registration, "shear": shear, "detection": detection} | settings_used
     write_results(results, numbers, drawn)
-
-
-def mean_by(group: Int64[np.ndarray, " f"], values: Float[np.ndarray, "f c"]) -> Float[np.ndarray, "m c"]:
-    """Average rows with equal group numbers, which are counted from 0."""
-    sums = np.stack([np.bincount(group, column) for column in values.T.astype(float)], axis=1)
-    return sums / np.bincount(group)[:, None]
 
 
 def number_places(place_mm: Float[np.ndarray, "m 2"]) -> Int64[np.ndarray, " m"]:

@@ -131,13 +131,11 @@ class LabelFrame:
         )
 
 
-def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame | None:
-    """Compare labelled places with estimates that do not use the labels; return None for fewer than `LABELS_MIN_N`.
+def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame:
+    """Find the most probable other axes of labelled places, by estimates of these places without the labels.
 
     Both are relative to the board's centre. Errors are normally distributed, with a share of outliers.
     """
-    if len(place_mm) < LABELS_MIN_N:
-        return None
     log_p = {name: _log_likelihood(estimate, place_mm @ matrix.T) for name, matrix in frames().items()}
     as_given = log_p.pop("as given")
     name = max(log_p, key=log_p.__getitem__)
