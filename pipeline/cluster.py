@@ -109,7 +109,7 @@ def _connect(address: str) -> Any:
         from distributed import Client
     except ImportError:
         remedy = "Try: pip install -c constraints.txt -e '.[dask]'"
-        raise ParamsError(f"RESKIN_EXECUTOR: package distributed is not installed. {remedy}") from None
+        raise ParamsError(f"RESKIN_EXECUTOR: the Python package `distributed` is not installed. {remedy}") from None
     try:
         return Client(address, timeout=CONNECT_TIMEOUT_s, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -129,4 +129,4 @@ def require(package: str, where: object) -> None:
 def missing_package(package: str, where: object) -> ParamsError:
     """Create the error for a missing package, with the command that installs the package."""
     extra = EXTRAS.get(package, "pipeline")
-    return ParamsError(f"{where}: package {package} is not installed. In the checkout: pip install '.[{extra}]'")
+    return ParamsError(f"{where}: the Python package `{package}` is not installed. In the checkout: pip install '.[{extra}]'")

@@ -94,13 +94,13 @@ def test_library_imports_only_required_packages():
 
 
 def test_missing_package_names_its_extra():
-    with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere is not installed.*\[pipeline\]"):
+    with pytest.raises(ParamsError, match=r"model.safetensors: the Python package `nowhere` is not installed.*\[pipeline\]"):
         require("nowhere", "model.safetensors")
-    with pytest.raises(ParamsError, match=r"package torch is not installed.*'\.\[train\]'"), explaining("reskin"):
+    with pytest.raises(ParamsError, match=r"package `torch` is not installed.*'\.\[train\]'"), explaining("reskin"):
         raise ModuleNotFoundError("", name="torch.nn")
     for package, extra in (("distributed.client", "dask"), ("dask", "dask"), ("psycopg2", "team"), ("onnx", "onnx")):
         name = package.partition(".")[0]
-        message = rf"package {name} is not installed.*'\.\[{extra}\]'"
+        message = rf"package `{name}` is not installed.*'\.\[{extra}\]'"
         assert extra in PROJECT["optional-dependencies"]
         with pytest.raises(ParamsError, match=message), explaining("train_multi"):
             raise ModuleNotFoundError("", name=package)

@@ -300,7 +300,7 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions for test rows: over all rows, also without a constant offset per board; and for each skin."""
+    """Score predictions for test rows, over all rows and per skin; also with one offset per board subtracted."""
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 

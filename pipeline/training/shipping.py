@@ -16,8 +16,8 @@ from jaxtyping import Float
 
 from pipeline.training.universal import (
     AS_TRAINED,
+    CALIBRATION_ERRORS,
     CALIBRATION_SKINS_N,
-    LAW_ERRORS,
     NOMINAL_POWERS,
     best_powers,
     coverage,
@@ -39,36 +39,40 @@ PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "source": "simulated",
-    "map": "presses of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
-    "network": "trained on presses of simulated skins, errors of the law drawn at every step; no recorded row",
-    "answers": "places: the map's probabilities times the network's normal distribution; forces: by map and network or "
-    "by the map alone, corrected by a line that is fitted to presses of known force; misfit: the map's",
-    "standard_deviations": "of a power of that product. The power: `sureness`, by number of unlabelled presses "
-    "(anywhere, or evenly over the skin) and of labels, over the median misfit of the presses (of 12 or more) and over "
-    "the variance inflation of cross-validated labels. Calibrated on simulated skins: 1.645 to either side cover 90 %",
-    "made_in_s_of": "one core's processor time; other machines take others",
+    "map": "fields of simulated presses on a lattice of places and forces, and their derivatives by the parameters of "
+    "the law; no recorded data",
+    "network": "trained on presses of simulated skins, with random errors of the law; no recorded data",
+    "estimates": "place: the product of the map's probabilities and the network's normal distribution; force: by map "
+    "and network, or by the map alone, corrected by a line that is fitted to presses of known force; misfit: the map's",
+    "standard_deviations": "from a power of that product (`likelihood_powers`, by the number of unlabelled presses, "
+    "anywhere or evenly spread, and the number of labels). The power is divided by the median misfit of 12 or more "
+    "presses, and by the variance inflation from cross-validation over the labels. The powers were chosen on simulated "
+    "skins: the place plus or minus 1.645 standard deviations contains the true place in 90 % of the readings",
+    "made_in_s_of": "processor time of one core",
     "recorded_knowledge": "from two recorded boards: the form of the law, its slide, the force at which the slide ends "
     "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), the direction of the "
-    "magnetisation, the length scales of the law's error, and how forces are estimated",
+    "magnetisation, the length scales of the law's error, and the method by which forces are estimated",
 }
 SHIPPED = {  # what the card of the shipped model says in addition
     "name": "universal, simulated alone",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
-    "presses that lie evenly (see(presses, even=True)) and by labels; intervals with fewer presses are calibrated on "
-    "simulated skins alone",
-    "not_for": "boards of other chips or turns, skins of other magnets, of other thickness, two contacts, shear",
+    "evenly spread presses (see(presses, even=True)) and by labels. Table `random_presses` "
+    "has presses at random places",
+    "not_for": "boards with other positions or rotations of the chips, skins with another magnetisation or thickness, "
+    "two contacts at once, shear",
 }
 MADE = {
     "name": "universal, simulated alone, for the board of a layout",
-    "tested_on": "simulated skins of the layout alone",
-    "not_for": "boards of another layout, two contacts, shear, skins whose magnets are not powder in an elastic layer",
+    "tested_on": "simulated skins of the layout only",
+    "not_for": "boards of another layout, two contacts at once, shear, skins that are not an elastic layer with "
+    "magnetic powder",
 }
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
     """Choose likelihood powers for a misfit of 1 by numbers of presses and labels, from coverage on simulated skins."""
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
-    for name, error in LAW_ERRORS.items():
+    for name, error in CALIBRATION_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
         for i in range(len(skins)):
             for presses_n, even in PRESS_SETS:
@@ -153,9 +157,9 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
         Universal(tables, networks, NO_POWERS, layout), inputs.prior, inputs.labels_n, inputs.seed
     )
     times_s.append(time.process_time())
-    elapsed_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
+    elapsed_s = dict(zip(("map", "network", "likelihood_powers"), np.diff(times_s).round().tolist(), strict=True))
     training = inputs.training.model_dump() | {"seed": inputs.seed}
-    about = CARD | {"centre": asdict(layout.law), "lessons": training, "made_in_s": elapsed_s}
+    about = CARD | {"centre": asdict(layout.law), "training": training, "made_in_s": elapsed_s}
     return Universal(tables, networks, powers, layout, about)
 
 

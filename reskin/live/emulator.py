@@ -109,7 +109,7 @@ def read_script(source: str) -> Script:
 
 
 def read_capture(folder: Path) -> Script:
-    """Create a script from a recorded byte stream, or from an SD card log, whose readings it encodes as frames."""
+    """Create a script from a recorded byte stream, or from an SD card log; the log's readings are encoded as frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)

@@ -85,7 +85,7 @@ def lattice_mm(area: Area = PAPER_AREA) -> Float[np.ndarray, " a"]:
 def tabulate(
     centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
 ) -> Tables:
-    """Simulate presses at all places and forces, for the central law and with each parameter slightly changed.
+    """Simulate presses at all places and forces, for the central law and for laws with one parameter slightly changed.
 
     With the default forces, these are 4,356 presses per law, 70,000 in total; the simulation takes about 30 s.
     """

@@ -85,7 +85,7 @@ POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
 EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, single precision is not sufficient
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
-FORMAT = "reskin-universal-3"
+FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
 OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
 UNSTORED = ("names", "area")  # fields of `Tables` that follow from the card
 CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
@@ -730,7 +730,7 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
         raise SchemaError(f"{problem}. Copy the card as well; if the file is a saved calibration, pass it first.")
     card = io.read_json(card_file)
     form = _format_of(card)
-    if form != FORMAT:
+    if form not in (FORMAT, FORMAT_3):
         remedy = "Use the files of this version, or make the model again: reskin model make"
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file, digest_needed=True)
@@ -742,7 +742,8 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     if len(tables.rest_uT) != layout.channels_n:
         chips_n, remedy = len(tables.rest_uT) // 3, "Use the card that was written with the model."
         raise SchemaError(card_file, "layout", f"of {chips_n} chips", f"{len(layout.chips)} chips", remedy)
-    return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"]), layout, card
+    powers = LikelihoodPowers.from_card(card["sureness" if form == FORMAT_3 else "likelihood_powers"])
+    return tables, network.from_tensors(parts), powers, layout, card
 
 
 def write(
@@ -759,5 +760,5 @@ def write(
     io.write_tensors(file, map_arrays | network.to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
     own = layout.model_dump(mode="json")
-    card = {"format": FORMAT, **about, "layout": own, "sureness": powers.to_card(), "spreads": spreads}
+    card = {"format": FORMAT, **about, "layout": own, "likelihood_powers": powers.to_card(), "spreads": spreads}
     io.write_json(file.with_suffix(".json"), card)

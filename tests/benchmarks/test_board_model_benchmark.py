@@ -25,7 +25,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation
 
 from pipeline.training.shipping import make_model, read_inputs
-from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins
+from pipeline.training.universal import draw_prior_skins, law_error
 from reskin.config import parse
 from reskin.models.classical import RbfRidge, fit
 from reskin.models.inputs import VIEW
@@ -176,7 +176,7 @@ def test_simulated_skins_of_the_layout(name: str) -> None:
     """Score the model on simulated skins of its layout, with errors of the law as in training."""
     model = model_for(name)
     inputs = read_inputs(layout=model.layout)
-    skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", LAW_ERRORS[AS_TRAINED])
+    skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", law_error())
     centre_mm = np.array(model.layout.centre_mm)
     places: dict[int, list[Score]] = {n: [] for n in LABELS_N}
     forces: dict[int, list[Score]] = {n: [] for n in LABELS_N}

@@ -14,9 +14,7 @@ import pytest
 
 from pipeline.training import universal
 from pipeline.training.universal import (
-    AS_TRAINED,
     ASSUMED_POWER,
-    LAW_ERRORS,
     LawError,
     Powers,
     calibrate_on_simulated,
@@ -89,7 +87,7 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
     print("\npowers by labels:", {n: [round(power, 2) for power in powers] for n, powers in by_labels.items()})
     widths_mm = {}
     for name, error in {
-        "of the prior": LAW_ERRORS[AS_TRAINED],
+        "of the prior": universal.law_error(),
         **size(FAMILIES, dict([*FAMILIES.items()][:1])),
     }.items():
         skins = draw_prior_skins(prior, SKINS_N, SEED, "asked", error)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pipeline.experiments.random_presses import CHECKERBOARD, BoardPresses, draw_presses, raise_forces
-from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins, split_presses
+from pipeline.training.universal import draw_prior_skins, law_error, split_presses
 from reskin.data.grid import CENTRE_MM
 from reskin.logs import CONTACT_SDS
 from reskin.physics import external
@@ -120,7 +120,7 @@ def test_networks_and_distance_on_simulated_skins():
     """Compare what the networks receive, and distances of the assumed magnets; this decided both."""
     skins_n, shipped = size(24, 1), load_universal()
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
-    skins = draw_prior_skins(prior, skins_n, SEED, "external fields", LAW_ERRORS[AS_TRAINED])
+    skins = draw_prior_skins(prior, skins_n, SEED, "external fields", law_error())
     variants = [(0.0, external.DISTANCE_MM, NETWORKS[0])]
     variants += [(sd_uT, external.DISTANCE_MM, networks) for sd_uT in (30.0, 140.0) for networks in NETWORKS]
     variants += [
@@ -160,7 +160,7 @@ def test_coverage_on_simulated_skins():
     """
     skins_n = size(24, 1)
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
-    skins = draw_prior_skins(prior, skins_n, SEED, "external powers, test", LAW_ERRORS[AS_TRAINED])
+    skins = draw_prior_skins(prior, skins_n, SEED, "external powers, test", law_error())
     print(f"\nSIMULATED, {skins_n} skins, magnets at 60 mm: coverage of 90 % intervals")
     for sd_uT in size((0.0, 10.0, 30.0, 70.0, 140.0, 300.0), (0.0, 30.0)):
         for labels_n in size((0, 10, 40), (10,)):

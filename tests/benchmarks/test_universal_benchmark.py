@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.training.shipping import NO_POWERS, calibrate
-from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins, split_presses
+from pipeline.training.universal import AS_TRAINED, draw_prior_skins, law_error, split_presses
 from reskin.config import parse
 from reskin.data.grid import SKIN_MM
 from reskin.physics.skin import SkinDesign
@@ -94,7 +94,7 @@ def make_lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> t
 def evaluate(setting: str, tables: Tables, networks: Sequence[Weights], prior: SkinPrior, build_s: float) -> Row:
     """Calibrate a model to 65 presses of each test skin and score it there."""
     model = Universal(tables, networks, NO_POWERS)
-    skins = draw_prior_skins(prior, TESTED_N, SEED, AS_TRAINED, LAW_ERRORS[AS_TRAINED])
+    skins = draw_prior_skins(prior, TESTED_N, SEED, AS_TRAINED, law_error())
     off_mm, off_log, took_s, read_n = [], [], 0.0, 0
     for i in range(len(skins)):
         b_uT, place_mm = calibrate(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)

@@ -108,7 +108,7 @@ def test_control_is_calibrated_with_pokes_of_the_next_board():
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_foreign_fields_have_equal_length_and_another_direction():
+def test_changes_of_a_board_turn_its_fields_and_keep_their_length():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))

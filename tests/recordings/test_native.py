@@ -124,8 +124,8 @@ def test_indentations_are_recovered(
 ) -> None:
     found, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
     for name, column in expected_readings().items():
-        # Tolerances: the mean is float32; times of text frames are off by up to half a frame, because lines differ in
-        # length.
+        # Means of no-load readings are rounded to float32. The time of a text frame is estimated from its position in
+        # the bytes; as lines have different lengths, it is wrong by up to half a frame.
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
         np.testing.assert_allclose(found[name], column, rtol=0, atol=atol, err_msg=name)
     assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N

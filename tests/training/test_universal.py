@@ -91,7 +91,7 @@ def _synthetic_skins(monkeypatch):
 
 @pytest.fixture(scope="module")
 def nominal() -> Variant:
-    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "sureness"))])
+    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "powers"))])
     return Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
 
 
@@ -160,7 +160,7 @@ def test_powers_are_calibrated_for_all_numbers_of_labels(nominal, monkeypatch):
 
 def test_force_line_corrects_forces_of_a_stiffer_skin():
     tables = make_tables()
-    model = PriorModel(new_map(tables), [draw_weights(15, rng_for(0, "sureness"))])
+    model = PriorModel(new_map(tables), [draw_weights(15, rng_for(0, "powers"))])
     skins = make_population(1, rng_for(3, "stiffer"))
     pool, tested = split_presses(skins, 0, seed=1)
     pool, tested = (replace(part, force_N=2 * part.force_N) for part in (pool, tested))  # all forces are twice as large

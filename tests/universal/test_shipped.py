@@ -73,7 +73,7 @@ def test_card_describes_the_model(skin):
     assert skin.card["source"] == "simulated"
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
-    assert len(skin.networks) == skin.card["lessons"]["seeds_n"]
+    assert len(skin.networks) == skin.card["training"]["seeds_n"]
     assert FILE.stat().st_size <= 5e6  # limit on the size of the file in bytes
     assert tuple(skin.card["spreads"]) == skin.tables.names
 
@@ -215,11 +215,21 @@ def test_changed_model_is_refused(skin, tmp_path):
             load_universal(file=file)
 
 
+def test_model_with_the_format_before_still_loads(skin, tmp_path):
+    file = tmp_path / FILE.name
+    shutil.copy(FILE, file)
+    card = dict(skin.card)
+    io.write_json(
+        file.with_suffix(".json"), card | {"format": "reskin-universal-3", "sureness": card["likelihood_powers"]}
+    )
+    assert load_universal(file=file).powers == skin.powers
+
+
 def test_model_of_an_earlier_version_is_refused(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE, file)
     io.write_json(file.with_suffix(".json"), skin.card | {"format": "reskin-universal-2"})
-    with pytest.raises(SchemaError, match="format must be reskin-universal-3; got reskin-universal-2"):
+    with pytest.raises(SchemaError, match="format must be reskin-universal-4; got reskin-universal-2"):
         load_universal(file=file)
 
 
