@@ -5,6 +5,7 @@
 `record`, `lifted`, `touch`            record a board, with labels from a robot's program
 `load_universal`                       the universal model, which can be calibrated to any skin
 `load_model`, `Model`                  a trained network
+`load_recording`                       a recording of any kind, as a pandas DataFrame with units
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
         draw_skin,
         lifted,
         load_model,
+        load_recording,
         load_rows,
         load_universal,
         open,
@@ -48,6 +50,7 @@ __all__ = [
     "draw_skin",
     "lifted",
     "load_model",
+    "load_recording",
     "load_rows",
     "load_universal",
     "open",

@@ -22,6 +22,8 @@ from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from reskin.data.rows import Rows
     from reskin.live.tracker import LiveSkin, LiveSkins
     from reskin.models.trained import Network
@@ -377,6 +379,56 @@ def load_universal(
     from reskin.universal.model import load_universal as load
 
     return load(calibration, file=FILE if file is None else file, external_uT=external_uT)
+
+
+def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 400.0) -> pd.DataFrame:
+    """Load a recording as a pandas DataFrame. Requires the package pandas (`pip install '.[learn]'`).
+
+    Parameters
+    ----------
+    path : path
+        One of these recordings, which are told apart by their content:
+
+        - a capture's folder, as `reskin record` and `reskin add` write it
+        - the log of an SD card
+        - a file that `reskin decode` wrote
+        - a table with labels (CSV or Parquet, layout `table` in data/README.md)
+        - an ingested capture, `data/indentations/SCENE/CAPTURE.parquet`
+    frames : bool
+        Whether to load all frames of a capture that has labels, instead of its labelled readings.
+    rate_hz : float
+        Frames per second, only for a decoded file without a clock.
+
+    Returns
+    -------
+    DataFrame
+        Column names end in units; `frame.attrs["units"]` maps each column to its unit ("1" for counts, "" for text).
+        `frame.attrs["counts"]` tells how many frames and rows were read, and how many were dropped for which reason.
+
+        If the recording has labels, there is one row per reading in contact, as in an ingested capture: the columns of
+        data/README.md (`board`, `x_mm`, `Fz_N`, ...), with one column per channel for the field (`bx0_uT`, `by0_uT`,
+        ...), the no-load reading (`noload_bx0_uT`, ...) and their difference (`dbx0_uT`, ...).
+
+        Otherwise, or with `frames`, there is one row per frame: time `t_s`, field `bx0_uT`, ..., and temperature
+        `temperature0_degC`, ...; for a capture's folder also its names (`capture`, `board`, `skin`, `source`).
+
+        Faulty readings are dropped as in `params.yaml: faults`.
+
+    Raises
+    ------
+    ReskinError
+        If the path does not exist, is none of these recordings, or the recording is damaged; or if pandas is missing.
+
+    Examples
+    --------
+    >>> frame = reskin.load_recording("captures/run1")  # doctest: +SKIP
+    >>> frame.attrs["units"]["Fz_N"]  # doctest: +SKIP
+    'N'
+    >>> X, y = frame.filter(like="db"), frame[["x_mm", "y_mm", "Fz_N"]]  # doctest: +SKIP
+    """
+    from reskin.recordings import loading
+
+    return loading.load_recording(Path(path), frames=frames, rate_hz=rate_hz)
 
 
 @overload

@@ -1,18 +1,30 @@
 """Load recordings: logs as arrays, and recordings of any kind as a pandas DataFrame with units."""
 
+import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from reskin import io
 from reskin.board.stream import decode_all
-from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.decode import read_frames
-from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
-from reskin.recordings.ingest import read_header, timer
-from reskin.recordings.readers import sd_card
+from reskin.errors import CaptureError, ParamsError, ReskinError, missing_package
+from reskin.recordings.decode import frame_columns, read_frames
+from reskin.recordings.fault_policy import STANDARD_POLICY
+from reskin.recordings.header import LOG_FILE, PROBE_FILE, RATE_MAX_HZ, STREAM_FILE, write_capture
+from reskin.recordings.ingest import open_capture, read_header, timer
+from reskin.recordings.preparing import UNNAMED, CaptureNames, foreign, layouts_of
+from reskin.recordings.readers import READERS, sd_card
+from reskin.schema import LABELS, UNITS, Readings, unit_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PARQUET_MAGIC = b"PAR1"
+EXTRA = "learn"  # the extra of pyproject.toml that installs pandas
 
 
 def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
@@ -46,3 +58,101 @@ def _read_capture(folder: Path) -> sd_card.Log:
     kept = frames.where(timed)
     *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
     return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+
+
+def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
+    """Load a recording as a DataFrame (see `reskin.load_recording`)."""
+    try:
+        import pandas as pd
+    except ImportError:
+        raise missing_package("pandas", "load_recording", extra=EXTRA) from None
+    labels: Mapping[str, str] = {}  # names that are the same in all rows
+    if path.is_dir():
+        header = read_header(path)
+        is_log = header.layout == "sd-card" or (header.layout == "native" and not (path / PROBE_FILE).is_file())
+        kind = "log" if is_log or (frames and header.layout == "native") else "labelled"
+        labels = {name: getattr(header, name) for name in LABELS}
+    else:
+        kind = _kind_of(path)
+    if kind != "log":
+        if frames:
+            raise ParamsError(f"{path}: only a capture of `reskin record` has frames. Load it without frames=True.")
+        readings, counts = READ[kind](path)
+        return _readings_frame(pd, readings, counts)
+    t_s, b_uT, temperature_degC, counts = read_any_log(path, rate_hz)
+    names = [name for name, unit in frame_columns(temperature_degC.shape[1]).items() if unit in ("uT", "degC")]
+    columns: dict[str, Any] = {**labels, "t_s": t_s, **dict(zip(names, [*b_uT.T, *temperature_degC.T], strict=True))}
+    return _frame(pd, columns, counts)
+
+
+def _kind_of(file: Path) -> str:
+    """Return the kind of a file by its column names: `table`, `ingested`, or `log` for all others."""
+    if not file.is_file():
+        raise CaptureError(f"{file}: file not found. Check the path.")
+    with file.open("rb") as stream:
+        head = stream.read(sd_card.HEADER_CHARACTERS_MAX)
+    if head.startswith(PARQUET_MAGIC):
+        names = io.read_column_names(file)
+    else:
+        names = [name.strip() for name in head.decode("utf-8-sig", errors="replace").partition("\n")[0].split(",")]
+    return "table" if "phase" in names else "ingested" if set(UNITS) <= set(names) else "log"
+
+
+def _read_labelled(folder: Path) -> tuple[Readings, Mapping[str, int]]:
+    """Read the readings in contact of a capture."""
+    _, blocks, account = open_capture(folder, STANDARD_POLICY)
+    parts = list(blocks)
+    if not parts:
+        raise CaptureError(f"{folder}: no reading can be used: {dict(account)}. Check its labels and its faults.")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in UNITS}
+    return replace(parts[0], **joined), account
+
+
+def _read_ingested(file: Path) -> tuple[Readings, Mapping[str, int]]:
+    return io.read_readings(file), io.read_ingest_counts(file)
+
+
+def _read_table(file: Path) -> tuple[Readings, Mapping[str, int]]:
+    """Read the readings in contact of a file of layout `table`."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", file.stem).lstrip("_-")[:64]
+    try:
+        header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
+        with TemporaryDirectory() as folder:
+            copy = Path(folder) / header.capture
+            return READERS["table"].read(copy, write_capture(copy, header, files), STANDARD_POLICY)
+    except ReskinError as error:
+        others = [layout for layout in layouts_of(file) if layout in READERS and layout != "table"]
+        if not others:
+            raise
+        raise type(error)(
+            f"{error} This is layout {' or '.join(others)}: add the recording with `reskin add`, and load its capture."
+        ) from None
+
+
+READ = {"labelled": _read_labelled, "ingested": _read_ingested, "table": _read_table}
+
+
+def _readings_frame(pd: Any, readings: Readings, counts: Mapping[str, int]) -> "pd.DataFrame":
+    """Convert readings to a DataFrame with one column per channel, and with the field changes."""
+    columns: dict[str, Any] = {name: getattr(readings, name) for name in LABELS}
+    channels = [name for name, unit in frame_columns(readings.chips_n).items() if unit == "uT"]
+    for name in UNITS:
+        values = getattr(readings, name)
+        if name == "temperature_degC":
+            columns |= {f"temperature{chip}_degC": column for chip, column in enumerate(values.T)}
+        elif name == "b_uT":
+            columns |= dict(zip(channels, values.T, strict=True))
+        elif name == "noload_uT":
+            columns |= {f"noload_{channel}": column for channel, column in zip(channels, values.T, strict=True)}
+            change_uT = readings.b_uT - readings.noload_uT
+            columns |= {f"d{channel}": column for channel, column in zip(channels, change_uT.T, strict=True)}
+        else:
+            columns[name] = values
+    return _frame(pd, columns, counts)
+
+
+def _frame(pd: Any, columns: Mapping[str, Any], counts: Mapping[str, int]) -> "pd.DataFrame":
+    units = {name: "" if name in LABELS else unit_of(name) for name in columns}
+    frame = pd.DataFrame(columns)
+    frame.attrs = {"units": units, "counts": dict(counts)}
+    return frame
