@@ -26,16 +26,26 @@ ROOT = Path(__file__).resolve().parents[1]
 QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
 
 
-@pytest.mark.parametrize("name", ["reskin", "reskin.api", "reskin.errors", "reskin.live.emulator"])
+@pytest.mark.parametrize("name", ["reskin", "reskin.api", "reskin.errors", "reskin.estimators", "reskin.live.emulator"])
 def test_examples_in_docstrings_run(name):
     done = doctest.testmod(importlib.import_module(name), extraglobs={"reskin": reskin})
     assert (done.failed, done.attempted > 0) == (0, True)
 
 
 def test_import_is_cheap():
-    code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
+    modules = ("torch", "scipy", "pandas", "sklearn", "mlflow")
+    code = f"import sys, reskin; print([name for name in {modules} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_estimators_need_scikit_learn_but_the_library_does_not(monkeypatch):
+    assert {"ContactRegressor", "UniversalRegressor", "SCORERS"} < set(dir(reskin))
+    monkeypatch.setattr("reskin.find_spec", lambda name: None)
+    with pytest.raises(ReskinError, match=r"reskin.SCORERS: package scikit-learn is not installed.*'\.\[learn\]'"):
+        _ = reskin.SCORERS
+    assert "ContactRegressor" not in dir(reskin)
+    assert all(hasattr(reskin, name) for name in reskin.__all__)
 
 
 def test_load_rows_equals_the_pipeline(tmp_path):
