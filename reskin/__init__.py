@@ -9,6 +9,7 @@
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
+`simulate_recording`                   a recording of a simulated board, like that of `record`
 `ContactRegressor`                     the paper's network, with scikit-learn's fit and predict
 `UniversalRegressor`                   the same for the universal model: `fit` calibrates it to a skin
 `SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
         open,
         record,
         simulate_pokes,
+        simulate_recording,
         touch,
     )
     from reskin.estimators import SCORERS as SCORERS
@@ -64,6 +66,7 @@ __all__ = [
     "open",
     "record",
     "simulate_pokes",
+    "simulate_recording",
     "touch",
 ]
 # Names that need scikit-learn. They are not in `__all__`, so that `from reskin import *` works without it.

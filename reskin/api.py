@@ -8,6 +8,7 @@ its dependencies when it is called, so that `import reskin` is quick.
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -223,6 +224,63 @@ def simulate_pokes(
     noload_uT, _ = read_field(response.rest_T, board, design=design, rng=rngs["noload"])
     b_uT, _ = read_field(response.rest_T + response.change_T[:, 0], board, design=design, rng=rngs["contact"])
     return Pokes(noload_uT, b_uT, response.force_N[:, 0, 2])
+
+
+def simulate_recording(
+    folder: Path | str,
+    *,
+    skin: str = "b0_s0",
+    board: str = "b0",
+    depths_mm: Sequence[float] = (0.4, 0.8, 1.2),
+    passes_n: int = 1,
+    seed: int = 0,
+) -> Path:
+    """Simulate a labelled recording of a board, and write it to a folder like `reskin record`.
+
+    A robot presses the skin at the 65 places of the paper's grid. The header says that the capture is simulated.
+
+    Parameters
+    ----------
+    folder : path
+        Folder to create for the capture.
+    skin, board, seed : str, str, int
+        The same names and seed give the same skin (`draw_skin`), board (`draw_board`) and noise.
+    depths_mm : sequence of float
+        Depths of the indentations: all places are pressed at the first depth, then at the next one.
+    passes_n : int
+        Number of repetitions.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    ReskinError
+        If the folder exists, a name is not allowed, or a setting is out of range.
+
+    Examples
+    --------
+    >>> folder = reskin.simulate_recording("captures/run1", depths_mm=[1.0])  # doctest: +SKIP
+    """
+    from reskin.recordings import header as headers
+    from reskin.simulation.capture import simulate_capture, to_files
+    from reskin.simulation.defaults import SHARED
+    from reskin.simulation.settings import MAIN, parse_simulation
+
+    target, where = Path(folder), "simulate_recording"
+    if target.exists():
+        raise ParamsError(f"{where}: {target} exists. Choose another folder.")
+    for what, name in (("folder", target.name), ("skin", skin), ("board", board)):
+        if not re.fullmatch(headers.NAME, name):
+            raise ParamsError(where, what, "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another name.")
+    presses = nominal("protocols")[MAIN] | {"depths_mm": list(depths_mm), "passes_n": passes_n}
+    section = {"boards": nominal("boards"), "protocols": {MAIN: presses}}
+    simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, where)
+    header, files = to_files(simulate_capture(simulation, MAIN, board=board, skin=skin, seed=seed), simulation)
+    headers.write_capture(target, header.model_copy(update={"capture": target.name}), files)
+    return target
 
 
 class Model:

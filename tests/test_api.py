@@ -140,3 +140,20 @@ def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
         reskin.load_model(model).predict(b_uT)
     with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):
         loaded.predict([1.0, 2.0])
+
+
+def test_simulated_recording_is_loaded_like_a_recorded_one(tmp_path):
+    folder = reskin.simulate_recording(tmp_path / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
+    frame = reskin.load_recording(folder)
+    assert [frame[name].unique().tolist() for name in ("capture", "board", "skin", "source")] == [
+        ["run1"], ["b1"], ["b1_s0"], ["simulated"],
+    ]  # fmt: skip
+    assert (frame["indentation"].nunique(), frame["depth_mm"].unique().tolist()) == (65, [1.0])
+    again = reskin.simulate_recording(tmp_path / "again" / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
+    assert reskin.load_recording(again).equals(frame)
+    with pytest.raises(ReskinError, match="run1 exists. Choose another folder"):
+        reskin.simulate_recording(folder)
+    for wrong in ({"depths_mm": [-1.0]}, {"passes_n": 0}, {"board": "a b"}):
+        with pytest.raises(ReskinError, match="simulate_recording"):
+            reskin.simulate_recording(tmp_path / "wrong", **wrong)
+    assert not (tmp_path / "wrong").exists()
