@@ -1,7 +1,8 @@
-"""Tests of docs/notebook.ipynb: its cells run in order, without Jupyter, and print what the committed file shows."""
+"""Tests of docs/notebook.ipynb and docs/python.md: their code runs, and the notebook prints its committed outputs."""
 
 import io
 import json
+import re
 import tempfile
 from contextlib import redirect_stdout
 from pathlib import Path
@@ -40,3 +41,18 @@ def test_notebook_was_run_once_in_order(cells):
     names = {output.get("name", "figure") for cell in cells for output in cell["outputs"]}
     assert names == {"stdout", "figure"}  # neither warnings nor errors
     assert FILE.stat().st_size < BYTES_MAX_N
+
+
+def test_examples_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("Agg")
+    blocks = re.findall(r"```python\n(.*?)```", FILE.with_name("python.md").read_text(encoding="utf-8"), re.DOTALL)
+    variables: dict[str, object] = {}
+    try:
+        for block in blocks:
+            exec(block.replace("steps_n=800", "steps_n=4"), variables)
+    finally:
+        plt.close("all")
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "captures", "network.safetensors", "network.json", "b0_s0.safetensors",
+    }  # fmt: skip
