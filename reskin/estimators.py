@@ -242,7 +242,7 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     ----------
     model_ : Universal
         The calibrated model. `model_.save(FILE)` writes the calibration, for `reskin.load_universal(FILE)` and `reskin
-        live --model FILE`; `model_.warnings` tells what is uncertain.
+        live --model FILE`.
     n_features_in_, feature_names_in_
         Number of channels, and their names if X was a DataFrame.
 
@@ -293,6 +293,11 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         SchemaError
             If the number of channels is not that of the board, only one of x_mm and y_mm is known, or a label or a
             field is out of range (see `reskin.universal.model.Universal.label`).
+
+        Warns
+        -----
+        UserWarning
+            If the orientation of the skin or of the labels' axes is uncertain or wrong (`model_.warnings`).
         """
         from reskin.universal.model import FILE, load_universal  # imported late, because it imports Numba
 
@@ -317,6 +322,8 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             model.label(target[rows, :2], target[rows, 2], b_uT[rows])
         if (rows := placed & ~weighed).any():
             model.label(target[rows, :2], None, b_uT[rows], keep=True)
+        for sentence in model.warnings:
+            warnings.warn(sentence, UserWarning, stacklevel=2)
         self.model_ = model
         return self
 

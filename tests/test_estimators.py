@@ -200,6 +200,13 @@ def test_universal_regressor_follows_conventions(pressed, tmp_path):
     np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)  # rounding of the sum
 
 
+def test_universal_regressor_warns_of_mirrored_labels(pressed):
+    noload_uT, X, y = pressed
+    mirrored = y * [1, -1, 1] + [0, 16, 0]
+    with pytest.warns(UserWarning, match="mirrored"):
+        reskin.UniversalRegressor(noload_uT).fit(X, mirrored)
+
+
 def test_universal_regressor_refuses_wrong_data(pressed):
     noload_uT, X, y = pressed
     for regressor, changed, message in (
