@@ -66,6 +66,25 @@ def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
         import pandas as pd
     except ImportError:
         raise missing_package("pandas", "load_recording", extra=EXTRA) from None
+    try:
+        return _load(pd, path, frames=frames, rate_hz=rate_hz)
+    except ReskinError as error:
+        if hint := _hint(path, frames=frames):
+            raise type(error)(f"{error} {hint}") from None
+        raise
+
+
+def _hint(path: Path, *, frames: bool) -> str:
+    """Return what else the user can do if a recording cannot be loaded; "" if nothing."""
+    layouts = [layout for layout in layouts_of(path) if layout != "table"]
+    if layouts == ["capture"]:
+        return "" if frames else "To load the frames without labels, try: frames=True"
+    if set(layouts) <= READERS.keys():
+        return f"This is layout {' or '.join(layouts)}: run `reskin add`, and load the capture." if layouts else ""
+    return "This is a dump of a serial port: run `reskin decode`, and load its output."
+
+
+def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
     labels: Mapping[str, str] = {}  # names that are the same in all rows
     if path.is_dir():
         header = read_header(path)
@@ -115,18 +134,10 @@ def _read_ingested(file: Path) -> tuple[Readings, Mapping[str, int]]:
 def _read_table(file: Path) -> tuple[Readings, Mapping[str, int]]:
     """Read the readings in contact of a file of layout `table`."""
     name = re.sub(r"[^A-Za-z0-9_-]", "_", file.stem).lstrip("_-")[:64]
-    try:
-        header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
-        with TemporaryDirectory() as folder:
-            copy = Path(folder) / header.capture
-            return READERS["table"].read(copy, write_capture(copy, header, files), STANDARD_POLICY)
-    except ReskinError as error:
-        others = [layout for layout in layouts_of(file) if layout in READERS and layout != "table"]
-        if not others:
-            raise
-        raise type(error)(
-            f"{error} This is layout {' or '.join(others)}: add the recording with `reskin add`, and load its capture."
-        ) from None
+    header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / header.capture
+        return READERS["table"].read(copy, write_capture(copy, header, files), STANDARD_POLICY)
 
 
 READ = {"labelled": _read_labelled, "ingested": _read_ingested, "table": _read_table}

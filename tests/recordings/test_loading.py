@@ -151,13 +151,17 @@ def test_other_files_are_errors_that_name_the_file(tmp_path):
         with pytest.raises(ReskinError, match=rf"{name}.*{message}"):
             reskin.load_recording(tmp_path / name)
     stream = write_stream(tmp_path / "late", {PROBE_FILE: labels().replace(",0,contact", ",0,noload").encode()})
-    with pytest.raises(CaptureError, match="late"):
+    with pytest.raises(CaptureError, match="late.*try: frames=True"):
         reskin.load_recording(stream)
+    assert len(reskin.load_recording(stream, frames=True)) == FRAMES_N
+    with pytest.raises(CaptureError, match="stream.bin.*run `reskin decode`"):
+        reskin.load_recording(stream / STREAM_FILE)
 
 
 def test_recorded_layout_is_named(shared_data):
-    with pytest.raises(ReskinError, match="This is layout lab: add the recording with `reskin add`"):
-        reskin.load_recording(shared_data / "lab/board1_depth1.csv")
+    for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
+        with pytest.raises(ReskinError, match=f"This is layout {layout}: run `reskin add`"):
+            reskin.load_recording(shared_data / name)
 
 
 def test_missing_pandas_is_an_error_that_names_the_extra(tmp_path, monkeypatch):
