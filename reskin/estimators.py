@@ -9,6 +9,7 @@ have the same inputs and outputs, so that they can be compared by `cross_val_sco
 """
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from reskin.errors import ParamsError, SchemaError, TrainingError, require
 from reskin.models.job import TrainingData, TrainingJob, TrainingResult
 from reskin.models.recipe import Recipe
 from reskin.models.runner import MAX_ATTEMPTS_N
-from reskin.models.trained import FORMAT, Network
+from reskin.models.trained import FORMAT, SUFFIX, Network
 
 # How scikit-learn validates y: one or several targets, which may be unknown (NaN).
 TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "allow-nan"}
@@ -136,7 +137,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         data = TrainingData(db_uT, target, np.zeros(len(db_uT), int) if skin is None else np.asarray(skin))
         job = TrainingJob("fit", "own", recipe, "all", seed, 0, np.arange(len(db_uT)), np.zeros(0, np.int64))
         result, collapsed_before_n = _train(job, data)
-        self.targets_shape_ = targets.shape[1:]
+        self._targets_shape = targets.shape[1:]
         self.loss_curve_ = result.curve
         self.network_ = Network(
             _card(recipe, seed, db_uT.shape[1], result, collapsed_before_n),
@@ -148,22 +149,26 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT."""
         check_is_fitted(self)
         db_uT = validate_data(self, X, dtype=np.float32, reset=False)
-        return self.network_(db_uT).reshape(-1, *self.targets_shape_).astype(np.float64)
+        return self.network_(db_uT).reshape(-1, *self._targets_shape).astype(np.float64)
 
     def save(self, file: Path | str) -> None:
         """Write the network (.safetensors) and its card (.json), for `reskin.load_model` and `reskin live --model`.
 
         Raises
         ------
+        ParamsError
+            If the file's name does not end in .safetensors.
         SchemaError
             If the network was not trained on Bx, By, Bz of each chip and the three targets x_mm, y_mm and force.
         """
         check_is_fitted(self)
-        if self.n_features_in_ % 3 or self.targets_shape_ != (len(TARGETS),):
-            got = f"{self.n_features_in_} channels and targets of shape {self.targets_shape_}"
+        path = Path(file)
+        if path.suffix != SUFFIX:
+            raise ParamsError(file, "the name", f"one that ends in {SUFFIX}", path.name, f"Try: {path.name}{SUFFIX}")
+        if self.n_features_in_ % 3 or self._targets_shape != (len(TARGETS),):
+            got = f"{self.n_features_in_} channels and targets of shape {self._targets_shape}"
             rule = f"3 channels per chip and the targets {', '.join(TARGETS)}"
             raise SchemaError(file, "a saved network", f"for {rule}", got, "Use joblib for other networks.")
-        path = Path(file).with_suffix(".safetensors")
         io.write_tensors(path, self.network_.tensors, {"format": FORMAT})
         io.write_json(path.with_suffix(".json"), dict(self.network_.card))
 
@@ -187,8 +192,6 @@ def _as_seed(random_state: Any) -> int:
 
 def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
     """Train as `reskin.models.runner.run_jobs`; return the result, and the number of runs before that collapsed."""
-    from dataclasses import replace
-
     from reskin.models.train import train_stack  # imported late, because it imports torch
 
     for attempt_i in range(MAX_ATTEMPTS_N):

@@ -87,6 +87,8 @@ def test_network_equals_that_of_the_training_loop_bit_for_bit(triplet_weight):
     assert all((tensors[name] == values).all() for name, values in network_of(regressor).items())
     assert regressor.loss_curve_ == expected.curve
     np.testing.assert_array_equal(regressor.predict(X), expected.predicted)
+    from_grid = clone(regressor).set_params(steps_n=np.int64(4), rate_max=np.float64(regressor.rate_max))
+    np.testing.assert_array_equal(from_grid.fit(X, y, skin=skin).predict(X), expected.predicted)
     other_seed = clone(regressor).set_params(random_state=4).fit(X, y, skin=skin)
     assert (other_seed.predict(X) != expected.predicted).all()
 
@@ -122,7 +124,9 @@ def test_saved_network_is_loaded_as_a_model(tmp_path):
     np.testing.assert_array_equal(model.predict(X), regressor.predict(X))
     with pytest.raises(SchemaError, match="a saved network must be for 3 channels per chip"):
         reskin.ContactRegressor(**SHORT).fit(X[:, :14], y).save(tmp_path / "other.safetensors")
-    assert not (tmp_path / "other.safetensors").exists()
+    with pytest.raises(ParamsError, match=r"ends in .safetensors; got mine. Try: mine.safetensors"):
+        regressor.save(tmp_path / "mine")
+    assert {file.name for file in tmp_path.iterdir()} == {"mine.safetensors", "mine.json"}
 
 
 def test_failed_training_is_not_silent(monkeypatch):

@@ -32,7 +32,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
     if log.is_dir():
         return _read_capture(log)
     if not 0 < rate_hz <= RATE_MAX_HZ:
-        raise ParamsError(f"--rate-hz: {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
+        raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
     if log.is_file():
         with log.open("rb") as stream:
             is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
@@ -85,12 +85,12 @@ def _hint(path: Path, *, frames: bool) -> str:
 
 
 def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
-    labels: Mapping[str, str] = {}  # names that are the same in all rows
+    names_of: Mapping[str, str] = {}  # column -> the name that all rows have
     if path.is_dir():
         header = read_header(path)
         is_log = header.layout == "sd-card" or (header.layout == "native" and not (path / PROBE_FILE).is_file())
         kind = "log" if is_log or (frames and header.layout == "native") else "labelled"
-        labels = {name: getattr(header, name) for name in LABELS}
+        names_of = {name: getattr(header, name) for name in LABELS}
     else:
         kind = _kind_of(path)
     if kind != "log":
@@ -99,9 +99,9 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
         readings, counts = READ[kind](path)
         return _readings_frame(pd, readings, counts)
     t_s, b_uT, temperature_degC, counts = read_any_log(path, rate_hz)
-    names = [name for name, unit in frame_columns(temperature_degC.shape[1]).items() if unit in ("uT", "degC")]
-    columns: dict[str, Any] = {**labels, "t_s": t_s, **dict(zip(names, [*b_uT.T, *temperature_degC.T], strict=True))}
-    return _frame(pd, columns, counts)
+    channels = [name for name, unit in frame_columns(temperature_degC.shape[1]).items() if unit in ("uT", "degC")]
+    measured = dict(zip(channels, [*b_uT.T, *temperature_degC.T], strict=True))
+    return _frame(pd, {**names_of, "t_s": t_s, **measured}, counts)
 
 
 def _kind_of(file: Path) -> str:
