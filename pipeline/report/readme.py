@@ -21,6 +21,10 @@ from reskin.errors import ParamsError, SchemaError
 
 TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
+MOVING = (
+    "moving_hand", "moving_hand_detection", "moving_hand_places", "moving_hand_simulated",
+    "moving_hand_places_simulated",
+)  # fmt: skip
 NONE_YET = "None yet."
 COSTS_MEANING = (
     "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
@@ -84,11 +88,13 @@ def blocks_of(
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
+    moving = [numbers for numbers in recorded if "moving_hand" in numbers]
     skins = {
         f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
+        if numbers not in moving  # their presses are those of another scene
     }
     return {
         "headline": _summary(results[-1]),
@@ -98,6 +104,7 @@ def blocks_of(
         "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
+        "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),
     }
