@@ -122,8 +122,10 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     # Tables are made only for the experiments that are shown, because the current code may be unable to read the
     # committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
+    trained = provenance["trained"]  # empty if the scene trains no networks
+    code = f"trained by code {trained}" if trained else f"code {provenance['git']}"
     heading = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; {code}, "
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])
