@@ -478,19 +478,17 @@ OF_RECORDINGS = (
     "say little about the distance."
 )
 OF_CONTACTS = (
-    "Recorded. False contacts: readings of the tested recordings, without contact, that are above the threshold of "
-    "`reskin live`. Compensation: a regression predicts the change from the joint positions, and it is subtracted. The "
-    "regression is trained on the pad's other recording or on the first half of the tested one; then only the second "
-    "half is tested."
+    "Recorded. False contacts: readings of the tested recordings, without contact, that are above a threshold: that of "
+    "`reskin live`, or that for {detected:g} % of touches (table moving_hand_detection). Compensation: a regression "
+    "predicts the change from the joint positions, and it is subtracted. The regression is trained on the pad's other "
+    "recording or on the first half of the tested one; then only the second half is tested."
 )
 OF_DETECTION = (
     "Superposed: {touches_n} recorded readings of presses, times a factor, each plus a change recorded on the hand. "
-    "Detected by live: superpositions above the threshold of `reskin live`. "
-    "Threshold: {detected:g} % of the superpositions with changes of the rows for the threshold are above it. False "
-    "contacts: recorded changes of the tested rows, without a press, above this threshold. Detected: superpositions "
-    "with changes of the tested rows. The rows for the threshold are the other recording or, with compensation, the "
-    "first half of the tested one. Superpositions contain the noise of both recordings, and no effect of a "
-    "press on the hand."
+    "Threshold: {detected:g} % of the superpositions with changes of the rows for the threshold are above it. Detected: "
+    "superpositions with changes of the tested rows above this threshold, or above that of `reskin live`. The rows for "
+    "the threshold are the other recording or, with compensation, the first half of the tested one. Superpositions "
+    "contain the noise of both recordings, and no effect of a press on the hand."
 )
 OF_SIMULATED = (
     "Simulated: {skins_n} skins from the prior of the shipped model. Turned: a skin is turned from one random "
@@ -527,7 +525,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     distances = {"distances_n": len(DISTANCES_MM), "least": DISTANCES_MM[0], "most": DISTANCES_MM[-1]}
     notes = {
         "moving_hand_recordings": OF_RECORDINGS.format(**distances),
-        "moving_hand": OF_CONTACTS,
+        "moving_hand": OF_CONTACTS.format(detected=detected),
         "moving_hand_detection": OF_DETECTION.format(detected=detected, touches_n=numbers["touches_n"]),
         "moving_hand_simulated": simulated + OF_THRESHOLD.format(detected=detected),
         "moving_hand_places": OF_PLACES.format(
@@ -537,7 +535,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     }
     lines = {
         "moving_hand_recordings": [_recording_line(row) for row in numbers["recordings"]],
-        "moving_hand": [_contact_line(row) for row in numbers["contacts"]],
+        "moving_hand": [_contact_line(row, detected) for row in numbers["contacts"]],
         "moving_hand_detection": [_detection_line(row) for row in numbers["contacts"]],
         "moving_hand_simulated": [_simulated_line(row) for row in numbers["simulated_contacts"]],
         "moving_hand_places": _place_lines(numbers["superposed_places"], SUPERPOSED),
@@ -555,9 +553,12 @@ def _recording_line(row: Mapping[str, Any]) -> Row:
     }  # fmt: skip
 
 
-def _contact_line(row: Mapping[str, Any]) -> Row:
-    false = {"false contacts per 100 readings": round(row["live_false_per_100"], 1)}
-    return _method_cells(row) | {"readings": row["readings_n"]} | false | {"source": RECORDED}
+def _contact_line(row: Mapping[str, Any], detected_pct: float) -> Row:
+    false = {"threshold of live": round(row["live_false_per_100"], 1)}
+    for part in row["thresholds"]:
+        false[f"{detected_pct:g} % of touches x {part['touch_scale']:g}"] = round(part["false_per_100"], 1)
+    titled = {f"false contacts per 100, {name}": per_100 for name, per_100 in false.items()}
+    return _method_cells(row) | {"readings": row["readings_n"]} | titled | {"source": RECORDED}
 
 
 def _method_cells(row: Mapping[str, Any]) -> Row:
@@ -570,10 +571,9 @@ def _detection_line(row: Mapping[str, Any]) -> Row:
     for part in row["thresholds"]:
         name = f"touches x {part['touch_scale']:g}: "
         line |= {
-            f"{name}detected by live, %": round(part["live_detected_pct"], 1),
             f"{name}threshold, uT": round(part["threshold_uT"]),
-            f"{name}false contacts per 100": round(part["false_per_100"], 1),
             f"{name}detected, %": round(part["detected_pct"], 1),
+            f"{name}detected by live, %": round(part["live_detected_pct"], 1),
         }
     return line | {"source": SUPERPOSED}
 

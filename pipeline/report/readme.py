@@ -21,10 +21,7 @@ from reskin.errors import ParamsError, SchemaError
 
 TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
-MOVING = (
-    "moving_hand", "moving_hand_detection", "moving_hand_places", "moving_hand_simulated",
-    "moving_hand_places_simulated",
-)  # fmt: skip
+MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
     "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
