@@ -486,8 +486,8 @@ OF_CONTACTS = (
 OF_DETECTION = (
     "Superposed: {touches_n} recorded readings of presses, times a factor, each plus a change recorded on the hand. "
     "Threshold: {detected:g} % of the superpositions with changes of the rows for the threshold are above it. "
-    "Detected: superpositions with changes of the tested rows above this threshold, or above that of `reskin live`. The "
-    "rows for the threshold are the other recording or, with compensation, the first half of the tested one. "
+    "Detected: superpositions with changes of the tested rows above this threshold, or above that of `reskin live`. "
+    "The rows for the threshold are the other recording or, with compensation, the first half of the tested one. "
     "Superpositions contain the noise of both recordings, and no effect of a press on the hand."
 )
 OF_SIMULATED = (
