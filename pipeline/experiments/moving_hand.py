@@ -291,7 +291,7 @@ def count_contacts(
         live_threshold(tested.noise_uT, of_pair[1]) for (_, tested), of_pair in zip(pairs, matrices, strict=True)
     ]
     false = np.concatenate([strength_uT > limit_uT for strength_uT, limit_uT in zip(still, live_uT, strict=True)])
-    row: Row = {"live_false_per_100": 100 * float(false.mean()), "thresholds": []}
+    row: Row = {"live_false_pct": 100 * float(false.mean()), "thresholds": []}
     pad_i = rng.integers(len(pairs), size=len(touches_uT))
     for scale in section.touch_scales:
         superposed = np.zeros((2, len(touches_uT)))
@@ -303,7 +303,7 @@ def count_contacts(
         threshold_uT = float(np.quantile(superposed[0], 1 - section.detected_fraction))
         row["thresholds"].append({
             "touch_scale": scale, "threshold_uT": threshold_uT,
-            "false_per_100": 100 * float((np.concatenate(still) > threshold_uT).mean()),
+            "false_pct": 100 * float((np.concatenate(still) > threshold_uT).mean()),
             "detected_pct": 100 * float((superposed[1] > threshold_uT).mean()),
             "live_detected_pct": 100 * float((superposed[1] > np.array(live_uT)[pad_i]).mean()),
         })  # fmt: skip
@@ -384,9 +384,9 @@ def simulated_contact_rows(
             limit_uT = float(np.quantile(np.concatenate(pressed[::2]), 1 - section.detected_fraction))
             rows.append({
                 "field": field, "external_uT": external_uT, "readings_n": sum(map(len, still)),
-                "live_false_per_100": _above_pct(still, live_uT),
+                "live_false_pct": _above_pct(still, live_uT),
                 "live_detected_pct": _above_pct(pressed, live_uT), "threshold_uT": limit_uT,
-                "false_per_100": _above_pct(still[1::2], limit_uT), "detected_pct": _above_pct(pressed[1::2], limit_uT),
+                "false_pct": _above_pct(still[1::2], limit_uT), "detected_pct": _above_pct(pressed[1::2], limit_uT),
             })  # fmt: skip
     return rows
 
@@ -554,9 +554,9 @@ def _recording_line(row: Mapping[str, Any]) -> Row:
 
 
 def _contact_line(row: Mapping[str, Any], detected_pct: float) -> Row:
-    false = {"threshold of live": round(row["live_false_per_100"], 1)}
+    false = {"threshold of live": round(row["live_false_pct"], 1)}
     for part in row["thresholds"]:
-        false[f"{detected_pct:g} % of touches x {part['touch_scale']:g}"] = round(part["false_per_100"], 1)
+        false[f"{detected_pct:g} % of touches x {part['touch_scale']:g}"] = round(part["false_pct"], 1)
     titled = {f"false contacts per 100, {name}": per_100 for name, per_100 in false.items()}
     return _method_cells(row) | {"readings": row["readings_n"]} | titled | {"source": RECORDED}
 
@@ -581,9 +581,9 @@ def _detection_line(row: Mapping[str, Any]) -> Row:
 def _simulated_line(row: Mapping[str, Any]) -> Row:
     return {
         "external field": row["field"], "external_uT": f"{row['external_uT']:g}", "readings": row["readings_n"],
-        "false contacts per 100 readings": round(row["live_false_per_100"], 1),
+        "false contacts per 100 readings": round(row["live_false_pct"], 1),
         "detected, %": round(row["live_detected_pct"], 1), "other threshold, uT": round(row["threshold_uT"]),
-        "with it: false contacts per 100": round(row["false_per_100"], 1),
+        "with it: false contacts per 100": round(row["false_pct"], 1),
         "with it: detected, %": round(row["detected_pct"], 1), "source": SIMULATED,
     }  # fmt: skip
 
@@ -611,7 +611,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         for axes, (rows, key, kind) in zip(panels[:2], false, strict=True):
             for i, name in enumerate(dict.fromkeys(row[key] for row in rows)):
                 own = [row for row in rows if row[key] == name]
-                x, y = ([row[part] for row in own] for part in ("external_uT", "live_false_per_100"))
+                x, y = ([row[part] for row in own] for part in ("external_uT", "live_false_pct"))
                 axes.plot(x, y, marker=MARKERS[i], color=COLOURS[i], label=name)
             axes.set(ylabel="false contacts per 100 readings", title=f"Contacts, {kind}", ylim=(-4, 104))
         places = ((numbers["superposed_places"], SUPERPOSED), (numbers["simulated_places"], SIMULATED))

@@ -95,15 +95,15 @@ def test_option_and_compensation_reduce_false_contacts():
     ]
     touches_uT = 400 * rng.standard_normal((500, 15))
     off, on = (hand.count_contacts(pairs, touches_uT, uT, SECTION, rng_for(0, "draws")) for uT in (0.0, 100.0))
-    assert off["live_false_per_100"] > 90
-    assert on["live_false_per_100"] < 5
+    assert off["live_false_pct"] > 90
+    assert on["live_false_pct"] < 5
     for row in (off, on):
         for part, scale in zip(row["thresholds"], SECTION.touch_scales, strict=True):
             assert part["touch_scale"] == scale
             # detection on other changes: 99 % up to the errors of two quantiles of 500 (0.45 % each)
             assert part["detected_pct"] == pytest.approx(99, abs=1.8)
     still = [(pad_of(np.zeros((300, 15))), pad_of(np.zeros((300, 15))))]
-    assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_per_100"] == 0
+    assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_pct"] == 0
 
 
 def test_groups_must_name_captures_of_pads():
@@ -161,8 +161,8 @@ def test_stage_runs_on_made_up_recordings(tmp_path):
     assert by_field["pads", 0.0, 4] > by_field[NO_FIELD, 0.0, 4]
     simulated = {(row["field"], row["external_uT"]): row for row in numbers["simulated_contacts"]}
     assert set(simulated) == {(field, uT) for field in (NO_FIELD, TURNED, MAGNET) for uT in (0.0, 140.0)}
-    assert simulated[NO_FIELD, 0.0]["live_false_per_100"] == 0
-    assert simulated[MAGNET, 140.0]["live_false_per_100"] < simulated[MAGNET, 0.0]["live_false_per_100"]
+    assert simulated[NO_FIELD, 0.0]["live_false_pct"] == 0
+    assert simulated[MAGNET, 140.0]["live_false_pct"] < simulated[MAGNET, 0.0]["live_false_pct"]
     shown = hand.tables(numbers, "recorded")
     kinds = {name: set(table["source"]) for name, table in shown.items()}
     assert kinds == {
