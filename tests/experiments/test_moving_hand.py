@@ -87,7 +87,7 @@ def test_compensation_removes_what_joints_explain(learner, trained_on):
     assert rms_uT < (1.1 if learner == "ridge" else 3) * NOISE_uT < pads[1].db_uT.std() / 3
 
 
-def test_option_and_compensation_reduce_false_contacts():
+def test_option_reduces_false_contacts_but_not_detection():
     rng = rng_for(0, "moving hand", "contacts")
     cov = external.covariance(np.array(CHIPS_MM), 100.0)
     pairs = [

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
@@ -49,7 +49,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class _Pad:
-    """The rows of one pad, before they are sorted by use: those from `first_i` to `first_i + NOLOAD_ROWS_N` rest."""
+    """All rows of one pad. The no-load rows are the `NOLOAD_ROWS_N` rows from index `first_i` on."""
 
     b_uT: Float64[np.ndarray, "f ch"]
     joint_counts: Int64[np.ndarray, "f j"]
@@ -58,12 +58,12 @@ class _Pad:
     pads_n: int
 
     @property
-    def is_noload(self) -> np.ndarray:
+    def is_noload(self) -> Bool[np.ndarray, " f"]:
         row_i = np.arange(len(self.b_uT)) - self.first_i
         return (row_i >= 0) & (row_i < NOLOAD_ROWS_N) & self.rows.keep
 
     @property
-    def is_reading(self) -> np.ndarray:
+    def is_reading(self) -> Bool[np.ndarray, " f"]:
         return (np.arange(len(self.b_uT)) >= self.first_i + NOLOAD_ROWS_N) & self.rows.keep
 
 
