@@ -42,7 +42,9 @@ def test_import_is_cheap():
 def test_estimators_need_scikit_learn_but_the_library_does_not(monkeypatch):
     assert {"ContactRegressor", "UniversalRegressor", "SCORERS"} < set(dir(reskin))
     monkeypatch.setattr("reskin.find_spec", lambda name: None)
-    with pytest.raises(ReskinError, match=r"reskin.SCORERS: the Python package `scikit-learn` is not installed.*'\.\[learn\]'"):
+    with pytest.raises(
+        ReskinError, match=r"reskin.SCORERS: the Python package `scikit-learn` is not installed.*'\.\[learn\]'"
+    ):
         _ = reskin.SCORERS
     assert "ContactRegressor" not in dir(reskin)
     assert all(hasattr(reskin, name) for name in reskin.__all__)

@@ -21,6 +21,7 @@ from reskin.errors import ParamsError, SchemaError
 
 TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
+MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
     "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
@@ -84,11 +85,13 @@ def blocks_of(
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
+    moving = [numbers for numbers in recorded if "moving_hand" in numbers]
     skins = {
         f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
+        if numbers not in moving  # their presses are those of another scene
     }
     return {
         "headline": _summary(results[-1]),
@@ -98,6 +101,7 @@ def blocks_of(
         "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
+        "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),
     }
@@ -115,8 +119,10 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     # Tables are made only for the experiments that are shown, because the current code may be unable to read the
     # committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
+    trained = provenance["trained"]  # empty if the scene trains no networks
+    code = f"trained by code {trained}" if trained else f"code {provenance['git']}"
     heading = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; {code}, "
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])

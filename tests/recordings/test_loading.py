@@ -166,5 +166,7 @@ def test_recorded_layout_is_named(shared_data):
 
 def test_missing_pandas_is_an_error_that_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ParamsError, match=r"load_recording: the Python package `pandas` is not installed.*'\.\[learn\]'"):
+    with pytest.raises(
+        ParamsError, match=r"load_recording: the Python package `pandas` is not installed.*'\.\[learn\]'"
+    ):
         reskin.load_recording(tmp_path)
