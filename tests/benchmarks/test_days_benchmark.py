@@ -9,7 +9,7 @@ same or drawn again. No recorded press is used.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -19,17 +19,18 @@ from reskin.seeds import rng_for
 from reskin.universal import map, model
 from reskin.universal.batches import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from reskin.universal.calibration import CalibrationData, LabelledPresses, no_labels
-from reskin.universal.law import to_chips
+from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, SLIDE, condition_on_noload, new_map
 from reskin.universal.model import calibrate_day, load_universal
 from reskin.universal.population import PLACES_N, THICKNESSES, TIPS, draw_law, draw_skin
 from tests.benchmarks import FULL, size
+from tests.benchmarks.test_moving_benchmark import boards
 from tests.universal.skins import SETUP
 
 CHOICE_SEED, SEED = 1, 2
 CHOICE_SKINS_N, SKINS_N, COVERAGE_SKINS_N = 24, size(96, 1), 24
 PRESSES_N, LABELS_N = size((0, 5, 12, 65), (5,)), size((0, 10, 40), (10,))
-CHOICE_PRESSES_N = 1, 3, 12
+CHOICE_PRESSES_N, RECORDED_PRESSES_N = (1, 3, 12), (0, 5, 12)
 # correlations between days, of the slide and of the law's errors
 CORRELATIONS = (0.0, 0.0), (0.0, 0.5), (0.0, 0.7), (0.0, 0.85), (0.0, 1.0), (0.5, 0.7)
 LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
@@ -215,3 +216,37 @@ def test_coverage_and_force_on_a_later_day(tmp_path):
         place, force, square = np.mean(of_skins, axis=0)
         cells = " | ".join(str(cell) for cell in row)
         print(f"| {cells} | {100 * place:.0f} | {100 * force:.0f} | {np.exp(np.sqrt(square)):.2f} |")
+
+
+@FULL_ONLY
+def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
+    """Use recordings of one depth in place of the first day, and of another depth in place of the later day.
+
+    They were not recorded on different days, so this does not test the change from day to day. Labels are at tested
+    places. No setting was chosen on these recordings.
+    """
+    scores: dict[tuple[int, int, str], list[Score]] = {}
+    odds = []
+    for name, board in boards(shared_data, tmp_path).items():
+        order = rng_for(SEED, "recorded", name).permutation(PLACES_N)
+        own = board.presses
+        db_uT = to_board(own.db_uT).reshape(-1, PLACES_N, own.db_uT.shape[1])[:, order]
+        force_N, place_mm = own.force_N.reshape(-1, PLACES_N)[:, order], own.place_mm[:PLACES_N][order]
+        np.testing.assert_array_equal(own.place_mm.reshape(-1, PLACES_N, 2)[:, order], [place_mm] * len(db_uT))
+        new_n = max(RECORDED_PRESSES_N)
+        presses_i = np.concatenate([np.arange(PLACES_N), np.arange(PLACES_N - new_n)])  # the last new_n are not tested
+        for first, later in permutations(range(len(db_uT)), 2):
+            skin = SkinOnTwoDays(
+                to_board(board.rest_uT[None])[0], place_mm[presses_i], force_N[first][presses_i],
+                db_uT[first][presses_i], {CHANGED: db_uT[later][presses_i]},
+            )  # fmt: skip
+            for labels_n in LABELS_N:
+                days = TwoDays(skin, labels_n)
+                odds.append(days.log_odds(CHANGED, new_n))
+                for n, way in product(RECORDED_PRESSES_N, WAYS):
+                    scores.setdefault((labels_n, n, way), []).append(days.score(CHANGED, n, way))
+    print(f"log odds of the same slide from {new_n} presses: {np.round(odds, 1).tolist()}")
+    print(f"| labels | new presses | {' | '.join(WAYS)} |\n|---|---|---|---|---|")
+    for labels_n, n in product(LABELS_N, RECORDED_PRESSES_N):
+        means = [np.mean(scores[labels_n, n, way], axis=0) for way in WAYS]
+        print(f"| {labels_n} | {n} | {' | '.join(f'{within:.1f} / {mse:.2f}' for within, mse in means)} |")
