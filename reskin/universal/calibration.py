@@ -199,15 +199,13 @@ class CalibrationData:
     def same_slide(self, last: "CalibrationData") -> "CalibrationData":
         """Join the presses with those of the last day, on which the skin slid in the same way.
 
-        The presses tell the middle of the skin if these are, or else if those of the last day are evenly spread or all
-        over the area.
+        As on a single day, presses that are all over the area are then used only if no others were made after them.
         """
-        spread = self if len(self.even_uT) or len(self.area_uT) else last
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
+        even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
+        area_uT = self.area_uT if len(self.presses_uT) else last.area_uT
         labels = join_labels(last.labels, self.labels)
-        return replace(
-            self, presses_uT=presses_uT, even_uT=spread.even_uT, area_uT=spread.area_uT, labels=labels, earlier=()
-        )
+        return replace(self, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT, labels=labels, earlier=())
 
 
 def write_calibration(data: CalibrationData, file: Path, board: str) -> None:

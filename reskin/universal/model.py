@@ -264,19 +264,25 @@ class PressCalibration:
     @cached_property
     def centre_mm(self) -> Float[np.ndarray, "2"]:
         """Shift of the networks' places that follows from unlabelled presses."""
+        if self.spread is not self:
+            return self.spread.centre_mm
         if len(self.data.area_uT):
             estimate = CalibratedModel(self.skin, self.layers, ()).estimate(self.data.area_uT, [MAP_POWER])[0]
             pairs = zip(self.skin.tables.names, self.skin.tables.spreads, strict=True)
             sd_mm = math.hypot(*(float(sd) for name, sd in pairs if name in OFFSETS_ALONG_X))
             return shift_onto_area(estimate, sd_mm, self.skin.tables.area)
-        if len(self.even_mm):
-            return -self.even_mm.mean(axis=0)
-        return np.zeros(2) if self.earlier is None else self.earlier.centre_mm
+        return -self.even_mm.mean(axis=0) if len(self.even_mm) else np.zeros(2)
 
     @cached_property
     def moved(self) -> SkinMap:
         """The map, with its places moved onto the area of the grid if the presses are spread over it."""
-        return move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
+        return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
+
+    @property
+    def spread(self) -> "PressCalibration":
+        """This or the last earlier calibration whose presses are known to be spread evenly or over the area."""
+        known = len(self.data.even_uT) or len(self.data.area_uT)
+        return self if known or self.earlier is None else self.earlier.spread
 
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
@@ -333,7 +339,7 @@ class PressCalibration:
     @cached_property
     def _next_day_maps(self) -> tuple[SkinMap, SkinMap]:
         unpressed = CalibrationData.at_rest(self.data.rest_uT)
-        changed = PressCalibration(begin_day(self.moved), self.networks, unpressed, self)
+        changed = PressCalibration(begin_day(self.skin), self.networks, unpressed, self)
         return self.with_labels(self.data.labels).skin, changed.with_labels(unpressed.labels).skin
 
 
@@ -360,7 +366,7 @@ def join_day(
 
 def start_day(noload_map: SkinMap, earlier: PressCalibration | None) -> SkinMap:
     """Return the map before it is conditioned on presses after a change of the slide."""
-    return noload_map if earlier is None else begin_day(earlier.moved)
+    return noload_map if earlier is None else begin_day(earlier.skin)
 
 
 def is_same_slide(log_odds: Float[np.ndarray, " n"]) -> bool:
@@ -471,7 +477,7 @@ class Universal:
     def __repr__(self) -> str:
         noload = "no no-load reading" if self._noload_uT is None else "no-load reading taken"
         noload += ", skin turned by a quarter" if self._data.turned else ""
-        noload += f", {len(self._data.earlier)} earlier days" if self._data.earlier else ""
+        noload += f", earlier days: {len(self._data.earlier)}" if self._data.earlier else ""
         presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
         board = f"board {self.layout.name}, {len(self.layout.chips)} chips"
         return (

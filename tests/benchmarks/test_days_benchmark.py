@@ -122,6 +122,7 @@ class TwoDays:
 
 
 @FULL_ONLY
+@pytest.mark.timeout(3600)
 def test_choice_of_correlations_and_of_the_limit(monkeypatch):
     """Choose the settings in two steps; skins with the same and with other errors of the law count equally."""
     skins = list(draw_skins(CHOICE_SKINS_N, CHOICE_SEED))
@@ -153,6 +154,7 @@ def test_choice_of_correlations_and_of_the_limit(monkeypatch):
     assert of_limits[model.SAME_SLIDE_LOG_ODDS_MIN] > max(of_limits.values()) - 1
 
 
+@pytest.mark.timeout(3600)
 def test_accuracy_on_a_later_day():
     scores: dict[tuple[str, int, int], list[tuple[Score, ...]]] = {}
     cosines: dict[str, list[np.ndarray]] = {}
@@ -186,6 +188,7 @@ def test_accuracy_on_a_later_day():
 
 
 @FULL_ONLY
+@pytest.mark.timeout(3600)
 def test_coverage_and_force_on_a_later_day(tmp_path):
     n, file = 12, tmp_path / "first.safetensors"
     scores: dict[tuple[str, int, str], list[tuple[float, float, float]]] = {}
@@ -219,6 +222,7 @@ def test_coverage_and_force_on_a_later_day(tmp_path):
 
 
 @FULL_ONLY
+@pytest.mark.timeout(3600)
 def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
     """Use recordings of one depth in place of the first day, and of another depth in place of the later day.
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from reskin import io
-from reskin.errors import SchemaError
+from reskin.errors import ParamsError, SchemaError
+from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal import calibration, map
 from reskin.universal.law import to_chips
@@ -148,7 +149,7 @@ def test_presses_tell_whether_the_slide_has_changed(skin, first_day):
     assert off_mm[0] < off_mm[1]
     # more presses can change the decision
     assert not later.see(np.concatenate([changed_uT, changed_uT])).slide.same
-    assert "1 earlier days, 15 presses at unknown places, 0 labelled" in repr(later)
+    assert "earlier days: 1, 15 presses at unknown places, 0 labelled" in repr(later)
 
 
 def test_order_of_presses_and_labels_of_a_new_day_does_not_matter(skin, first_day):
@@ -183,9 +184,9 @@ def test_saved_days_are_loaded_again(skin, first_day, tmp_path):
     ):
         np.testing.assert_allclose(found, value, rtol=1e-5)
     third = load_universal(later_file, new_day=True)
-    assert "2 earlier days" in repr(third)
+    assert "earlier days: 2" in repr(third)
     third.save(later_file)  # a day without presses is not kept
-    assert "2 earlier days" in repr(load_universal(later_file, new_day=True))
+    assert "earlier days: 2" in repr(load_universal(later_file, new_day=True))
     assert third.zero(rest_uT).presses_n == 0
     assert third.slide is None
 
@@ -212,7 +213,7 @@ def test_days_are_limited_and_checked(first_day, monkeypatch):
     tensors, header = io.read_tensors(file)
     days = {f"earlier_{i}_{name}": values for i in range(4) for name, values in tensors.items()}
     io.write_tensors(file, tensors | days, header)
-    assert "4 earlier days" in repr(load_universal(file, new_day=True))  # the first of five days is omitted
+    assert "earlier days: 4" in repr(load_universal(file, new_day=True))  # the first of five days is omitted
     more = {f"earlier_4_{name}": values for name, values in tensors.items()}
     io.write_tensors(file, tensors | days | more, header)
     with pytest.raises(SchemaError, match="days must be at most 5 days with 2000 labels; got 6 with 36"):
@@ -226,3 +227,24 @@ def test_days_are_limited_and_checked(first_day, monkeypatch):
     with pytest.raises(SchemaError, match="labels: 11 are too many"):
         later.label(PLACES_MM, np.ones(5), np.tile(rest_uT + 100, (5, 1)))
     assert later.presses_n == 22
+
+
+def test_middle_of_the_skin_is_carried_over(skin, tmp_path):
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
+    inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
+    found_mm = []
+    for even in (False, True):  # presses on one side, whose mean place would be the middle
+        skin.zero(rest_uT).see(np.tile(pokes(skin)[[2, 3, 6, 7]] + rest_uT, (3, 1)), even=even).save(file)
+        later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(changed_uT)
+        assert not later.slide.same
+        found_mm.append([each.predict(inner_uT)[:, :2].mean(axis=0) for each in (skin, later)])
+    first_mm, later_mm = np.subtract(*found_mm)
+    assert np.linalg.norm(first_mm) > 0.1
+    np.testing.assert_allclose(later_mm, first_mm, atol=0.5 * np.linalg.norm(first_mm))
+
+
+def test_commands_begin_a_day(first_day):
+    _, file = first_day
+    assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
+    with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):
+        read_models([], new_day=True)
