@@ -6,7 +6,7 @@ parameters of the slide are those of the first day, or drawn again from the prio
 same or drawn again. No recorded press is used.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
@@ -59,7 +59,8 @@ def draw_skins(skins_n: int, seed: int) -> Iterator[SkinOnTwoDays]:
         yield draw_two_days(partial(rng_for, seed, "days", i))
 
 
-def draw_two_days(rng) -> SkinOnTwoDays:
+def draw_two_days(rng: Callable[[str], np.random.Generator]) -> SkinOnTwoDays:
+    """Simulate one skin; `rng` returns the random generator of a name."""
     law, other = (draw_law(NOMINAL, NOMINAL_SPREADS, rng(name)) for name in ("law", "slide"))
     changed = replace(law, **{name: getattr(other, name) for name in SLIDE})
     thickness, tip = (float(rng("size").choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES, TIPS))
