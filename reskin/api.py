@@ -397,7 +397,11 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(
-    calibration: Path | str | None = None, *, file: Path | str | None = None, external_uT: float = 0.0
+    calibration: Path | str | None = None,
+    *,
+    file: Path | str | None = None,
+    external_uT: float = 0.0,
+    new_day: bool = False,
 ) -> Universal:
     """Load the universal model for the paper's board, or one for another board. It needs no data from your skin.
 
@@ -415,6 +419,9 @@ def load_universal(
     external_uT : float
         For a board that a robot moves: standard deviation in uT of each component of the external field's change since
         the no-load reading, about 30 for the earth's field. Default: 0, no external field.
+    new_day : bool
+        Whether the skin may slide under presses in another way than when the calibration was saved, as after a day or
+        two. A few further presses then tell whether it does (`slide`). Default: False, it slides in the same way.
 
     Returns
     -------
@@ -423,8 +430,8 @@ def load_universal(
     Raises
     ------
     ReskinError
-        If a file is missing or is not a calibration or a model, the calibration is for another board, or `external_uT`
-        is out of range.
+        If a file is missing or is not a calibration or a model, the calibration is for another board, `external_uT` is
+        out of range, or `new_day` is set without a calibration.
 
     Examples
     --------
@@ -436,7 +443,7 @@ def load_universal(
     from reskin.universal.model import FILE
     from reskin.universal.model import load_universal as load
 
-    return load(calibration, file=FILE if file is None else file, external_uT=external_uT)
+    return load(calibration, file=FILE if file is None else file, external_uT=external_uT, new_day=new_day)
 
 
 def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 400.0) -> pd.DataFrame:

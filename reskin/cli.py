@@ -61,6 +61,7 @@ MODEL = (
     "two. Default: the universal model for the paper's board."
 )
 EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
+NEW_DAY = "The calibration is of an earlier day, so the skin may slide in another way (docs/live.md)."
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -221,6 +222,7 @@ def live(
     http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
+    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
 ) -> None:
     """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
@@ -237,7 +239,7 @@ def live(
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
-    models = read_models(model or (), external_uT)
+    models = read_models(model or (), external_uT, new_day=new_day)
     with ExitStack() as stack:
         description = "a board"
         if source := replay or emulate:
@@ -272,12 +274,13 @@ def predict(
         float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
     ] = 400.0,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
+    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
 ) -> None:
     """Estimate contacts, places and forces from a log that begins with at least 0.5 s without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
-    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT)
+    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT, new_day=new_day)
     numbers = {key: count for key, count in counts.items() if not isinstance(count, list)}
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in numbers.items()))
     for sentence in warnings(counts):

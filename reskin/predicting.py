@@ -24,7 +24,13 @@ FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the mod
 
 
 def predict(
-    log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0, external_uT: float = 0.0
+    log: Path,
+    model: Path | Sequence[Path] | None,
+    out: Path,
+    *,
+    rate_hz: float = 400.0,
+    external_uT: float = 0.0,
+    new_day: bool = False,
 ) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
@@ -35,6 +41,7 @@ def predict(
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
     external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
+    new_day : whether the calibration is of an earlier day (see `load_universal`)
 
     Returns
     -------
@@ -43,7 +50,7 @@ def predict(
     the skin is turned by a quarter, and the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
-    models = read_models(files, external_uT)
+    models = read_models(files, external_uT, new_day=new_day)
     if len(files) > 1 and not isinstance(models, Universal):
         raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
@@ -111,14 +118,19 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Network] | Universal:
+def read_models(
+    files: Sequence[Path], external_uT: float = 0.0, *, new_day: bool = False
+) -> Sequence[Network] | Universal:
     """Read trained networks, or one universal model, one calibration of it, or both.
 
     Without a universal model, a calibration is for the shipped one; without any file, the model is the shipped one.
-    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0.
+    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0. `new_day` is
+    an option for a calibration.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
+    if new_day and not calibrations:
+        raise ParamsError("--new-day: there is no calibration of an earlier day. Pass one with --model.")
     if not (made or calibrations):
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
@@ -130,7 +142,7 @@ def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Net
         remedy = "Use it alone, or a universal model with one calibration."
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
     calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
-    return load_universal(calibration, file=model, external_uT=external_uT)
+    return load_universal(calibration, file=model, external_uT=external_uT, new_day=new_day)
 
 
 def _is_calibration(file: Path) -> bool:
