@@ -221,6 +221,9 @@ def live(
     http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
+    skins: Annotated[Path, Option(help="Folder in which the page saves what it has learnt about skins.")] = Path(
+        "skins"
+    ),
 ) -> None:
     """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
@@ -230,20 +233,27 @@ def live(
     from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
     from reskin.live.session import open_sessions
+    from reskin.live.skins import SkinFolder
     from reskin.predicting import read_models
     from reskin.recordings.fault_policy import override
+    from reskin.recordings.recorder import CAPTURES
 
     fault_policy = override(LIVE_POLICY, on_fault or (), "--on-fault")
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
-    models = read_models(model or (), external_uT)
+    models, skin_folder = read_models(model or (), external_uT), SkinFolder(skins)
     with ExitStack() as stack:
-        description = "a board"
+        description, emulated = "a board", None
         if source := replay or emulate:
             script = read_script(source)
-            port, description = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        sessions = open_sessions(port or [found.port for found in find_boards()], models, description, fault_policy)
+            emulated = stack.enter_context(playing(script))
+            port, description = [emulated.port], f"{script.source}: {source}, played"
+        sessions = open_sessions(
+            port or [found.port for found in find_boards()], models, description, fault_policy, skins=skin_folder,
+            model_name=", ".join(file.name for file in model or ()), emulated=emulated,
+        )  # fmt: skip
+        typer.echo(f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}")
         serve(sessions, host=host, http_port=http_port, say=typer.echo)
 
 

@@ -118,12 +118,11 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a JSON message from a page: the name of a pressed button, or the number of the data that it has shown."""
+    """Handle a JSON message from a page (see `Session.request`); ignore anything else."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):
-            session.press(message.get("press"))
-            session.confirm(message.get("seen"))
+            session.request(message)
 
 
 def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None]) -> None:

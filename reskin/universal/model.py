@@ -464,6 +464,11 @@ class Universal:
         return len(self._data.presses_uT) + len(self._data.labels)
 
     @property
+    def labels_n(self) -> int:
+        """Number of labelled presses that the model is calibrated to."""
+        return len(self._data.labels)
+
+    @property
     def misfit(self) -> float:
         """Median chi^2 per channel of unlabelled presses: about 1 for skins like those in training.
 
