@@ -22,7 +22,7 @@ from reskin.errors import ParamsError
 from reskin.live.session import Session
 
 PAGE = Path(__file__).parent / "page"
-FILES = {"/": "index.html", "/live.js": "live.js", "/trace.js": "trace.js", "/live.css": "live.css"}
+FILES = {"/": "index.html"} | {f"/{name}": name for name in ("live.js", "skin.js", "trace.js", "live.css")}
 LOCAL = ("127.0.0.1", "localhost", "::1")
 LOCAL_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"

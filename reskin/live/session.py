@@ -364,7 +364,7 @@ class Session:
             "adapted": self._adapted,
             "waiting": detected.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
-            "recording": f"{recording.folder} {skin.reader.writer_problem}" if recording else "",
+            "recording": f"{recording.folder} {skin.reader.writer_problem}".strip() if recording else "",
             "recorded": self._recorded,
             "labelling": "" if press is None else f"press {_place(press.label)}. {press.problem}".strip(),
             "label_mm": None if press is None else [press.label.x_mm, press.label.y_mm],
