@@ -235,7 +235,7 @@ class UniversalEstimator:
             f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
         )
 
-    def add_label(self, place_mm: Sequence[float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
+    def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
         """Calibrate also to one press at a place in mm; its force in N is NaN if it is unknown.
 
         Returns
