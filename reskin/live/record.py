@@ -259,4 +259,4 @@ class PageRecording:
         if self._labels is not None:
             self._labels.close()
         end_capture(self.folder, self._header)
-        return f"recorded {self.folder}" + (f" with {self.touches_n} labelled presses" if self._labels else "")
+        return f"recorded {self.folder}" + (f", labelled presses: {self.touches_n}" if self._labels else "")

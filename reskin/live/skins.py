@@ -71,4 +71,4 @@ class SkinFolder:
                 remedy = DISK_REMEDIES.get(error.errno or 0, "Try another folder with --skins.")
                 raise SchemaError(f"not saved: cannot write {file}: {error.strerror}. {remedy}") from None
             self._listed_s = float("-inf")
-        return f"saved {file}: {model.presses_n} presses, {model.labels_n} of them labelled"
+        return f"saved {file} (presses: {model.presses_n}, of which labelled: {model.labels_n})"

@@ -269,7 +269,7 @@ class UniversalEstimator:
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
         origin = copy(self.learnt.origin).remember(file)
         self._learn(LearningState.start(origin, file.stem, f"the loading of {file.stem}"))
-        return f"loaded {file}: {origin.presses_n} presses, {origin.labels_n} of them labelled"
+        return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
 
     def undo(self) -> str:
         """Take back the last step of learning; return a text for the user."""

@@ -81,7 +81,7 @@ def _learnt(state: LearningState) -> str:
         "at crosses": len(state.guided.db_uT),
         "labelled by you": len(state.typed.db_uT),
     }
-    return ", ".join(f"{count} presses {what}" for what, count in counts.items() if count)
+    return ", ".join(f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count)
 
 
 def _expected_of_universal(model: Universal) -> str:

@@ -114,7 +114,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
 
         for name in ("", "../s1", "a b", "x" * 65, ".s1", 3, None, ["s1"], "s1.safetensors"):
             assert "is not a name. Use 1 to 64 letters" in said(session, {"save": name})
-        assert said(session, {"save": "s1"}) == f"saved {folder / 's1.safetensors'}: 12 presses, 0 of them labelled"
+        assert said(session, {"save": "s1"}) == f"saved {folder / 's1.safetensors'} (presses: 12, of which labelled: 0)"
         content = (folder / "s1.safetensors").read_bytes()
         assert "s1.safetensors exists already. Choose another name." in said(session, {"save": "s1"})
         assert (folder / "s1.safetensors").read_bytes() == content
@@ -199,7 +199,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
         assert session.state()["labelled"] == "press at x 12 mm, y 4 mm: recorded as labelled press 1"
         until(lambda: reader.at_end, session)
         receive(session, '{"press": "record"}')
-        assert session.state()["recorded"].endswith("with 1 labelled presses")
+        assert session.state()["recorded"].endswith(", labelled presses: 1")
     finally:
         session.stop()
     (folder,) = (tmp_path / "captures").iterdir()

@@ -77,7 +77,8 @@ class Board {
     }
     const now_ms = performance.now();
     this.trail = this.trail.filter(({at_ms}) => now_ms - at_ms < TRAIL_MS);
-    if (contact && !Number.isNaN(x)) this.trail.push({x, y, force, at_ms: now_ms});
+    const lifted = this.rows.slice(this.rows.length - bins).some(({high}) => high[0] === 0); // the skin was not touched for a moment
+    if (contact && !Number.isNaN(x)) this.trail.push({x, y, force, at_ms: now_ms, begins: lifted});
     this.dirty = true;
   }
 
@@ -106,7 +107,7 @@ class Board {
     this.say("adapting", state.adapting || state.adapted || "–");
     this.parts.record.classList.toggle("on", Boolean(state.recording));
     this.parts.record.firstChild.textContent = state.recording ? "Stop " : "Record ";
-    this.say("recording", state.recording ? `${state.recording}, ${state.recording_n} labelled presses` : state.recorded || "–");
+    this.say("recording", state.recording ? `${state.recording}; labelled presses: ${state.recording_n}` : state.recorded || "–");
     if (state.waiting) { this.last = null; this.rows = []; this.trail = []; }
     this.dirty = true;
   }
@@ -121,7 +122,7 @@ class Board {
     if (kind !== this.kind) { this.kind = kind; this.backdrop = backdrop(frame, state, wide, ratio); drawLegend(this.keys, scale); }
     pen.setTransform(1, 0, 0, 1, 0, 0); pen.drawImage(this.backdrop, 0, 0); pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     if (state.waiting) { const [px, py] = at(frame.x0 + frame.wide / 2, frame.y0 + frame.high / 2); pen.fillStyle = colour("--soft"); pen.textAlign = "center"; pen.fillText("waiting for data", px, py); return; }
-    const trail = this.trail.map(({x, y, force, at_ms}) => { const [px, py] = at(x, y); return {px, py, force, age_ms: now_ms - at_ms}; });
+    const trail = this.trail.map(({x, y, at_ms, ...rest}) => { const [px, py] = at(x, y); return {px, py, age_ms: now_ms - at_ms, ...rest}; });
     drawTrail(pen, trail.filter(({age_ms}) => age_ms < TRAIL_MS));
     pen.lineWidth = 2;
     if (fresh && last.chips === state.chips_mm.length) state.chips_mm.forEach(([x, y], i) => drawArrow(pen, ...at(x, y), last.change.subarray(3 * i, 3 * i + 3), scale));

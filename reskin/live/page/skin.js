@@ -22,7 +22,7 @@ function frameOf(canvas, state) { // converts between mm and pixels of the canva
 
 function backdrop(frame, state, wide, ratio) { // the parts that do not change from reading to reading, as a picture
   const canvas = document.createElement("canvas"), pen = canvas.getContext("2d"), {x0, y0, scale, at} = frame;
-  canvas.width = Math.floor(wide * ratio); canvas.height = Math.floor(frame.height * ratio);
+  canvas.width = Math.max(Math.floor(wide * ratio), 1); canvas.height = Math.floor(frame.height * ratio); // a page without layout has width 0
   pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.font = FONT; pen.lineWidth = 1.5;
   const [left, top] = at(x0, y0 + frame.high), [right, bottom] = at(x0 + frame.wide, y0);
   pen.fillStyle = colour("--skin"); pen.strokeStyle = colour("--line");
@@ -62,11 +62,11 @@ function drawContact(pen, px, py, force_N) {
   pen.beginPath(); pen.arc(px, py, contactRadius(force_N), 0, 7); pen.fill(); pen.stroke();
 }
 
-function drawTrail(pen, points) { // points: {px, py, force, age_ms}, oldest first
+function drawTrail(pen, points) { // points: {px, py, force, age_ms, begins: whether a touch begins here}, oldest first
   pen.lineWidth = 4; pen.lineCap = "round";
   for (let i = 1; i < points.length; i++) {
     const a = points[i - 1], b = points[i];
-    if (a.age_ms - b.age_ms > TRAIL_GAP_MS) continue;
+    if (b.begins || a.age_ms - b.age_ms > TRAIL_GAP_MS) continue;
     pen.globalAlpha = Math.max(1 - b.age_ms / TRAIL_MS, 0); pen.strokeStyle = strengthColour(b.force);
     pen.beginPath(); pen.moveTo(a.px, a.py); pen.lineTo(b.px, b.py); pen.stroke();
   }
