@@ -463,7 +463,7 @@ class EmulatedBoard:
     """A board that is emulated by this process: its port, and its true contact at any time."""
 
     def __init__(self, script: Script, port: EmulatedPort) -> None:
-        self.port = port.name
+        self.port, self.source = port.name, script.source
         self._true_contacts = script.true_contacts
         self._sent_i = 0
 

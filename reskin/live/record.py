@@ -20,6 +20,7 @@ from reskin.board.find import BAUD, DetectedBoard
 from reskin.board.port import check_name
 from reskin.board.reader import Reader
 from reskin.errors import CaptureError, ParamsError
+from reskin.live.emulator import Source
 from reskin.live.health import Health
 from reskin.live.tracker import Estimates
 from reskin.recordings.header import HEADER_FILE, Clock, render
@@ -207,10 +208,13 @@ class LabelledPress:
 class PageRecording:
     """A recording of a board that `reskin live` reads, with labels from the page.
 
-    Raises `ReskinError` or `OSError` if the folder cannot be created.
+    `source` tells whether the board is emulated from a simulation. Raises `ReskinError` or `OSError` if the folder
+    cannot be created.
     """
 
-    def __init__(self, board: DetectedBoard, reader: Reader, *, port_in_name: bool) -> None:
+    def __init__(
+        self, board: DetectedBoard, reader: Reader, *, port_in_name: bool, source: Source = "recorded"
+    ) -> None:
         self.folder = new_folder()
         if port_in_name:  # two boards may start recording in the same second
             port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
@@ -218,6 +222,8 @@ class PageRecording:
         self._part, self._header = begin_capture(
             self.folder, NO_INFO, wire=board.wire, chips_n=board.chips_n, by="reskin live"
         )
+        if source != self._header.source:
+            self._change_header(source=source)
         self._reader = reader
         self._labels: ProbeLogWriter | None = None
         self._begun_s = reader.unix_s()
@@ -249,9 +255,12 @@ class PageRecording:
             # Labels and arrivals are on the same clock, so one mark with equal times aligns them.
             clock = Clock(kind="arrivals", rate_hz=None, marks=((self._begun_s, self._begun_s),))
             options = self._header.options | {"labels": "page"}
-            self._header = self._header.model_copy(update={"clock": clock, "options": options})
-            io.write_text(self._part / HEADER_FILE, render(self._header))
+            self._change_header(clock=clock, options=options)
         self._labels.write_all([Dwell(Label(False), *press.rest_s), Dwell(press.label, *press.held_s)])
+
+    def _change_header(self, **changes: object) -> None:
+        self._header = self._header.model_copy(update=changes)
+        io.write_text(self._part / HEADER_FILE, render(self._header))
 
     def end(self) -> str:
         """Finish the capture; return a text for the user. Raises `OSError` if the header cannot be written."""

@@ -464,7 +464,10 @@ class Session:
     def _begin_recording(self) -> None:
         """Start writing the byte stream to a new capture."""
         try:
-            self._recording = PageRecording(self.skin.detected, self.skin.reader, port_in_name=not self._alone)
+            source = "recorded" if self._emulated is None else self._emulated.source
+            self._recording = PageRecording(
+                self.skin.detected, self.skin.reader, port_in_name=not self._alone, source=source
+            )
             self._recorded = ""
         except (OSError, ReskinError) as error:
             self._recorded = str(error)

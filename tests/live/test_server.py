@@ -129,7 +129,8 @@ def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monke
         serve(name, models, act)
 
 
-def test_page_of_an_emulated_board_receives_the_true_contact():
+def test_page_of_an_emulated_board_receives_the_true_contact(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     script = make_script(pokes_n=1, rate_hz=100.0)
     poked = (script.t_s >= QUIET_S) & (script.t_s < QUIET_S + POKE_S)
     true = np.where(poked[:, None], PLACES[0], np.nan)
@@ -142,8 +143,12 @@ def test_page_of_an_emulated_board_receives_the_true_contact():
             poke = await until(socket, lambda message: message.get("contact") == 1)
             assert math.isnan(before["true_x_mm"])
             np.testing.assert_allclose([poke[f"true_{name}"] for name in ("x_mm", "y_mm", "F_N")], PLACES[0])
+            await socket.send_json({"press": "record"})
+            recording = await until(socket, lambda message: bool(message.get("recording")))
+            header = parse(Path(f"{recording['recording']}.part", HEADER_FILE).read_text(), "header")
+            assert header.source == "simulated"  # so that it is not added to a recorded scene
 
-    with playing(replace(script, true_contacts=true)) as board:
+    with playing(replace(script, source="simulated", true_contacts=true)) as board:
         serve(board.port, [], act, emulated=board)
 
 
