@@ -187,19 +187,23 @@ def emulate(
     speed: Annotated[float, Option(help="Speed relative to the source; inf: as fast as possible.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
+    true_places: Annotated[
+        bool, Option("--true-places", help="Print the true place and force of each touch of a simulation.")
+    ] = False,
 ) -> None:
     """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""
-    from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
+    from reskin.live.emulator import TouchPrinter, inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
     script = read_script(source)
     for spec in faults:
         script = inject(script, spec)
+    on_sent = TouchPrinter(script, source, typer.echo) if true_places else lambda piece_i: None
     emulated, stop = make_port(port), threading.Event()
     typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C: stop")
     started_s = time.monotonic()
     try:
-        sent_n = play(script, emulated, stop, speed=speed, loop=loop)
+        sent_n = play(script, emulated, stop, speed=speed, loop=loop, on_sent=on_sent)
         typer.echo(f"sent {sent_n} bytes in {time.monotonic() - started_s:.1f} s")
     except KeyboardInterrupt:
         typer.echo("stopped")

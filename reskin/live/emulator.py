@@ -482,6 +482,33 @@ class EmulatedBoard:
         return x_mm, y_mm, force_N
 
 
+class TouchPrinter:
+    """Prints the true place and the largest true force of each touch when its first frame has been sent.
+
+    Raises `ParamsError` if the true contacts of the script are unknown.
+    """
+
+    def __init__(self, script: Script, source: str, say: Callable[[str], object]) -> None:
+        if script.true_contacts is None:
+            remedy = "Use nominal, or a simulated scene with protocol log."
+            raise ParamsError(f"--true-places: the true places of {source} are unknown. {remedy}")
+        contact = np.isfinite(script.true_contacts[:, 0])
+        edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))  # starts and ends in turn
+        self._texts = {}
+        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            x_mm, y_mm, force_N = script.true_contacts[first:end].max(axis=0)
+            self._texts[first] = f"true place: x {x_mm:.1f} mm, y {y_mm:.1f} mm, up to {force_N:.2f} N"
+        self._say, self._sent_i = say, -1
+
+    def __call__(self, piece_i: int) -> None:
+        if piece_i < self._sent_i:  # the script has restarted
+            self._sent_i = -1
+        for i in range(self._sent_i + 1, piece_i + 1):
+            if i in self._texts:
+                self._say(self._texts[i])
+        self._sent_i = piece_i
+
+
 @contextmanager
 def playing(script: Script) -> Iterator[EmulatedBoard]:
     """Send a script in a loop from another thread; yield the emulated board."""

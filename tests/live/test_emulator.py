@@ -16,6 +16,7 @@ from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.live.emulator import (
     LATE_MAX_S,
     EmulatedBoard,
+    TouchPrinter,
     inject,
     make_port,
     parse_fault,
@@ -269,6 +270,24 @@ def test_true_contact_is_that_of_the_frame_sent_last(times):
     play(script, reader, times, on_sent=note_sent)
     assert [contact for _, contact in found] == [tuple(true[sent_n - 1]) for sent_n, _ in found]
     assert found[-1][0] == len(script)
+
+
+def test_true_places_are_printed_when_a_touch_begins(times):
+    true, printed = np.full((len(SCRIPT), 3), np.nan), []
+    true[100:150], true[300:400] = (4.0, 12.0, 0.5), (12.0, 4.0, 1.5)
+    true[320, 2] = 1.75
+    script, reader = replace(SCRIPT, true_contacts=true), FakeReader(times)
+    printer = TouchPrinter(script, "nominal", lambda text: printed.append((len(reader.arrival_s), text)))
+    for _ in range(2):
+        play(script, reader, times, on_sent=printer)
+    sent_n, texts = zip(*printed, strict=True)
+    assert texts == 2 * (
+        "true place: x 4.0 mm, y 12.0 mm, up to 0.50 N", "true place: x 12.0 mm, y 4.0 mm, up to 1.75 N",
+    )  # fmt: skip
+    first_n = np.array([101, 301, len(script) + 101, len(script) + 301])
+    assert np.all((np.array(sent_n) >= first_n) & (np.array(sent_n) < first_n + 256))
+    with pytest.raises(ParamsError, match="--true-places: the true places of captures/run1 are unknown"):
+        TouchPrinter(SCRIPT, "captures/run1", print)
 
 
 def test_invalid_sources_raise(tmp_path):
