@@ -257,8 +257,8 @@ def live(
             port or [found.port for found in find_boards()], models, description, fault_policy, skins=skin_folder,
             model_name=", ".join(file.name for file in model or ()), emulated=emulated,
         )  # fmt: skip
-        typer.echo(f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}")
-        serve(sessions, host=host, http_port=http_port, say=typer.echo)
+        where = f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}"
+        serve(sessions, host=host, http_port=http_port, say=typer.echo, where=where)
 
 
 @app.command(rich_help_panel=RECORDINGS)

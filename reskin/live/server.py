@@ -125,14 +125,21 @@ def receive(session: Session, text: str) -> None:
             session.request(message)
 
 
-def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None]) -> None:
-    """Serve the page of one or more boards until Ctrl-C."""
+def serve(
+    sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None], where: str = ""
+) -> None:
+    """Serve the page of one or more boards until Ctrl-C.
+
+    When the server listens, `say` is called with the address of the page, and with `where`, which names the folders of
+    saved files.
+    """
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:
         session.start()
     try:
         address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
         announcement = f"{', '.join(map(str, sessions))}: open {address}; press Ctrl-C to stop"
+        announcement += f"\n{where}" if where else ""
         app = Server(sessions, token).application()
         # aiohttp calls `print` once, when the server listens.
         web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)
