@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64
 from reskin.errors import ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
-from reskin.live.record import LabelledPress, PageRecording
+from reskin.live.page_recording import LabelledPress, PageRecording
 from reskin.live.skins import SkinFolder
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
 from reskin.live.used_model import describe
@@ -372,7 +372,7 @@ class Session:
             "skins": self._skins.names(), "skins_folder": str(self._skins.folder),
             "true_places": self._emulated is not None and self._emulated.has_true_contacts,
             "zeroings_n": skin.zeroings_n,
-            "zero_bins": [] if traces is None else traces.bins_of(skin.zeroings_s),
+            "zero_bins": [] if traces is None else traces.bins_of(tuple(skin.zeroings_s)),
             **describe(skin.estimator, self._models, self._model_name),
         }  # fmt: skip
         if recording:

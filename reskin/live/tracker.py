@@ -120,7 +120,7 @@ class LearningState(NamedTuple):
     presses_uT: Float64[np.ndarray, "n ch"]
     guided: Labels
     typed: Labels
-    step: str  # the last step, as a noun: "the last 12 presses"
+    step: str  # the last step of learning, such as "the 12 presses"
 
     @property
     def labels(self) -> Labels:
@@ -298,10 +298,10 @@ class UniversalEstimator:
             model.see(state.presses_uT + self._noload_uT)
         place_mm, force_N, db_uT = state.labels
         known = np.isfinite(force_N)
-        if not known.all():
-            model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
         if known.any():
             model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
+        if not known.all():  # after the known forces, with which the model estimates the others
+            model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
         self._model, self.warnings = model, model.warnings
 

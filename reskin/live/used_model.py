@@ -90,6 +90,8 @@ def _expected_of_universal(model: Universal) -> str:
         return f"{NOT_MEASURED} for this model"
     own_n = model.presses_n - model.labels_n, model.labels_n
     fitting = [each for each in measured.places if each.presses_n <= own_n[0] and each.labels_n <= own_n[1]]
+    if not fitting:
+        return f"{NOT_MEASURED} for so few presses"
     best = fitting[-1]
     calibration = f"{best.presses_n} presses and {best.labels_n} labels" if best.presses_n else "no calibration"
     accuracy, error = _join(best.accuracy_pct, ".0f"), _join(best.median_mm, ".1f")

@@ -11,7 +11,7 @@ import pytest
 
 from reskin.board import find
 from reskin.errors import CaptureError, ParamsError, SchemaError
-from reskin.live.record import LabelledPress, PageRecording
+from reskin.live.page_recording import LabelledPress, PageRecording
 from reskin.live.server import receive
 from reskin.live.session import PRESSES_N, Session
 from reskin.live.skins import SkinFolder
@@ -156,8 +156,8 @@ def test_labelled_presses_are_learnt(random_pokes):  # noqa: F811
         assert text.startswith("calibrated to a labelled press; before it, the place was wrong by ")
         assert ("force" in text) != unknown
     labelled = [0, 2]
-    model = load_universal().zero(noload_uT).label(place_mm[[1]], None, b_uT[[1]])
-    expected = model.label(place_mm[labelled], force_N[labelled], b_uT[labelled], keep=True).predict(b_uT)
+    model = load_universal().zero(noload_uT).label(place_mm[labelled], force_N[labelled], b_uT[labelled])
+    expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
     found = estimator(db_uT.astype(np.float32)).target
     np.testing.assert_allclose(found, expected, atol=0.02)  # mm and N; single precision
     for wrong_mm, wrong_N, message in (((99.0, 8.0), 1.0, "on the skin"), ((8.0, 8.0), 900.0, "the model's range")):

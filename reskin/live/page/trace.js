@@ -2,7 +2,7 @@
 // or the size changes, the picture is first stretched, and then redrawn in several frames, starting with the newest values.
 "use strict";
 // WINDOW_S and BIN_S must equal the constants of the same names in reskin/live/session.py.
-const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, AXIS_PX = 20, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
+const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, AXIS_PX = 20, UNLABELLED_PX = 6, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
 const NARROW_PX = 400; // below this width, the time axis has fewer labels
 const REDRAW_MS = 3, LINE_PX = 1.5; // REDRAW_MS: time per frame for redrawing old values
 const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // upper ends of the scale, times a power of ten; few values, so that the scale seldom changes
@@ -10,7 +10,7 @@ const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // upper ends of the scale, times a
 class Trace {
   constructor(canvas, first, least, below) { // below: whether the time axis is labelled below this trace
     this.canvas = canvas; this.first = first; this.least = least; this.below = below;
-    this.high_px = ABOVE_PX + HIGH_PX + (below ? AXIS_PX : 1);
+    this.high_px = ABOVE_PX + HIGH_PX + (below ? AXIS_PX : UNLABELLED_PX);
     this.layer = {width: 0}; this.top = least;
     this.columns = 64; // number of pixel columns to redraw per frame, adjusted so that redrawing takes REDRAW_MS
   }
