@@ -1,8 +1,8 @@
 """The web server of `reskin live`: an HTML page, and one websocket per page and board.
 
 By default, only this machine can connect. If the server listens on another address, requests need a token. A client can
-request only fixed files, boards and actions. Of the files that are read or written, it can choose only the names of saved
-skins, all of which are in one folder.
+request only fixed files, boards and actions. Of the files that are read or written, it can choose only the names of
+saved skins, all of which are in one folder.
 """
 
 import asyncio

@@ -1,5 +1,6 @@
 """Tests that boards are recognised by the bytes that they send, and that other devices are not."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,6 +99,11 @@ def test_busy_port_is_one_sentence():
             find.open_port(name, find.BAUD)
         assert "\n" not in str(error.value)
         assert str(find.detect_board(name, 0.1)).startswith(busy)
+
+
+def test_other_device_is_not_a_serial_port():
+    with pytest.raises(CaptureError, match=f"{os.devnull}: cannot open the port: it is not a serial port"):
+        find.open_port(os.devnull, find.BAUD)
 
 
 def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
