@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin.errors import ParamsError, ReskinError, SchemaError
+from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
 from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
 from reskin.live.page_recording import LabelledPress, PageRecording
@@ -239,6 +239,7 @@ class Session:
         self._error = ""
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
+        self._guided_press: LabelledPress | None = None  # the current one of the presses at crosses, for the recording
         self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
@@ -300,7 +301,7 @@ class Session:
         """
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
-            presses.add(estimates)
+            self._collect(presses, estimates)
             if presses.complete:
                 try:
                     if isinstance(presses, GuidedPresses):
@@ -312,6 +313,29 @@ class Session:
                 with self._button_lock:  # a button may have replaced the presses during the calibration
                     if self._presses is presses:
                         self._presses = None
+
+    def _collect(self, presses: Presses, estimates: Estimates) -> None:
+        """Add readings to the presses; write the labels of guided presses to the recording, if there is one."""
+        before_n, next_mm = len(presses), presses.next_mm
+        if next_mm is not None and self._guided_press is None:
+            self._guided_press = LabelledPress(Label(True, x_mm=next_mm[0], y_mm=next_mm[1]), learn=False)
+        if next_mm is not None and self._guided_press is not None:
+            self._guided_press.add(estimates)
+        presses.add(estimates)
+        if len(presses) == before_n:
+            return
+        done, self._guided_press = self._guided_press, None  # the next press is at another place
+        with self._button_lock:
+            if done is not None and self._recording is not None:
+                try:
+                    if not done.complete:
+                        raise CaptureError(done.problem or "two presses followed each other too quickly")
+                    self._recording.add(done)
+                    self._labelled = ""
+                except (ReskinError, OSError) as error:
+                    self._labelled = (
+                        f"press {before_n + 1} of {presses.presses_n} has no label in the recording: {error}"
+                    )
 
     def _label(self, estimates: Estimates) -> None:
         """Wait for the press that the user has labelled; then record its label and calibrate the model to it."""
@@ -425,7 +449,7 @@ class Session:
             elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
                 requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
                 self._presses = requested if self._presses is None else None
-                self._labelled_press = None
+                self._labelled_press = self._guided_press = None
             elif button == "record" and self._recording is not None:
                 self._end_recording()
             elif button == "record" and self.skin.detected.problem is None:

@@ -11,9 +11,10 @@ import pytest
 
 from reskin.board import find
 from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.live.emulator import encode_pieces
 from reskin.live.page_recording import LabelledPress, PageRecording
 from reskin.live.server import receive
-from reskin.live.session import PRESSES_N, Session
+from reskin.live.session import PRESSES_N, GuidedPresses, Session
 from reskin.live.skins import SkinFolder
 from reskin.live.tracker import Estimates, NetworkEstimator, UniversalEstimator
 from reskin.live.used_model import MEASURED_FILE, describe, read_measured
@@ -23,7 +24,7 @@ from reskin.recordings.header import HEADER_FILE, PROBE_FILE, parse
 from reskin.recordings.labels import Label
 from reskin.universal.model import load_universal
 from tests.live.boards import POKE_S, QUIET_S, ScriptReader, make_script, write_model
-from tests.live.test_estimators import QUIET_N, make_poke_script, random_pokes  # noqa: F401 - fixture
+from tests.live.test_estimators import QUIET_N, guided_pokes, make_poke_script, random_pokes  # noqa: F401 - fixtures
 from tests.live.test_record import places_of, read
 
 LONG_S = 20.0
@@ -213,6 +214,39 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     assert np.isnan(log.Fz_N).all()
     changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
     assert np.linalg.norm(changes_uT, axis=1).min() > 300  # uT; the field changes of the presses are above 600 uT
+
+
+def test_presses_at_crosses_are_labels_of_the_recording(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    script = make_poke_script(guided_pokes)
+    step_uT = np.tile([0.15, 0.15, 0.242], 5)  # `reskin add` checks the steps of the chips
+    script.frames.b_uT[:] = np.rint(script.frames.b_uT / step_uT) * step_uT
+    # with pauses of 1.25 s between the presses
+    slow = replace(script, pieces=encode_pieces(script.frames, "binary"), t_s=5 * script.t_s)
+    session, reader = running(slow, load_universal(), pauses_s=[5 * (QUIET_N - 80) / 400])
+    try:
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        receive(session, '{"press": "record"}')
+        receive(session, '{"press": "places"}')
+        reader.resume()
+        until(lambda: session.state()["adapted"].startswith("adapted to 8 known places"), session)
+        until(lambda: reader.at_end, session)
+        assert session.state()["recording_n"] == GuidedPresses().presses_n
+        assert session.state()["labelled"] == ""
+    finally:
+        session.stop()
+    (folder,) = (tmp_path / "captures").iterdir()
+    log = probe.parse(folder / PROBE_FILE, "log")
+    np.testing.assert_allclose(np.column_stack([log.x_mm, log.y_mm])[log.contact], guided_pokes[2])
+    blocks, account = read(folder)
+    assert account["indentations_n"] == GuidedPresses().presses_n
+    poked_uT = guided_pokes[1] - guided_pokes[0].mean(axis=0)
+    changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
+    place_mm = np.concatenate([np.column_stack([block.x_mm, block.y_mm]) for block in blocks])
+    press_i = np.linalg.norm(place_mm[:, None] - guided_pokes[2], axis=2).argmin(axis=1)
+    # tolerance in uT: the noise is 3 uT, and each reading must be of the press at its label
+    np.testing.assert_allclose(changes_uT, poked_uT[press_i], atol=30)
 
 
 def test_press_whose_rest_is_not_recorded_is_refused(tmp_path, monkeypatch):
