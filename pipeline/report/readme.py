@@ -1,4 +1,4 @@
-"""Fill in the generated blocks of README.md and docs from the results in `reports/`."""
+"""Fill in the generated blocks of README.md and docs, and what the live page shows, from the results in `reports/`."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -29,6 +29,9 @@ COSTS_MEANING = (
 )
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README.md shows HEADLINE
+# The scene in which the shipped universal model is tested, and its name there.
+SHIPPED_SCENE, SHIPPED_NAME = "lab", "universal, simulated alone"
+MEASURED = "reskin/universal/measured.json"  # what the live page shows of this model
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
@@ -56,7 +59,47 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
+    if SHIPPED_SCENE in numbers:
+        file, measured = root / MEASURED, measured_of(numbers[SHIPPED_SCENE])
+        if not file.exists() or io.read_json(file) != measured:
+            changed.append(str(file))
+            if write:
+                io.write_json(file, measured)
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
+
+
+def measured_of(numbers: Numbers) -> dict[str, Any]:
+    """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
+
+    The places are those of presses at random places, tested on the other colour of a checkerboard of places.
+    """
+
+    def by_board(row: Numbers) -> dict[str, list[float]]:
+        return {name: row[name]["values"] for name in ("accuracy_pct", "median_mm", "mse_xy_mm2")}
+
+    limits = numbers["recorded_limits"]
+    places = [
+        {"presses_n": 0, "labels_n": 0} | by_board(row)
+        for row in limits["registration"]["rows"]
+        if (row["method"], row["presses_n"], row["known"]) == (SHIPPED_NAME, 0, "not used")
+    ] + [
+        {"presses_n": row["presses_n"], "labels_n": int(row["labels"])} | by_board(row)
+        for row in numbers["random_presses"]["rows"]
+        if (row["method"], row["tested"]) == (SHIPPED_NAME, "other colour of a checkerboard")
+        and row["labels"].isdecimal()
+    ]
+    detection = [
+        row
+        for row in limits["detection"]["rows"]
+        if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")
+    ]
+    columns = {"lightest_N": "smallest_N", "detected_pct": "detected_pct", "false_alarm_pct": "false_alarm_pct"}
+    return {
+        "scene": numbers["provenance"]["scene"],
+        "source": numbers["provenance"]["source"],
+        "places": sorted(places, key=lambda row: (row["presses_n"], row["labels_n"])),
+        "detection": {name: [row[column] for row in detection] for name, column in columns.items()},
+    }
 
 
 def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:

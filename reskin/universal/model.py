@@ -571,6 +571,11 @@ class Universal:
         return Slide(self._same_slide, float(self._press_odds.sum() + self._label_odds.sum()))
 
     @property
+    def labels_n(self) -> int:
+        """Number of labelled presses that the model is calibrated to."""
+        return len(self._data.labels)
+
+    @property
     def misfit(self) -> float:
         """Median chi^2 per channel of unlabelled presses: about 1 for skins like those in training.
 
