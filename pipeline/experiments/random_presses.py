@@ -26,7 +26,7 @@ from pipeline.training.universal import FORCE_MIN_N, WAYS, coverage
 from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
 from reskin.config import Strict
 from reskin.errors import SchemaError
-from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.metrics import ACCURACY_LIMIT_MM, interval_score
 from reskin.seeds import rng_for
 from reskin.universal.calibration import (
     CalibrationData,
@@ -267,24 +267,16 @@ def place_scores(error_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
 
 def score_estimate(estimate: Estimate, tested: LabelledPresses) -> dict[str, float]:
     """Score estimates of tested readings, and coverage and score of their 90 % intervals."""
-    error_mm = estimate.place_mm - tested.place_mm
+    error_mm, half_width_mm = estimate.place_mm - tested.place_mm, NORMAL_90 * estimate.sd_mm
     error_log = np.log(estimate.force_N / tested.force_N)
     return place_scores(error_mm) | {
         "r2_f": r2(estimate.force_N, tested.force_N),
         "coverage_pct": 100 * coverage(estimate, tested.place_mm),
-        "interval_score_mm": interval_score(error_mm, NORMAL_90 * estimate.sd_mm),
+        "interval_score_mm": interval_score(error_mm, -half_width_mm, half_width_mm),
         "half_width_mm": NORMAL_90 * float(np.median(estimate.sd_mm)),
         "coverage_f_pct": 100 * float((np.abs(error_log) <= NORMAL_90 * estimate.sd_log_N).mean()),
         "half_width_f_factor": float(np.exp(NORMAL_90 * np.median(estimate.sd_log_N))),
     }
-
-
-def interval_score(error: Float[np.ndarray, "..."], half_width: Float[np.ndarray, "..."]) -> float:
-    """Return the mean interval score of 90 % intervals: width plus 20 times the distance of values outside.
-
-    The score is smallest for intervals that are as narrow as their coverage allows (Gneiting & Raftery, JASA 2007).
-    """
-    return float((2 * half_width + 2 / 0.1 * np.maximum(np.abs(error) - half_width, 0)).mean())
 
 
 def r2(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t"]) -> float:
