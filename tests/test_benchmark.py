@@ -89,6 +89,7 @@ def test_task_gives_only_what_a_method_may_use():
     assert set(task.train.board) == {f"train{i}" for i in range(40)}
     np.testing.assert_array_equal(task.tests_uT, own.db_uT[list(one.tests)])
     np.testing.assert_allclose(task.noload_uT, own.noload_uT[list(one.unlabelled)].mean(axis=0))
+    assert "\n" not in repr(task)
     with pytest.raises(SchemaError, match="place_mm has shape"):
         task.predictions([[8.0, 8.0]])
 

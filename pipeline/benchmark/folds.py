@@ -21,6 +21,7 @@ from pydantic import Field
 from reskin import io
 from reskin.code import ROOT
 from reskin.config import Strict, parse
+from reskin.display import one_line
 from reskin.errors import ParamsError, SchemaError, did_you_mean
 from reskin.recordings import ReaderLayout, header, preparing
 from reskin.recordings.fault_policy import REFUSE_NONE
@@ -112,6 +113,8 @@ class Presses:
     noload_uT: Float[np.ndarray, "n ch"]
     db_uT: Float[np.ndarray, "n ch"]
 
+    __repr__ = one_line
+
     def __len__(self) -> int:
         return len(self.press)
 
@@ -150,6 +153,8 @@ class Task:
     labels: Presses
     tests_uT: Float[np.ndarray, "t ch"]
     _tests: Int64[np.ndarray, " t"]
+
+    __repr__ = one_line
 
     def predictions(
         self, place_mm: ArrayLike, force_N: ArrayLike | None = None, *, interval_90: ArrayLike | None = None
@@ -323,10 +328,10 @@ def join_presses(parts: Sequence[Presses]) -> Presses:
 
 def _check_file(path: Path, digest: str) -> None:
     if not path.is_file():
-        remedy = "Run `reskin fetch` for this dataset, or give the folder of the recordings."
+        remedy = "Run `reskin fetch` for recordings, or give their folder; restore simulated presses with git."
         raise SchemaError(f"{path}: file not found. {remedy}")
     if io.sha256(path) != digest:
-        remedy = "Fetch it again with `reskin fetch`."
+        remedy = "Run `reskin fetch` for recordings; restore simulated presses with git."
         raise SchemaError(f"{path}: the file is not the one of the benchmark (another SHA-256). {remedy}")
 
 
