@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import FLOW
+from pipeline.benchmark import entries
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.tables import make_tables, skins_table, summary_table
@@ -27,6 +28,7 @@ COSTS_MEANING = (
     "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
     "them run side by side, so less time passes."
 )
+BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README.md shows HEADLINE
 # The scene in which the shipped universal model is tested, and its name there.
@@ -55,7 +57,9 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     times = io.read_json(root / TIMES) if (root / TIMES).exists() else None
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(page): page.read_text(encoding="utf-8") for page in pages}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times))
+    blocks = blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times)
+    blocks |= entries.blocks(entries.read_entries(root / BENCHMARK), numbers.get("lab", {}))
+    after = fill(before, blocks)
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
