@@ -28,10 +28,11 @@ from reskin.board.reader import PLUGGED_IN, Reader
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
+from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
-from reskin.logs import CONTACT_SDS, magnitudes_uT, quiet_start
+from reskin.logs import quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
@@ -526,11 +527,10 @@ class LiveSkin:
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-            noise_uT = b_uT - noload_uT
-            rms_uT = float(np.sqrt((noise_uT**2).mean()))
+            db_uT = b_uT - noload_uT
             if isinstance(self.estimator, UniversalEstimator):
-                self._suppressor = self.estimator.suppressor(rms_uT)
-            self._contact_uT = float(np.median(magnitudes_uT(noise_uT, self._suppressor)) + CONTACT_SDS * rms_uT)
+                self._suppressor = self.estimator.suppressor(noise_uT(db_uT))
+            self._contact_uT = contact_threshold_uT(db_uT, self._suppressor)
             self.noload_uT = noload_uT
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:

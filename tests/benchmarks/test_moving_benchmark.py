@@ -17,8 +17,8 @@ import pytest
 
 from pipeline.experiments.random_presses import CHECKERBOARD, BoardPresses, draw_presses, raise_forces
 from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins, split_presses
+from reskin.data.contact import CONTACT_SDS
 from reskin.data.grid import CENTRE_MM
-from reskin.logs import CONTACT_SDS
 from reskin.physics import external
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
