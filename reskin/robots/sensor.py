@@ -22,7 +22,7 @@ from reskin.live.tracker import Estimates, LiveSkin
 
 WAIT_S = 0.1  # longest time for which the background thread waits for data before it checks whether to stop
 READ_MS = 10_000.0  # longest time for which `read` and `zero` wait, as `read` of LeRobot's cameras
-ESTIMATE = ("x_mm", "y_mm", "F_N", "sd_x_mm", "sd_y_mm", "contact")
+ESTIMATE = ("x_mm", "y_mm", "F_N", "sd_x_mm", "sd_y_mm", "sd_F_N", "contact")
 
 
 class SkinConnectionError(CaptureError, ConnectionError):
@@ -38,22 +38,22 @@ class SkinSensorConfig:
     port : serial port or socket://host:port
     model : as in `reskin.open`; by default, the universal model without calibration
     baud : baud rate; USB ports ignore it
-    no_contact_mm : value of x_mm, y_mm and their standard deviations without contact. The default is NaN. Policies
+    without_contact : value of x_mm, y_mm and the standard deviations without contact. The default is NaN. Policies
         cannot use NaN: choose a value such as 0, and use `contact` and `F_N` as well.
     """
 
     port: str
     model: AnyModel = ()
     baud: int = find.BAUD
-    no_contact_mm: float = math.nan
+    without_contact: float = math.nan
 
 
 class SkinSensor:
     """A skin that a background thread reads continuously. May be used in a `with` statement, which connects it.
 
     A reading is a dict of numbers: the field of each chip (Bx0_uT, By0_uT, Bz0_uT, Bx1_uT, ...) and, if the model is
-    for this board, the estimate: x_mm, y_mm, F_N, sd_x_mm, sd_y_mm, and contact (1 or 0). Readings that are not usable,
-    such as failed reads of a chip, are never returned.
+    for this board, the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are not
+    usable, such as failed reads of a chip, are never returned.
     """
 
     def __init__(self, config: SkinSensorConfig) -> None:
@@ -217,9 +217,12 @@ class SkinSensor:
         values = dict(zip(_field_names(len(b_uT) // 3), b_uT, strict=True))
         if estimated:
             x_mm, y_mm, force_N = estimates.target[-1].tolist()
-            contact, place_sd = bool(estimates.contact[-1]), [x_mm, y_mm, *estimates.sd_mm[-1].tolist()]
-            x_mm, y_mm, *sd_mm = place_sd if contact else [self.config.no_contact_mm] * 4
-            values |= dict(zip(ESTIMATE, (x_mm, y_mm, force_N, *sd_mm, float(contact)), strict=True))
+            contact, unknown = bool(estimates.contact[-1]), self.config.without_contact
+            sd_x_mm, sd_y_mm, sd_F_N = (*estimates.sd_mm[-1].tolist(), float(estimates.sd_F_N[-1]))
+            if not contact:
+                x_mm = y_mm = sd_x_mm = sd_y_mm = sd_F_N = unknown
+            estimate = (x_mm, y_mm, force_N, sd_x_mm, sd_y_mm, sd_F_N, float(contact))
+            values |= dict(zip(ESTIMATE, estimate, strict=True))
         return values
 
 

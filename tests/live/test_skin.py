@@ -62,6 +62,7 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
+    assert touched.sd_F_N == pytest.approx(0.0, abs=0.01)
 
 
 def test_slow_caller_gets_the_latest_reading(tmp_path):

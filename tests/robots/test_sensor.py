@@ -75,7 +75,7 @@ def test_sensor_reads_an_emulated_board(tmp_path):
 
 
 def test_readings_are_returned_once_and_in_time(gated):
-    sensor, reader = gated(make_script(), no_contact_mm=-1.0)
+    sensor, reader = gated(make_script(), without_contact=-1.0)
     sensor.connect(warmup=False)
     try:
         reader.wait()
