@@ -271,6 +271,7 @@ class Contact(NamedTuple):
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # current problems of the board
     sd_F_N: float = np.nan  # standard deviation of the force (between networks; NaN for a single network)
+    usable: bool = True  # False if a chip is faulty, the board is silent, or there is no no-load reading
 
 
 @dataclass(frozen=True)
@@ -558,10 +559,14 @@ class LiveSkin:
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:
         if estimates is None:
             unknown_uT = np.full(3 * self.detected.chips_n, np.nan, np.float32)
-            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), unknown_uT, self.alarms())
+            no_place_mm = np.nan, np.nan
+            return Contact(
+                self.reader.taken_s, *no_place_mm, np.nan, no_place_mm, unknown_uT, self.alarms(), usable=False
+            )
         (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = estimates.target[i].tolist(), estimates.sd_mm[i].tolist()
         t_s, sd_mm, sd_F_N = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm), float(estimates.sd_F_N[i])
-        return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms(), sd_F_N)
+        usable = bool(np.isfinite(estimates.db_uT[i]).all())
+        return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms(), sd_F_N, usable)
 
 
 class LiveSkins:

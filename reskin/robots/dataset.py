@@ -262,10 +262,10 @@ def split(recording: Recording, features: Mapping[str, Sequence[str]], fps: int)
             since_s = recording.t_s[rows] - recording.t_s[rows[0]]
             frame_s = np.arange(int(since_s[-1] * fps + ROUNDING) + 1) / fps
             kept = rows[np.searchsorted(since_s, frame_s + ROUNDING / fps, "right") - 1]
-        about = recording.about | {"recording": Path(recording.where).name, "part": int(recording.part[rows[0]])}
+        about: dict[str, str | int] = {"recording": Path(recording.where).name, "part": int(recording.part[rows[0]])}
         used_n = len(np.unique(kept))
         about |= {"skipped_readings_n": len(rows) - used_n, "repeated_readings_n": len(kept) - used_n}
-        yield Episode({feature: column[kept] for feature, column in values.items()}, about)
+        yield Episode({feature: column[kept] for feature, column in values.items()}, {**recording.about, **about})
 
 
 # --- Writing ---

@@ -52,8 +52,8 @@ class SkinSensor:
     """A skin that a background thread reads continuously. May be used in a `with` statement, which connects it.
 
     A reading is a dict of numbers: the field of each chip (Bx0_uT, By0_uT, Bz0_uT, Bx1_uT, ...) and, if the model is
-    for this board, the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are not
-    usable, such as failed reads of a chip, are never returned.
+    for this board, the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are
+    not usable, such as failed reads of a chip, are never returned.
     """
 
     def __init__(self, config: SkinSensorConfig) -> None:
@@ -218,7 +218,8 @@ class SkinSensor:
         if estimated:
             x_mm, y_mm, force_N = estimates.target[-1].tolist()
             contact, unknown = bool(estimates.contact[-1]), self.config.without_contact
-            sd_x_mm, sd_y_mm, sd_F_N = (*estimates.sd_mm[-1].tolist(), float(estimates.sd_F_N[-1]))
+            sd_x_mm, sd_y_mm = estimates.sd_mm[-1].tolist()
+            sd_F_N = float(estimates.sd_F_N[-1])
             if not contact:
                 x_mm = y_mm = sd_x_mm = sd_y_mm = sd_F_N = unknown
             estimate = (x_mm, y_mm, force_N, sd_x_mm, sd_y_mm, sd_F_N, float(contact))

@@ -13,8 +13,8 @@ from reskin.live.session import PRESSES_N, GuidedPresses, Presses, Session
 from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
-from reskin.universal.law import to_chips
 from reskin.universal.force import prior_line
+from reskin.universal.law import to_chips
 from reskin.universal.model import load_universal
 from tests.live.boards import ScriptReader, make_script, play_to_skin
 

@@ -134,7 +134,6 @@ def with_nan(changes: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def run_onnx(file: Path, db_uT: np.ndarray) -> dict[str, np.ndarray]:
-    pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     runtime = pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
     session = runtime.InferenceSession(file, providers=["CPUExecutionProvider"])
     names = [output.name for output in session.get_outputs()]
@@ -191,6 +190,7 @@ def test_onnx_model_equals_python(tmp_path, kind):
 
 
 def test_shipped_model_is_exported_whole(tmp_path):
+    pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     model, changes = load_universal().zero(quiet()), {"presses": presses(50)[2]}
     model.export_onnx(tmp_path / "skin.onnx")
     found = run_onnx(tmp_path / "skin.onnx", changes["presses"])
