@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from reskin import cli, io
+from reskin import io
 from reskin.errors import CaptureError, ReskinError, SchemaError
 from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import HEADER_FILE, PROBE_FILE, STREAM_FILE, Clock
@@ -177,15 +177,6 @@ def test_wrong_input_is_an_error_and_leaves_nothing_behind(tmp_path):
     with pytest.raises(ReskinError, match="out exists. Choose another folder"):
         export_lerobot([good], out, task="touch")
     assert not list(tmp_path.glob(".out*"))
-
-
-def test_command_exports(tmp_path, monkeypatch, capsys):
-    file = write_readings(tmp_path / "c.parquet")
-    monkeypatch.setattr("sys.argv", ["reskin", "export", str(file), "--out", str(tmp_path / "out"), "--fps", "50"])
-    with pytest.raises(SystemExit) as done:
-        cli.main()
-    assert not done.value.code
-    assert "episodes_n 4, frames_n 20, fps 50" in capsys.readouterr().out
 
 
 @needs_lerobot

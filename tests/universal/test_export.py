@@ -1,5 +1,6 @@
 """Tests of exported estimates against Python: C code that is compiled here, and ONNX files in ONNX Runtime."""
 
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -16,31 +17,11 @@ from reskin.universal import export
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.network import LAYERS_N, WIDTH
 
+ROOT = Path(__file__).resolve().parents[2]
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic-errors", "-Werror"]
-# The program reads one value of each channel per line, and prints one estimate per line.
-PROGRAM = """
-#include "skin.h"
-#include <stdio.h>
-int main(void)
-{
-    reskin_real db_uT[RESKIN_CHANNELS_N];
-    reskin_result r;
-    double value;
-    int i = 0;
-    while (scanf("%lf", &value) == 1) {
-        db_uT[i++] = (reskin_real)value;
-        if (i == RESKIN_CHANNELS_N) {
-            reskin_estimate(db_uT, &r);
-            printf("%.17g %.17g %.17g %.17g %.17g %.17g %.17g %.17g %d\\n", (double)r.x_mm, (double)r.y_mm,
-                   (double)r.sd_x_mm, (double)r.sd_y_mm, (double)r.force_N, (double)r.sd_log_N, (double)r.misfit,
-                   (double)r.change_uT, r.contact);
-            i = 0;
-        }
-    }
-    return 0;
-}
-"""
+# The program reads a reading per line, and prints one estimate per line.
+PROGRAM = re.search(r"```c\n(.*?)```", (ROOT / "docs/robots.md").read_text(encoding="utf-8"), re.DOTALL)[1]
 NAMES = ("place_mm", "sd_mm", "force_N", "sd_log_N", "misfit")
 LABELS_N = {"unlabelled": 0, "few forces, moving, two networks": 3, "labels, turned": 6}
 EXACT = 1e-5  # in mm and N: single precision of Python, for presses and for readings without contact
@@ -122,7 +103,8 @@ def run_c(kind: str, *options: str) -> dict[str, np.ndarray]:
         coarse(kind).export_c(folder / "skin.h", sign(kind) * quiet())
         (folder / "main.c").write_text(PROGRAM)
         subprocess.run([COMPILER, *STRICT, *options, "-o", program, folder / "main.c", "-lm"], check=True)
-        text = "\n".join(" ".join(map(repr, row)) for row in with_nan(readings(kind)).tolist())
+        b_uT = with_nan(readings(kind)) + coarse(kind).noload_uT
+        text = "\n".join(" ".join(map(repr, row)) for row in b_uT.tolist())
         done = subprocess.run([program], input=text, capture_output=True, text=True, check=True)
     rows = np.array([line.split() for line in done.stdout.splitlines()], float)
     found = dict(zip(("force_N", "sd_log_N", "misfit", "change_uT", "contact"), rows.T[4:], strict=True))
