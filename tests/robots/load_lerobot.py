@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 INDICES = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-EXACT = {"min", "max", "mean", "std", "count"}  # statistics that LeRobot computes without approximation
+MOMENTS = {"min", "max", "mean", "std", "count"}  # LeRobot computes them in single precision, quantiles roughly
 
 
 def compare(exported: Path, own: Path) -> None:
@@ -44,8 +44,11 @@ def compare(exported: Path, own: Path) -> None:
         assert values.keys() == their_statistics[name].keys(), name
         if np.isnan(their_statistics[name]["mean"]).any():
             continue  # some values are unknown; LeRobot's statistics are then NaN
-        for key in EXACT:
-            np.testing.assert_allclose(values[key], their_statistics[name][key], rtol=1e-4, atol=1e-4, err_msg=name)
+        largest = np.abs([values["min"], values["max"]]).max()
+        for key in MOMENTS:
+            np.testing.assert_allclose(
+                values[key], their_statistics[name][key], rtol=1e-4, atol=1e-3 * largest, err_msg=name
+            )
 
 
 def write(frames: list[dict], dataset: LeRobotDataset, folder: Path) -> None:
