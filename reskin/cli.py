@@ -290,7 +290,7 @@ def export(
     out: Annotated[Path, Option(help="The folder to create.")],
     to: Annotated[Literal["lerobot"], Option(help="Format: lerobot, a LeRobot dataset v3.0.")] = "lerobot",
     task: Annotated[str, Option(help="What the robot does, in natural language.")] = "press the skin",
-    fps: Annotated[int | None, Option(help="Frames per second. Default: the rate of the readings.")] = None,
+    fps: Annotated[int | None, Option(help="Frames per second. Default: each reading is a frame.")] = None,
     rate_hz: Annotated[
         float | None, Option("--rate-hz", help="Readings per second, for files without times.", min=1.0)
     ] = None,
@@ -299,7 +299,7 @@ def export(
     from reskin.robots.dataset import export_lerobot
 
     counts = export_lerobot(files, out, task=task, fps=fps, rate_hz=rate_hz)
-    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
+    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ class Episode:
     """The frames of one episode, and the recording and part from which they come."""
 
     values: Mapping[str, Float32[np.ndarray, "f _"]]
-    about: Mapping[str, str | int]
+    about: Mapping[str, str | int | float]
 
     def __len__(self) -> int:
         return len(self.values[FIELD])
@@ -79,8 +79,8 @@ class Episode:
 
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
-) -> dict[str, int]:
-    """Write recordings as a LeRobot dataset, and return its numbers of episodes and frames and its frames per second.
+) -> dict[str, float]:
+    """Write recordings as a LeRobot dataset; return its size, its rate, and the largest error of its timestamps.
 
     Parameters
     ----------
@@ -89,9 +89,10 @@ def export_lerobot(
         one episode per indentation. A gap of more than `GAP_S` ends an episode.
     out : folder to create
     task : what the robot does, in natural language
-    fps : frames per second of the dataset; each frame is the latest reading at its time. Default: the rate of the
-        readings.
-    rate_hz : rate of the readings of files without times; such readings become frames one to one
+    fps : frames per second of the dataset; each frame is then the latest reading at its time. By default, each reading
+        is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 / fps; the
+        result tells how far they are from the times of the readings.
+    rate_hz : rate of the readings of files without times
 
     Raises
     ------
@@ -103,17 +104,20 @@ def export_lerobot(
     if not task.strip():
         raise ParamsError("--task: the text is empty. Say what the robot does, such as 'press the skin'.")
     recordings = [read_recording(file, rate_hz) for file in files]
-    features = find_features(recordings)
+    features, resample = find_features(recordings), fps is not None
     fps = find_rate(recordings, rate_hz) if fps is None else fps
     if not 1 <= fps <= FPS_MAX:
         raise ParamsError(f"--fps: {fps} is not from 1 to {FPS_MAX:,}.")
     untimed = [recording.where for recording in recordings if recording.t_s is None]
-    if untimed and fps != rate_hz:
+    if untimed and resample:
         raise ParamsError(f"--fps: {untimed[0]} has no times, so its rate cannot be changed. Omit --fps.")
-    episodes = [episode for recording in recordings for episode in split(recording, features, fps)]
+    parts = (split(recording, features, fps, resample=resample) for recording in recordings)
+    episodes = [episode for part in parts for episode in part]
     with io.replacing(out) as folder:
         write_dataset(folder, episodes, features, task, fps)
-    return {"episodes_n": len(episodes), "frames_n": sum(map(len, episodes)), "fps": fps}
+    late_s = max(float(episode.about["timestamp_error_max_s"]) for episode in episodes)
+    counts = {"episodes_n": len(episodes), "frames_n": sum(map(len, episodes)), "fps": fps}
+    return counts | {"timestamp_error_max_s": late_s}
 
 
 # --- Reading ---
@@ -246,8 +250,10 @@ def _rate_hz(recording: Recording) -> float | None:
     return float(1 / np.median(step_s)) if len(step_s) else None
 
 
-def split(recording: Recording, features: Mapping[str, Sequence[str]], fps: int) -> Iterator[Episode]:
-    """Divide a recording into episodes with a constant rate."""
+def split(
+    recording: Recording, features: Mapping[str, Sequence[str]], fps: int, *, resample: bool
+) -> Iterator[Episode]:
+    """Divide a recording into episodes. Frames are readings or, if `resample`, the latest readings at their times."""
     known = {feature: np.isfinite(recording.values[feature]).any(axis=0) for feature in features}
     values = {feature: recording.values[feature][:, mask].astype(np.float32) for feature, mask in known.items()}
     ends = np.diff(recording.part) != 0
@@ -257,14 +263,16 @@ def split(recording: Recording, features: Mapping[str, Sequence[str]], fps: int)
             raise CaptureError(f"{recording.where}: the times go backwards. Was the board reset? Split the file there.")
         ends = ends | (step_s > GAP_S)
     for rows in np.split(np.arange(len(recording.part)), np.flatnonzero(ends) + 1):
-        kept = rows
+        kept, late_s = rows, 0.0
         if recording.t_s is not None:
             since_s = recording.t_s[rows] - recording.t_s[rows[0]]
             frame_s = np.arange(int(since_s[-1] * fps + ROUNDING) + 1) / fps
-            kept = rows[np.searchsorted(since_s, frame_s + ROUNDING / fps, "right") - 1]
-        about: dict[str, str | int] = {"recording": Path(recording.where).name, "part": int(recording.part[rows[0]])}
-        used_n = len(np.unique(kept))
-        about |= {"skipped_readings_n": len(rows) - used_n, "repeated_readings_n": len(kept) - used_n}
+            if resample:
+                kept = rows[np.searchsorted(since_s, frame_s + ROUNDING / fps, "right") - 1]
+            late_s = float(np.abs(since_s[kept - rows[0]] - np.arange(len(kept)) / fps).max())
+        about: dict[str, str | int | float] = {"recording": Path(recording.where).name}
+        about |= {"part": int(recording.part[rows[0]]), "skipped_readings_n": len(rows) - len(np.unique(kept))}
+        about |= {"timestamp_error_max_s": round(late_s, 6)}
         yield Episode({feature: column[kept] for feature, column in values.items()}, {**recording.about, **about})
 
 

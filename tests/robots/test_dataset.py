@@ -67,7 +67,7 @@ def load_with_lerobot(exported: Path, folder: Path, *options: str) -> list[dict]
 
 def test_capture_becomes_an_episode_with_all_readings(tmp_path):
     counts = export_lerobot([write_stream(tmp_path, "binary")], tmp_path / "out", task="touch")
-    assert counts == {"episodes_n": 1, "frames_n": 500, "fps": 250}
+    assert counts == {"episodes_n": 1, "frames_n": 500, "fps": 250, "timestamp_error_max_s": 0}
     frames, episodes, info, statistics = read(tmp_path / "out")
     t_s, b_uT, temperature_degC = log_of()
     np.testing.assert_array_equal(values_of(frames, "observation.field_uT"), b_uT)
@@ -98,6 +98,16 @@ def test_frames_are_the_latest_readings_and_gaps_end_episodes(tmp_path):
     about = json.loads((tmp_path / "out/meta/reskin.json").read_text())["episodes"]
     read_n = sum(each["skipped_readings_n"] for each in about) + counts["frames_n"]
     assert read_n == kept.sum()
+    assert 0 < counts["timestamp_error_max_s"] <= 1 / RATE_HZ + 1e-6
+
+
+def test_readings_become_frames_one_to_one_if_no_rate_is_given(tmp_path):
+    t_s, b_uT, temperature_degC = log_of()
+    t_s = t_s + np.where(np.arange(len(t_s)) >= 100, 0.05, 0.0)  # frames were lost
+    io.write_text(tmp_path / "log.csv", dataset.sd_card.render(t_s, b_uT, temperature_degC))
+    counts = export_lerobot([tmp_path / "log.csv"], tmp_path / "out", task="touch")
+    np.testing.assert_array_equal(values_of(read(tmp_path / "out")[0], "observation.field_uT"), b_uT)
+    assert counts["timestamp_error_max_s"] == pytest.approx(0.05)
 
 
 def test_labels_of_a_capture_are_those_of_its_dwells(tmp_path):
@@ -123,7 +133,7 @@ def test_labels_of_a_capture_are_those_of_its_dwells(tmp_path):
 def test_ingested_readings_have_an_episode_per_indentation(tmp_path):
     files = [write_readings(tmp_path / f"c{i}.parquet", capture=f"c{i}") for i in range(2)]
     counts = export_lerobot(files, tmp_path / "out", task="touch")
-    assert counts == {"episodes_n": 8, "frames_n": 80, "fps": 100}
+    assert counts == {"episodes_n": 8, "frames_n": 80, "fps": 100, "timestamp_error_max_s": 0}
     frames, episodes, info, _ = read(tmp_path / "out")
     assert episodes["length"].to_pylist() == [10] * 8
     assert episodes["tasks"].to_pylist() == [["touch"]] * 8
