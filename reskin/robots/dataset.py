@@ -56,7 +56,7 @@ class Recording:
     """The readings of one file. values: feature -> values, NaN if unknown. t_s: None if the times are unknown.
 
     part: number of the part of the recording (such as the indentation) to which a reading belongs; each part becomes
-    an episode or, if it has gaps, several ones.
+    an episode or, if it has gaps, several ones. dropped_n: number of faulty frames, which are left out.
     """
 
     where: str
@@ -64,6 +64,7 @@ class Recording:
     values: Mapping[str, Float32[np.ndarray, "f _"]]
     t_s: Float[np.ndarray, " f"] | None
     part: Int[np.ndarray, " f"]
+    dropped_n: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Episode:
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
 ) -> dict[str, float]:
-    """Write recordings as a LeRobot dataset; return its size, its rate, and the largest error of its timestamps.
+    """Write recordings as a LeRobot dataset; return its size and rate, its largest timestamp error, and what it lacks.
 
     Parameters
     ----------
@@ -117,7 +118,8 @@ def export_lerobot(
         write_dataset(folder, episodes, features, task, fps)
     late_s = max(float(episode.about["timestamp_error_max_s"]) for episode in episodes)
     counts = {"episodes_n": len(episodes), "frames_n": sum(map(len, episodes)), "fps": fps}
-    return counts | {"timestamp_error_max_s": late_s}
+    dropped_n = sum(recording.dropped_n for recording in recordings)
+    return counts | {"timestamp_error_max_s": late_s, "dropped_faulty_frames_n": dropped_n}
 
 
 # --- Reading ---
@@ -132,28 +134,27 @@ def read_recording(file: Path, rate_hz: float | None) -> Recording:
     with file.open("rb") as stream:
         is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
     if not is_parquet:
-        return _of_log(str(file), {}, *read_any_log(file, 1.0)[:3])
+        return _of_log(str(file), {}, read_any_log(file, 1.0))
     table = io.read_table(file)
     if "indentation" in table.column_names:
         return _of_readings(table, str(file), rate_hz)
     if "device_s" in table.column_names and rate_hz is None and not _all_finite(table["device_s"]):
         raise ParamsError(f"{file}: the frames have no times. State their rate, such as --rate-hz 400.")
-    t_s, b_uT, temperature_degC, _ = sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file)), str(file))
-    return _of_log(str(file), {}, t_s, b_uT, temperature_degC)
+    return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file)), str(file)))
 
 
 def _of_log(
-    where: str, about: Mapping[str, str], t_s: Float[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"],
-    temperature_degC: Float32[np.ndarray, "f k"], labels: Mapping[str, Float32[np.ndarray, "f _"]] | None = None,
-) -> Recording:  # fmt: skip
+    where: str, about: Mapping[str, str], log: sd_card.Log, labels: Mapping[str, np.ndarray] | None = None
+) -> Recording:
+    t_s, b_uT, temperature_degC, account = log
     values = {FIELD: b_uT, TEMPERATURE: temperature_degC} | dict(labels or {})
-    return Recording(where, about, values, t_s, np.zeros(len(t_s), int))
+    dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
+    return Recording(where, about, values, t_s, np.zeros(len(t_s), int), dropped_n)
 
 
 def _of_capture(folder: Path) -> Recording:
-    header = read_header(folder)
-    t_s, b_uT, temperature_degC, _ = read_any_log(folder, 1.0)
-    return _of_log(str(folder), _about(header), t_s, b_uT, temperature_degC, _labels(folder, header, t_s))
+    header, log = read_header(folder), read_any_log(folder, 1.0)
+    return _of_log(str(folder), _about(header), log, _labels(folder, header, log[0]))
 
 
 def _about(header: Any) -> dict[str, str]:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from reskin import io
+from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
 from reskin.errors import CaptureError, ReskinError, SchemaError
 from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import HEADER_FILE, PROBE_FILE, STREAM_FILE, Clock
@@ -30,6 +31,9 @@ DWELLS = """indentation,pass_i,phase,t_start_s,t_end_s,x_mm,y_mm,depth_mm,Fx_N,F
 0,0,noload,100.1,100.9,,,,,,0
 0,0,contact,101.0,101.5,4,12,,,,0.5
 """
+
+
+EXACT = {"timestamp_error_max_s": 0, "dropped_faulty_frames_n": 0}
 
 
 def indentations(**changes: object) -> Readings:
@@ -67,7 +71,7 @@ def load_with_lerobot(exported: Path, folder: Path, *options: str) -> list[dict]
 
 def test_capture_becomes_an_episode_with_all_readings(tmp_path):
     counts = export_lerobot([write_stream(tmp_path, "binary")], tmp_path / "out", task="touch")
-    assert counts == {"episodes_n": 1, "frames_n": 500, "fps": 250, "timestamp_error_max_s": 0}
+    assert counts == {"episodes_n": 1, "frames_n": 500, "fps": 250, **EXACT}
     frames, episodes, info, statistics = read(tmp_path / "out")
     t_s, b_uT, temperature_degC = log_of()
     np.testing.assert_array_equal(values_of(frames, "observation.field_uT"), b_uT)
@@ -99,6 +103,14 @@ def test_frames_are_the_latest_readings_and_gaps_end_episodes(tmp_path):
     read_n = sum(each["skipped_readings_n"] for each in about) + counts["frames_n"]
     assert read_n == kept.sum()
     assert 0 < counts["timestamp_error_max_s"] <= 1 / RATE_HZ + 1e-6
+
+
+def test_faulty_frames_are_counted(tmp_path):
+    t_s, b_uT, temperature_degC = log_of()
+    b_uT[10:14, :3], temperature_degC[10:14, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
+    io.write_text(tmp_path / "log.csv", dataset.sd_card.render(t_s, b_uT, temperature_degC))
+    counts = export_lerobot([tmp_path / "log.csv"], tmp_path / "out", task="touch")
+    assert (counts["frames_n"], counts["dropped_faulty_frames_n"]) == (496, 4)
 
 
 def test_readings_become_frames_one_to_one_if_no_rate_is_given(tmp_path):
@@ -133,7 +145,7 @@ def test_labels_of_a_capture_are_those_of_its_dwells(tmp_path):
 def test_ingested_readings_have_an_episode_per_indentation(tmp_path):
     files = [write_readings(tmp_path / f"c{i}.parquet", capture=f"c{i}") for i in range(2)]
     counts = export_lerobot(files, tmp_path / "out", task="touch")
-    assert counts == {"episodes_n": 8, "frames_n": 80, "fps": 100, "timestamp_error_max_s": 0}
+    assert counts == {"episodes_n": 8, "frames_n": 80, "fps": 100, **EXACT}
     frames, episodes, info, _ = read(tmp_path / "out")
     assert episodes["length"].to_pylist() == [10] * 8
     assert episodes["tasks"].to_pylist() == [["touch"]] * 8
