@@ -35,6 +35,7 @@ from reskin.schema import from_table
 
 VERSION = "v3.0"
 FPS_MAX = 10_000
+RATE_TOLERANCE = 0.05  # relative difference between recordings of which one rate is assumed
 ROUNDING = 1e-6  # tolerance of times, as a fraction of the time between frames
 GAP_S = 0.3  # an episode ends at a longer gap between readings; the last reading is then outdated
 FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
@@ -153,7 +154,13 @@ def _of_log(
 
 
 def _of_capture(folder: Path) -> Recording:
-    header, log = read_header(folder), read_any_log(folder, 1.0)
+    header = read_header(folder)
+    if header.layout not in ("native", "sd-card"):
+        raise CaptureError(
+            f"{folder}: this is a capture of layout {header.layout}. Export its table of ingested readings, "
+            f"data/indentations/SCENE/{header.capture}.parquet."
+        )
+    log = read_any_log(folder, 1.0)
     return _of_log(str(folder), _about(header), log, _labels(folder, header, log[0]))
 
 
@@ -234,21 +241,22 @@ def _known(recording: Recording) -> dict[str, list[str]]:
 
 
 def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
-    """Return the rate of the readings, which must be the same in all recordings when rounded to whole numbers."""
-    rates = [rate_hz if recording.t_s is None else _rate_hz(recording) for recording in recordings]
-    rounded = sorted({round(rate) for rate in rates if rate is not None})
-    if not rounded:
-        raise ParamsError("--fps: each episode has a single reading, which has no rate. State the rate: --fps.")
-    if len(rounded) > 1:
-        raise ParamsError(f"--fps: the recordings have different rates ({rounded} Hz). Choose one: --fps.")
-    return rounded[0]
+    """Return the median rate of the recordings; raise ParamsError if they differ by more than `RATE_TOLERANCE`."""
+    found = [rate_hz if recording.t_s is None else _rate_hz(recording) for recording in recordings]
+    rates = sorted(rate for rate in found if rate is not None)
+    if not rates:
+        raise ParamsError("--fps: no episode has two readings at different times. State the rate: --fps.")
+    if rates[-1] > (1 + RATE_TOLERANCE) * rates[0]:
+        got = f"{rates[0]:.4g} to {rates[-1]:.4g} Hz"
+        raise ParamsError(f"--fps: the recordings have different rates, {got}. Choose one: --fps.")
+    return round(float(np.median(rates)))
 
 
 def _rate_hz(recording: Recording) -> float | None:
     """Return the reciprocal of the median time between readings of the same part; None if there is no such time."""
     assert recording.t_s is not None
     step_s = np.diff(recording.t_s)[np.diff(recording.part) == 0]
-    return float(1 / np.median(step_s)) if len(step_s) else None
+    return float(1 / np.median(step_s[step_s > 0])) if (step_s > 0).any() else None
 
 
 def split(

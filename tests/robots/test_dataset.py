@@ -15,11 +15,12 @@ from reskin import io
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC
 from reskin.errors import CaptureError, ReskinError, SchemaError
 from reskin.recordings.decode import decode_dump
-from reskin.recordings.header import HEADER_FILE, PROBE_FILE, STREAM_FILE, Clock
+from reskin.recordings.header import HEADER_FILE, PROBE_FILE, STREAM_FILE, Clock, write_capture
 from reskin.robots import dataset
 from reskin.robots.dataset import export_lerobot
 from reskin.schema import Readings
 from tests.data.tables import readings
+from tests.recordings.headers import make_header
 from tests.test_predicting import RATE_HZ, log_of, write_log, write_stream
 
 LEROBOT = os.environ.get("RESKIN_LEROBOT")  # a Python with the package lerobot
@@ -179,17 +180,21 @@ def test_wrong_input_is_an_error_and_leaves_nothing_behind(tmp_path):
     unlabelled = write_readings(tmp_path / "c.parquet", Fz_N=np.full(40, np.nan, np.float32))
     slow = write_readings(tmp_path / "d.parquet", t_s=np.arange(40) / 10.0)
     backwards = write_readings(tmp_path / "e.parquet", t_s=-np.arange(40.0))
+    still = write_readings(tmp_path / "f.parquet", t_s=np.zeros(40))
+    write_capture(tmp_path / "a_capture", make_header(), {})
     folder = write_stream(tmp_path, "binary")
     (folder / PROBE_FILE).write_text(DWELLS)
     for files, options, error, message in (
         ([good, simulated], {}, SchemaError, "it is simulated, but .*a.parquet is recorded"),
         ([good, unlabelled], {}, SchemaError, "differ in the values Fz_N. Export them to different folders"),
-        ([good, slow], {}, ReskinError, r"different rates \(\[10, 100\] Hz\)"),
+        ([good, slow], {}, ReskinError, "different rates, 10 to 100 Hz"),
         ([good, write_log(tmp_path)], {}, SchemaError, "differ in the values"),
         ([backwards], {"fps": 10}, CaptureError, "the times go backwards"),
         ([folder], {}, CaptureError, "labels in probe.csv are on another clock"),
         ([good], {"fps": 0}, ReskinError, "--fps: 0 is not from 1 to"),
         ([good], {"task": " "}, ReskinError, "--task: the text is empty"),
+        ([still], {}, ReskinError, "no episode has two readings at different times"),
+        ([tmp_path / "a_capture"], {}, CaptureError, "capture of layout lab. Export its table of ingested readings"),
         ([tmp_path / "missing"], {}, SchemaError, "file not found"),
     ):
         with pytest.raises(error, match=message):
