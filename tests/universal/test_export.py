@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
+from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for
 from reskin.universal import export
@@ -148,8 +149,13 @@ def check_equal(model: Universal, found: dict[str, np.ndarray], changes: dict[st
 def test_c_code_equals_python(kind):
     found = run_c(kind)
     check_equal(coarse(kind), found, readings(kind))
-    assert (found["contact"][:200] == 1).all()  # presses
-    assert (found["contact"][[400, -1]] == 0).all()  # no change, NaN
+    db_uT, quiet_uT = with_nan(readings(kind)), sign(kind) * quiet() - coarse(kind).noload_uT
+    suppressor = coarse(kind).suppressor(noise_uT(quiet_uT))
+    change_uT = magnitudes_uT(db_uT, suppressor)
+    np.testing.assert_allclose(found["change_uT"], change_uT, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(found["contact"], change_uT > contact_threshold_uT(quiet_uT, suppressor))
+    assert found["contact"][:200].all()  # presses
+    assert not found["contact"][[400, -1]].any()  # no change, NaN
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
