@@ -14,9 +14,11 @@ Nothing may touch the skin in the first second.
 | `~/force_sd`     | geometry_msgs/WrenchStamped               | its standard deviation; published only in contact    |
 | `/diagnostics`   | diagnostic_msgs/DiagnosticArray           | alarms, once a second and whenever they change       |
 
-Service `~/zero` (std_srvs/Trigger) takes a new no-load reading. Parameters: `port`; `model` and `calibration` (files,
-as for `reskin live --model`; default: the universal model without calibration); `external_uT` (for a board that a robot
-moves); `baud`; `frame_id`; `rate_hz` (largest number of messages of a topic per second).
+Service `~/zero` (std_srvs/Trigger) takes a new no-load reading.
+
+Parameters: `port` (default: the only connected board); `model` and `calibration` (files, as for `reskin live --model`;
+default: the universal model without calibration); `external_uT` (for a board that a robot moves); `baud`; `frame_id`;
+`rate_hz` (largest number of messages of a topic per second).
 
 Decisions:
 
@@ -37,6 +39,8 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import reskin
+from reskin.board.find import find_board
+from reskin.errors import ReskinError
 from reskin.live.tracker import Contact, LiveSkin
 
 if TYPE_CHECKING:
@@ -176,13 +180,17 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         given = {name: node.declare_parameter(name, default).value for name, default in PARAMETERS.items()}
         model = find_model(given["model"], given["calibration"], given["external_uT"])
-        with reskin.open(given["port"], model=model, baud=given["baud"]) as skin:
+        port = given["port"] or find_board().port
+        with reskin.open(port, model=model, baud=given["baud"]) as skin:
             publisher = SkinPublisher(node, skin, given["frame_id"])
             node.get_logger().info(f"publishing {skin.description}")
             for contact in limit_rate(iter(skin), given["rate_hz"]):
                 rclpy.spin_once(node, timeout_sec=0.0)  # serves calls of ~/zero
                 if contact is not None:
                     publisher.publish(contact)
+    except ReskinError as error:
+        node.get_logger().fatal(str(error))
+        raise SystemExit(error.exit_code) from None
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:

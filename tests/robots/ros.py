@@ -102,7 +102,7 @@ class Node:
         self.services[name] = kind, callback
 
     def get_logger(self) -> SimpleNamespace:
-        return SimpleNamespace(info=print)
+        return SimpleNamespace(info=print, fatal=print)
 
     def destroy_node(self) -> None:
         self.is_destroyed = True

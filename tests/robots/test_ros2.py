@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import reskin
+from reskin.board import find
 from reskin.live.tracker import Contact
 from reskin.robots import ros2
 from tests.live.boards import ScriptReader, make_script, write_model
@@ -55,7 +56,7 @@ def run(monkeypatch):
     """Return a function that runs the node on a skin, and returns what it publishes, by topic."""
 
     def run(skin, spin=lambda: None, **parameters) -> dict[str, list[Message]]:
-        node = Node({"rate_hz": 1e6} | parameters)
+        node = Node({"rate_hz": 1e6, "port": "played"} | parameters)
         for name, module in fake_modules(node, spin).items():
             monkeypatch.setitem(sys.modules, name, module)
         if skin is not None:
@@ -148,6 +149,14 @@ def test_node_publishes_the_contacts_of_a_board(run, monkeypatch, tmp_path):
     x_m = [message.pose.pose.position.x for message in published["~/place"]]
     np.testing.assert_allclose(x_m, 0.004, atol=5e-4)
     assert len(published["~/chip0/field"]) == len(published["~/force"]) == len(published["~/contact"])
+
+
+def test_error_ends_the_node_with_a_message(run, monkeypatch, capsys):
+    monkeypatch.setattr(find, "port_names", lambda: [])
+    for port, message in (("/dev/nowhere", "/dev/nowhere"), ("", "no board found")):
+        with pytest.raises(SystemExit):
+            run(None, port=port)
+        assert message in capsys.readouterr().out
 
 
 def test_models_are_selected_by_parameters():
