@@ -92,6 +92,7 @@ def test_stall_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         for contact in skin:
             seen += [] if seen and seen[-1] == contact.alarms else [contact.alarms]
+            assert contact.usable == np.isfinite(contact.b_uT).all()
             if any("unplugged" in alarm for alarms in seen for alarm in alarms) and contact.F_N > 0:
                 break
     alarms_text = " ".join(alarm for alarms in seen for alarm in alarms)
