@@ -521,7 +521,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     Returns
     -------
     LiveSkin or LiveSkins
-        Iteration yields the latest `Contact`: time, place, force, standard deviation of the place, field, alarms.
+        Iteration yields the latest `Contact`: time, place, force, their standard deviations, field, alarms.
         If your loop is slow, older contacts are skipped; `every()` yields a contact for each reading instead. With a
         list of ports, iteration yields tuples of contacts, in the order of the ports; an unplugged board does not delay
         the others.

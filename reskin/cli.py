@@ -1,4 +1,4 @@
-"""The `reskin` command, with the subcommands ports, template, record, emulate, live, decode and predict.
+"""The `reskin` command, with the subcommands ports, template, record, emulate, live, decode, predict and export.
 
 In a checkout of the project, the subcommands of `pipeline.cli` are added. Each command imports its dependencies when it
 runs, so that `reskin --help` is quick.
@@ -299,6 +299,24 @@ def predict(
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in numbers.items()))
     for sentence in warnings(counts):
         typer.echo(sentence)
+
+
+@app.command(rich_help_panel=RECORDINGS)
+def export(
+    files: Annotated[list[Path], Argument(help=f"Recordings. {LOG[:-1]}, or a table in data/indentations.")],
+    out: Annotated[Path, Option(help="The folder to create.")],
+    to: Annotated[Literal["lerobot"], Option(help="Format: lerobot, a LeRobot dataset v3.0.")] = "lerobot",
+    task: Annotated[str, Option(help="What the robot does, in natural language.")] = "press the skin",
+    fps: Annotated[int | None, Option(help="Frames per second. Default: each reading is a frame.")] = None,
+    rate_hz: Annotated[
+        float | None, Option("--rate-hz", help="Readings per second, for files without times.", min=1.0)
+    ] = None,
+) -> None:
+    """Export recordings as a dataset for robot learning (docs/robots.md)."""
+    from reskin.robots.dataset import export_lerobot
+
+    counts = export_lerobot(files, out, task=task, fps=fps, rate_hz=rate_hz)
+    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.errors import CaptureError
 from reskin.metrics import score
 
@@ -20,9 +21,6 @@ QUIET_MIN_S = 0.5  # assumed: shortest quiet start; the mean of a shorter one is
 # With 15 channels, noise alone exceeds this in 1 of 1,000 windows.
 WANDER_SDS = 4.0
 START_WINDOWS_N = 2  # number of windows at the start of the log from which mean and noise are estimated
-# A reading is in contact if |dB| exceeds its median over the quiet start by more than this multiple of the noise, which
-# is the rms of dB over all channels in the quiet start.
-CONTACT_SDS = 6.0
 POINTS_MAX_N = 1500  # largest number of points per series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
@@ -64,18 +62,11 @@ def estimate_after(
     """Subtract the mean field of the first `quiet_n` readings, detect contact, and estimate place and force."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
-    noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
-    magnitude_uT = magnitudes_uT(db_uT, None if find_suppressor is None else find_suppressor(noise_uT))
-    contact = magnitude_uT > np.median(magnitude_uT[:quiet_n]) + CONTACT_SDS * noise_uT
+    quiet_noise_uT = noise_uT(db_uT[:quiet_n])
+    suppressor = None if find_suppressor is None else find_suppressor(quiet_noise_uT)
+    contact = magnitudes_uT(db_uT, suppressor) > contact_threshold_uT(db_uT[:quiet_n], suppressor)
     targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
-    return LogEstimates(t_s, targets, contact, quiet_n, noise_uT)
-
-
-def magnitudes_uT(
-    db_uT: Float[np.ndarray, "f ch"], suppressor: Float64[np.ndarray, "ch ch"] | None
-) -> Float[np.ndarray, " f"]:
-    """Return |dB| of each reading, by which contact is detected; external fields are removed with the suppressor."""
-    return np.linalg.norm(db_uT if suppressor is None else db_uT @ suppressor, axis=1)
+    return LogEstimates(t_s, targets, contact, quiet_n, quiet_noise_uT)
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:

@@ -23,8 +23,8 @@ from pipeline.stage import say
 from pipeline.statistics import add_seed_sd, summarise
 from reskin.config import Strict
 from reskin.data.baseline import subtract
+from reskin.data.contact import CONTACT_SDS
 from reskin.data.grid import CENTRE_MM
-from reskin.logs import CONTACT_SDS
 from reskin.models.trained import networks_held_out
 from reskin.schema import Readings
 from reskin.seeds import rng_for

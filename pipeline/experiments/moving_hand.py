@@ -32,10 +32,10 @@ from pipeline.stage import say
 from pipeline.statistics import statistic
 from pipeline.training.jobs import SceneData
 from reskin.config import Strict
+from reskin.data.contact import CONTACT_SDS, magnitudes_uT
 from reskin.data.grid import CENTRE_MM
 from reskin.data.rows import Selection, gather
 from reskin.errors import ParamsError, SchemaError
-from reskin.logs import CONTACT_SDS, magnitudes_uT
 from reskin.physics import external
 from reskin.physics.magnet import MU0_4PI, field_of_each
 from reskin.physics.skin import SkinDesign

@@ -35,9 +35,9 @@ from pipeline.stage import say
 from pipeline.statistics import DECIMALS, statistic
 from pipeline.training.universal import WAYS
 from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
+from reskin.data.contact import CONTACT_SDS
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.errors import SchemaError
-from reskin.logs import CONTACT_SDS
 from reskin.models.classical import Classical, fit
 from reskin.models.inputs import VIEW
 from reskin.models.recipe import Name

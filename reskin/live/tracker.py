@@ -29,10 +29,11 @@ from reskin.board.reader import PLUGGED_IN, Reader
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
+from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
-from reskin.logs import CONTACT_SDS, magnitudes_uT, quiet_start
+from reskin.logs import quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
@@ -70,11 +71,12 @@ class Prediction(NamedTuple):
 
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
+    sd_F_N: Float64[np.ndarray, " f"]  # standard deviation of the force; NaN if unknown
     unknown: Bool[np.ndarray, " f"]  # whether a reading is outside the model's training distribution
 
 
 class NetworkEstimator:
-    """Predicts the mean of several trained networks, with the standard deviation between the networks as `sd_mm`."""
+    """Predicts the mean of several trained networks, with the standard deviations between the networks."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.channels_n: int = networks[0].card["input"]["channels_n"]
@@ -91,9 +93,10 @@ class NetworkEstimator:
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
-        sd_mm = targets[:, :, :2].std(axis=0, ddof=1) if len(targets) > 1 else np.full((len(db_uT), 2), np.nan)
+        sd = targets.std(axis=0, ddof=1) if len(targets) > 1 else np.full((len(db_uT), 3), np.nan)
         inputs_sds = np.stack([np.abs(scaler.encode(view(db_uT))).max(axis=1) for view, scaler in self._inputs])
-        return Prediction(targets.mean(axis=0), sd_mm, np.asarray((inputs_sds > UNKNOWN_SDS).any(axis=0)))
+        unknown = np.asarray((inputs_sds > UNKNOWN_SDS).any(axis=0))
+        return Prediction(targets.mean(axis=0), sd[:, :2], sd[:, 2], unknown)
 
 
 class Labels(NamedTuple):
@@ -282,7 +285,8 @@ class UniversalEstimator:
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         estimate = self._estimate(db_uT)
         target = np.column_stack([estimate.place_mm, estimate.force_N])
-        return Prediction(target, estimate.sd_mm, np.asarray(estimate.misfit > MISFIT_MAX))
+        sd_F_N = estimate.force_N * estimate.sd_log_N  # to first order
+        return Prediction(target, estimate.sd_mm, sd_F_N, np.asarray(estimate.misfit > MISFIT_MAX))
 
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
         return self._model.estimate(db_uT + self._noload_uT)
@@ -373,6 +377,8 @@ class Contact(NamedTuple):
     sd_mm: tuple[float, float]  # standard deviations of x and y (between networks; NaN for a single network)
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # current problems of the board
+    sd_F_N: float = np.nan  # standard deviation of the force (between networks; NaN for a single network)
+    usable: bool = True  # False if a chip is faulty, the board is silent, or there is no no-load reading
 
 
 @dataclass(frozen=True)
@@ -384,6 +390,7 @@ class Estimates:
     db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading, and for faulty frames
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N, as in `Contact`; NaN without a model
     sd_mm: Float64[np.ndarray, "f 2"]
+    sd_F_N: Float64[np.ndarray, " f"]
     contact: Bool[np.ndarray, " f"]
 
     def __len__(self) -> int:
@@ -637,39 +644,42 @@ class LiveSkin:
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-            noise_uT = b_uT - noload_uT
-            rms_uT = float(np.sqrt((noise_uT**2).mean()))
+            db_uT = b_uT - noload_uT
             if isinstance(self.estimator, UniversalEstimator):
-                self._suppressor = self.estimator.suppressor(rms_uT)
-            self._contact_uT = float(np.median(magnitudes_uT(noise_uT, self._suppressor)) + CONTACT_SDS * rms_uT)
+                self._suppressor = self.estimator.suppressor(noise_uT(db_uT))
+            self._contact_uT = contact_threshold_uT(db_uT, self._suppressor)
             self.noload_uT = noload_uT
             self.zeroings_n += 1
             self.zeroings_s.append(float(t_s[-1]))
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
-        target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)
+        target, sd_mm, sd_F_N = (np.full((len(frames), *shape), np.nan) for shape in ((3,), (2,), ()))
         if self.noload_uT is None:
             unknown_uT, contact = np.full_like(frames.b_uT, np.nan), np.zeros(len(t_s), bool)
-            return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, contact)
+            return Estimates(t_s, frames.b_uT, unknown_uT, target, sd_mm, sd_F_N, contact)
         db_uT = (np.where(sound[:, None], frames.b_uT, np.nan) - self.noload_uT).astype(np.float32)
         contact = magnitudes_uT(db_uT, self._suppressor) > self._contact_uT  # False for NaN
         if self.estimator is not None:
             target[sound & ~contact, 2] = 0.0
             if contact.any():
-                target[contact], sd_mm[contact], unknown = self.estimator(db_uT[contact])
+                target[contact], sd_mm[contact], sd_F_N[contact], unknown = self.estimator(db_uT[contact])
                 self.health.note(UNKNOWN_SKIN, int(unknown.sum()), t_s[-1])
         if sound[-1] and self.layout.known:
             expected_uT = self.estimator.external_uT if isinstance(self.estimator, UniversalEstimator) else 0.0
             self.health.feed_change(db_uT[-1], self.layout.turn, t_s[-1], expected_uT)
-        return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, contact)
+        return Estimates(t_s, frames.b_uT, db_uT, target, sd_mm, sd_F_N, contact)
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:
         if estimates is None:
             unknown_uT = np.full(3 * self.detected.chips_n, np.nan, np.float32)
-            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), unknown_uT, self.alarms())
+            no_place_mm = np.nan, np.nan
+            return Contact(
+                self.reader.taken_s, *no_place_mm, np.nan, no_place_mm, unknown_uT, self.alarms(), usable=False
+            )
         (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = estimates.target[i].tolist(), estimates.sd_mm[i].tolist()
-        t_s, sd_mm = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm)
-        return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms())
+        t_s, sd_mm, sd_F_N = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm), float(estimates.sd_F_N[i])
+        usable = bool(np.isfinite(estimates.db_uT[i]).all())
+        return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms(), sd_F_N, usable)
 
 
 class LiveSkins:

@@ -373,8 +373,8 @@ class MapEvaluator:
         parameters = mean.astype(np.float32), np.linalg.cholesky(cov).astype(np.float32)
         error_cov = skin.error_cov.astype(np.float32)
         noise_cov = skin.hypotheses.noise_cov.astype(np.float32)
-        self._gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
-        invalid = ~np.isfinite(self._gaussians.log_det)
+        self.gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
+        invalid = ~np.isfinite(self.gaussians.log_det)
         if invalid.any():
             what = f"{int(invalid.sum())} covariances of its hypotheses are not positive definite"
             raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
@@ -395,7 +395,7 @@ class MapEvaluator:
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Likelihoods:
         """Return the likelihoods of all hypotheses for each reading."""
-        chi2, deviance = self._gaussians.evaluate(db_uT.astype(np.float32))
+        chi2, deviance = self.gaussians.evaluate(db_uT.astype(np.float32))
         return Likelihoods(chi2, deviance, deviance.argmin(axis=1), db_uT.shape[1])
 
     def without_external(self, db_uT: Float[np.ndarray, "n ch"], likelihoods: Likelihoods) -> Float[np.ndarray, "n ch"]:
@@ -403,7 +403,7 @@ class MapEvaluator:
         external_cov = self._hypotheses.external_cov
         if external_cov is None:
             return db_uT
-        return db_uT - self._gaussians.solve(db_uT.astype(np.float32), likelihoods.best) @ external_cov
+        return db_uT - self.gaussians.solve(db_uT.astype(np.float32), likelihoods.best) @ external_cov
 
     def mean(self, likelihoods: Likelihoods, power: float) -> Estimate:
         """Estimate places and forces as means over all hypotheses, weighted by a power of their likelihoods."""

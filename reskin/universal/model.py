@@ -497,6 +497,11 @@ class Universal:
         return self._model.skin
 
     @property
+    def calibrated(self) -> CalibratedModel:
+        """Map and networks, conditioned on all calibration data, in the board's frame."""
+        return replace(self._model, line=self.line)
+
+    @property
     def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
         """Covariance of external fields along the board's axes; None if no external fields are expected."""
         return external.covariance(self.layout.chips_mm, self.external_uT) if self.external_uT else None
@@ -744,7 +749,7 @@ class Universal:
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
         """Return the result of `estimate` for each likelihood power; only the places' standard deviations differ."""
-        estimates = replace(self._model, line=self.line).estimate(self._change(b_uT), powers)
+        estimates = self.calibrated.estimate(self._change(b_uT), powers)
         return [replace(estimate, place_mm=estimate.place_mm + self._centre_mm) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
@@ -764,6 +769,27 @@ class Universal:
         if self._noload_uT is None:
             raise SchemaError("save: the model has no no-load reading. First call zero.")
         write_calibration(self._data, Path(file), self.layout.name)
+
+    def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
+        """Write the estimate of this skin as an ONNX file, for programs without Python (docs/robots.md).
+
+        Input `db_uT` are field changes since the no-load reading, along the chips' axes [f, ch], in double precision.
+        Outputs are the attributes of `estimate`, `change_uT` (|dB|) and, if `quiet_uT` is given, `contact`. quiet_uT:
+        readings without contact; their noise determines the threshold of contact, as in `reskin.open`. Requires the
+        package onnx; raises SchemaError before `zero`.
+        """
+        from reskin.universal import export
+
+        export.write_onnx(export.skin_function(self, quiet_uT), Path(file))
+
+    def export_c(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
+        """Write the estimate of this skin as a C99 header without dependencies, such as `skin.h` (docs/robots.md).
+
+        Inputs, outputs and `quiet_uT` are those of `export_onnx`. Raises SchemaError before `zero`.
+        """
+        from reskin.universal import export
+
+        export.write_c(export.skin_function(self, quiet_uT), Path(file))
 
     def remember(self, file: Path | str, *, new_day: bool = False) -> "Universal":
         """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`.

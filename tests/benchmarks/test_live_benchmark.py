@@ -164,7 +164,7 @@ def test_memory_of_a_day_of_frames():
     tracemalloc.start()
     for second in range(size(86_400, 60)):
         t_s = second + np.arange(made_n) / made_n
-        traces.add(Estimates(t_s, db_uT, db_uT, target, sd_mm, target[:, 2] > 0), t_s[-1])
+        traces.add(Estimates(t_s, db_uT, db_uT, target, sd_mm, sd_mm[:, 0], target[:, 2] > 0), t_s[-1])
         if second in size((600, 86_399), (30, 59)):
             print(f"\n  after {second} s: {tracemalloc.get_traced_memory()[0] / 1e6:.3f} MB")
     tracemalloc.stop()

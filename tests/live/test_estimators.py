@@ -13,6 +13,7 @@ from reskin.live.session import PRESSES_N, GuidedPresses, Presses, Session
 from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
+from reskin.universal.force import prior_line
 from reskin.universal.law import to_chips
 from reskin.universal.model import load_universal
 from tests.live.boards import ScriptReader, make_script, play_to_skin
@@ -48,6 +49,9 @@ def test_universal_model_estimates_places_and_their_standard_deviation(random_po
     error_mm = np.abs(estimates[: len(true), :2] - true[: len(estimates)])
     assert np.median(error_mm) < 1.0
     assert 0.2 < np.median(error_mm) / np.median(sd_mm) < 2.0
+    sd_F_N = np.concatenate([batch.sd_F_N[batch.contact] for batch in readings])
+    force_N = estimates[:, 2]
+    np.testing.assert_allclose(sd_F_N, force_N * prior_line().apply(np.log(force_N))[1])  # no force is known
     assert skin.health.alarms == {}
 
 
@@ -211,7 +215,7 @@ def test_guided_presses_add_to_the_labels_of_a_calibration(guided_pokes):
 def test_short_contact_is_not_a_press():
     pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
-    pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
+    pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), np.zeros(6), contact))
     assert len(pokes) == 0
 
 

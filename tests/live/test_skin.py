@@ -62,6 +62,7 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
+    assert touched.sd_F_N == pytest.approx(0.0, abs=0.01)
 
 
 def test_slow_caller_gets_the_latest_reading(tmp_path):
@@ -91,6 +92,7 @@ def test_stall_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         for contact in skin:
             seen += [] if seen and seen[-1] == contact.alarms else [contact.alarms]
+            assert contact.usable == np.isfinite(contact.b_uT).all()
             if any("unplugged" in alarm for alarms in seen for alarm in alarms) and contact.F_N > 0:
                 break
     alarms_text = " ".join(alarm for alarms in seen for alarm in alarms)

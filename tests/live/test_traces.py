@@ -9,7 +9,7 @@ from reskin.live.tracker import Estimates, layout_of
 def readings(t_s, force_N):
     db_uT = np.zeros((len(t_s), 15), np.float32)
     target = np.column_stack([np.full((len(t_s), 2), 8.0), force_N])
-    return Estimates(t_s, db_uT, db_uT, target, np.full((len(t_s), 2), np.nan), force_N > 0)
+    return Estimates(t_s, db_uT, db_uT, target, np.full((len(t_s), 2), np.nan), np.full(len(t_s), np.nan), force_N > 0)
 
 
 def forces(data):

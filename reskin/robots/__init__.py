@@ -1,0 +1,1 @@
+"""Interfaces to the software that robots run: LeRobot datasets and sensors, and ROS 2."""

@@ -1,0 +1,402 @@
+"""Write recordings as a LeRobot dataset: format v3.0, which LeRobot 0.4 to 0.6 read and write.
+
+The package lerobot is not needed. The dataset is a folder:
+
+    meta/info.json                              features with their names and units, frames per second, totals
+    meta/stats.json                             statistics of each feature over all frames
+    meta/tasks.parquet                          the task
+    meta/episodes/chunk-000/file-000.parquet    length, file and statistics of each episode
+    meta/reskin.json                            recording, board, skin and source of each episode (not read by LeRobot)
+    data/chunk-000/file-000.parquet, ...        one row per frame
+
+Features of sensors begin with `observation.`, so that policies use them as inputs. Features that a rig measured (place,
+depth, force) begin with `label.`; LeRobot loads them, but policies do not use them.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Float, Float32, Int
+
+from reskin import io
+from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.recordings import clocks, probe
+from reskin.recordings.decode import read_frames
+from reskin.recordings.header import PROBE_FILE, Header
+from reskin.recordings.ingest import read_header
+from reskin.recordings.loading import PARQUET_MAGIC, read_any_log
+from reskin.recordings.readers import sd_card
+from reskin.schema import from_table
+
+VERSION = "v3.0"
+FPS_MAX = 10_000
+RATE_TOLERANCE = 0.05  # relative difference between recordings of which one rate is assumed
+ROUNDING = 1e-6  # tolerance of times, as a fraction of the time between frames
+GAP_S = 0.3  # an episode ends at a longer gap between readings; the last reading is then outdated
+FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
+PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+QUANTILES = {f"q{percent:02d}": percent / 100 for percent in (1, 10, 50, 90, 99)}
+FIELD, NOLOAD, TEMPERATURE = "observation.field_uT", "observation.noload_uT", "observation.temperature_degC"
+LABELS = {
+    "label.place_mm": ("x_mm", "y_mm"),
+    "label.depth_mm": ("depth_mm",),
+    "label.force_N": ("Fx_N", "Fy_N", "Fz_N"),
+}
+INDICES = {name: "float32" if name == "timestamp" else "int64" for name in (
+    "timestamp", "frame_index", "episode_index", "index", "task_index",
+)}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The readings of one file. values: feature -> values, NaN if unknown. t_s: None if the times are unknown.
+
+    part: number of the part of the recording (such as the indentation) to which a reading belongs; each part becomes
+    an episode or, if it has gaps, several ones. dropped_n: number of faulty frames, which are left out.
+    """
+
+    where: str
+    about: Mapping[str, str]
+    values: Mapping[str, Float32[np.ndarray, "f _"]]
+    t_s: Float[np.ndarray, " f"] | None
+    part: Int[np.ndarray, " f"]
+    dropped_n: int = 0
+
+
+@dataclass(frozen=True)
+class Episode:
+    """The frames of one episode, and the recording and part from which they come."""
+
+    values: Mapping[str, Float32[np.ndarray, "f _"]]
+    about: Mapping[str, str | int | float]
+
+    def __len__(self) -> int:
+        return len(self.values[FIELD])
+
+
+def export_lerobot(
+    files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
+) -> dict[str, float]:
+    """Write recordings as a LeRobot dataset; return its size and rate, its largest timestamp error, and what it lacks.
+
+    Parameters
+    ----------
+    files : folders of captures (`reskin record`), tables of ingested readings (data/indentations), tables that
+        `reskin decode` wrote, or logs of an SD card. A capture or log is one episode, a table of ingested readings has
+        one episode per indentation. A gap of more than `GAP_S` ends an episode.
+    out : folder to create
+    task : what the robot does, in natural language
+    fps : frames per second of the dataset; each frame is then the latest reading at its time. By default, each reading
+        is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 / fps; the
+        result tells how far they are from the times of the readings.
+    rate_hz : rate of the readings of files without times
+
+    Raises
+    ------
+    ReskinError : a file cannot be read; the files differ in chips, in the kind of labels or in the kind of source; or
+        times or the rate are missing
+    """
+    if out.exists():
+        raise ParamsError(f"--out: {out} exists. Choose another folder.")
+    if not task.strip():
+        raise ParamsError("--task: the text is empty. Say what the robot does, such as 'press the skin'.")
+    recordings = [read_recording(file, rate_hz) for file in files]
+    features, resample = find_features(recordings), fps is not None
+    fps = find_rate(recordings, rate_hz) if fps is None else fps
+    if not 1 <= fps <= FPS_MAX:
+        raise ParamsError(f"--fps: {fps} is not from 1 to {FPS_MAX:,}.")
+    untimed = [recording.where for recording in recordings if recording.t_s is None]
+    if untimed and resample:
+        raise ParamsError(f"--fps: {untimed[0]} has no times, so its rate cannot be changed. Omit --fps.")
+    parts = (split(recording, features, fps, resample=resample) for recording in recordings)
+    episodes = [episode for part in parts for episode in part]
+    with io.replacing(out) as folder:
+        write_dataset(folder, episodes, features, task, fps)
+    late_s = max(float(episode.about["timestamp_error_max_s"]) for episode in episodes)
+    counts = {"episodes_n": len(episodes), "frames_n": sum(map(len, episodes)), "fps": fps}
+    dropped_n = sum(recording.dropped_n for recording in recordings)
+    return counts | {"timestamp_error_max_s": late_s, "dropped_faulty_frames_n": dropped_n}
+
+
+# --- Reading ---
+
+
+def read_recording(file: Path, rate_hz: float | None) -> Recording:
+    """Read a capture, a table of ingested readings, a table of decoded frames, or the log of an SD card."""
+    if file.is_dir():
+        return _of_capture(file)
+    if not file.is_file():
+        raise SchemaError(f"{file}: file not found. Check the path.")
+    with file.open("rb") as stream:
+        is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
+    if not is_parquet:
+        return _of_log(str(file), {}, read_any_log(file, 1.0))
+    table = io.read_table(file)
+    if "indentation" in table.column_names:
+        return _of_readings(table, str(file), rate_hz)
+    if "device_s" in table.column_names and rate_hz is None and not _all_finite(table["device_s"]):
+        raise ParamsError(f"{file}: the frames have no times. State their rate, such as --rate-hz 400.")
+    return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file)), str(file)))
+
+
+def _of_log(
+    where: str, about: Mapping[str, str], log: sd_card.Log, labels: Mapping[str, np.ndarray] | None = None
+) -> Recording:
+    t_s, b_uT, temperature_degC, account = log
+    values = {FIELD: b_uT, TEMPERATURE: temperature_degC} | dict(labels or {})
+    dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
+    return Recording(where, about, values, t_s, np.zeros(len(t_s), int), dropped_n)
+
+
+def _of_capture(folder: Path) -> Recording:
+    header = read_header(folder)
+    if header.layout not in ("native", "sd-card"):
+        raise CaptureError(
+            f"{folder}: this is a capture of layout {header.layout}. Export its table of ingested readings, "
+            f"data/indentations/SCENE/{header.capture}.parquet."
+        )
+    log = read_any_log(folder, 1.0)
+    return _of_log(str(folder), _about(header), log, _labels(folder, header, log[0]))
+
+
+def _about(header: Any) -> dict[str, str]:
+    return {name: getattr(header, name) for name in ("capture", "board", "skin", "source")}
+
+
+def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[str, Float32[np.ndarray, "f _"]]:
+    """Return the labels of each reading of a capture: those of the dwell in which it was taken, NaN between dwells."""
+    file = folder / PROBE_FILE
+    if not file.is_file():
+        return {}
+    if not header.clock.marks:
+        raise CaptureError(
+            f"{folder}: the labels in {PROBE_FILE} are on another clock. Add the capture with `reskin add`, run "
+            "`dvc repro`, and export the table of ingested readings."
+        )
+    log = probe.parse(file, str(file))
+    probe_s = clocks.from_marks(np.array(header.clock.marks), str(folder)).probe_s(t_s)
+    dwell_i = np.searchsorted(log.t_start_s, probe_s, "right") - 1
+    inside = (dwell_i >= 0) & (probe_s <= log.t_end_s[dwell_i])
+    return {
+        feature: np.where(inside[:, None], np.stack([getattr(log, name)[dwell_i] for name in names], axis=1), np.nan)
+        for feature, names in LABELS.items()
+    }
+
+
+def _of_readings(table: pa.Table, where: str, rate_hz: float | None) -> Recording:
+    readings = from_table(table, where)
+    values = {FIELD: readings.b_uT, NOLOAD: readings.noload_uT, TEMPERATURE: readings.temperature_degC}
+    for feature, names in LABELS.items():
+        values[feature] = np.stack([getattr(readings, name) for name in names], axis=1)
+    timed = np.isfinite(readings.t_s).all()
+    if not timed and rate_hz is None:
+        raise ParamsError(f"{where}: the readings have no times. State their rate, such as --rate-hz 100.")
+    return Recording(where, _about(readings), values, readings.t_s if timed else None, readings.indentation)
+
+
+def _all_finite(column: pa.ChunkedArray) -> bool:
+    return bool(np.isfinite(np.asarray(column, np.float64)).all())
+
+
+# --- Episodes ---
+
+
+def find_features(recordings: Sequence[Recording]) -> dict[str, list[str]]:
+    """Return the features with the names of their components; values that are unknown everywhere are omitted."""
+    first, *others = recordings
+    features = _known(first)
+    for other in others:
+        problem = ""
+        if (own := _known(other)) != features:
+            names, own_names = ({name for part in each.values() for name in part} for each in (features, own))
+            problem = f"it and {first.where} differ in the values {', '.join(sorted(names ^ own_names))}"
+        elif _source(other) != _source(first):
+            problem = f"it is {_source(other)}, but {first.where} is {_source(first)}"
+        if problem:
+            raise SchemaError(f"{other.where}: {problem}. Export them to different folders.")
+    return features
+
+
+def _source(recording: Recording) -> str:
+    """Return whether a recording is simulated or recorded; files without a header count as recorded."""
+    return recording.about.get("source", "recorded")
+
+
+def _known(recording: Recording) -> dict[str, list[str]]:
+    """Return the features of a recording with the names of those components that are known for some reading."""
+    chips_n = recording.values[FIELD].shape[1] // 3
+    field = tuple(f"B{axis}{chip}_uT" for chip in range(chips_n) for axis in "xyz")
+    temperature = tuple(f"T{chip}_degC" for chip in range(chips_n))
+    names = {FIELD: field, NOLOAD: field, TEMPERATURE: temperature, **LABELS}
+    known = {}
+    for feature, values in recording.values.items():
+        is_known = np.isfinite(values).any(axis=0)
+        known[feature] = [name for name, kept in zip(names[feature], is_known, strict=True) if kept]
+    return {feature: known[feature] for feature in names if known.get(feature)}
+
+
+def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
+    """Return the median rate of the recordings; raise ParamsError if they differ by more than `RATE_TOLERANCE`."""
+    found = [rate_hz if recording.t_s is None else _rate_hz(recording) for recording in recordings]
+    rates = sorted(rate for rate in found if rate is not None)
+    if not rates:
+        raise ParamsError("--fps: no episode has two readings at different times. State the rate: --fps.")
+    if rates[-1] > (1 + RATE_TOLERANCE) * rates[0]:
+        got = f"{rates[0]:.4g} to {rates[-1]:.4g} Hz"
+        raise ParamsError(f"--fps: the recordings have different rates, {got}. Choose one: --fps.")
+    return round(float(np.median(rates)))
+
+
+def _rate_hz(recording: Recording) -> float | None:
+    """Return the reciprocal of the median time between readings of the same part; None if there is no such time."""
+    assert recording.t_s is not None
+    step_s = np.diff(recording.t_s)[np.diff(recording.part) == 0]
+    return float(1 / np.median(step_s[step_s > 0])) if (step_s > 0).any() else None
+
+
+def split(
+    recording: Recording, features: Mapping[str, Sequence[str]], fps: int, *, resample: bool
+) -> Iterator[Episode]:
+    """Divide a recording into episodes. Frames are readings or, if `resample`, the latest readings at their times."""
+    known = {feature: np.isfinite(recording.values[feature]).any(axis=0) for feature in features}
+    values = {feature: recording.values[feature][:, mask].astype(np.float32) for feature, mask in known.items()}
+    ends = np.diff(recording.part) != 0
+    if recording.t_s is not None:
+        step_s = np.diff(recording.t_s)
+        if (~ends & (step_s < 0)).any():
+            raise CaptureError(f"{recording.where}: the times go backwards. Was the board reset? Split the file there.")
+        ends = ends | (step_s > GAP_S)
+    for rows in np.split(np.arange(len(recording.part)), np.flatnonzero(ends) + 1):
+        kept, late_s = rows, 0.0
+        if recording.t_s is not None:
+            since_s = recording.t_s[rows] - recording.t_s[rows[0]]
+            frame_s = np.arange(int(since_s[-1] * fps + ROUNDING) + 1) / fps
+            if resample:
+                kept = rows[np.searchsorted(since_s, frame_s + ROUNDING / fps, "right") - 1]
+            late_s = float(np.abs(since_s[kept - rows[0]] - np.arange(len(kept)) / fps).max())
+        about: dict[str, str | int | float] = {"recording": Path(recording.where).name}
+        about |= {"part": int(recording.part[rows[0]]), "skipped_readings_n": len(rows) - len(np.unique(kept))}
+        about |= {"timestamp_error_max_s": round(late_s, 6)}
+        yield Episode({feature: column[kept] for feature, column in values.items()}, {**recording.about, **about})
+
+
+# --- Writing ---
+
+
+Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]  # values of a feature in the frames
+
+
+def write_dataset(
+    folder: Path, episodes: Sequence[Episode], features: Mapping[str, Sequence[str]], task: str, fps: int
+) -> None:
+    """Write all files of a dataset to a new folder."""
+    described: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [len(parts)], "names": list(parts)} for name, parts in features.items()
+    }
+    described |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in INDICES.items()}
+    starts = np.cumsum([0, *map(len, episodes)]).tolist()
+    columns = [_columns(episode, i, starts[i], fps) for i, episode in enumerate(episodes)]
+    numbers = _file_numbers([sum(values.nbytes for values in each.values()) for each in columns])
+    for number in sorted(set(numbers)):
+        tables = [_table(each) for each, own in zip(columns, numbers, strict=True) if own == number]
+        io.write_table(folder / "data" / PATH.format(**_location(number)), pa.concat_tables(tables))
+    rows = []
+    for i, each in enumerate(columns):
+        row: dict[str, Any] = {"episode_index": i, "tasks": [task], "length": len(episodes[i])}
+        row |= {"dataset_from_index": starts[i], "dataset_to_index": starts[i + 1]}
+        row |= {f"data/{key}": index for key, index in _location(numbers[i]).items()}
+        row |= {f"meta/episodes/{key}": index for key, index in _location(0).items()}
+        for name, values in each.items():
+            row |= {f"stats/{name}/{key}": value for key, value in statistics(values).items()}
+        rows.append(row)
+    io.write_table(folder / "meta/episodes" / PATH.format(**_location(0)), pa.Table.from_pylist(rows))
+    io.write_table(folder / "meta/tasks.parquet", _task_table(task))
+    joined = {name: np.concatenate([each[name] for each in columns]) for name in described}
+    io.write_json(folder / "meta/stats.json", {name: statistics(values) for name, values in joined.items()})
+    io.write_json(folder / "meta/reskin.json", {"episodes": [dict(episode.about) for episode in episodes]})
+    info = {
+        "codebase_version": VERSION, "robot_type": "reskin", "total_episodes": len(episodes),
+        "total_frames": starts[-1], "total_tasks": 1, "chunks_size": FILES_PER_CHUNK_N,
+        "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": VIDEO_FILE_MB, "fps": fps,
+        "splits": {"train": f"0:{len(episodes)}"}, "data_path": f"data/{PATH}", "video_path": None,
+        "features": described,
+    }  # fmt: skip
+    io.write_json(folder / "meta/info.json", info)
+
+
+def _columns(episode: Episode, episode_i: int, start: int, fps: int) -> Columns:
+    """Return the values of all features of an episode, whose first frame has the index `start`."""
+    frame_i = np.arange(len(episode))[:, None]
+    indices = {
+        "timestamp": frame_i / fps, "frame_index": frame_i, "episode_index": np.full_like(frame_i, episode_i),
+        "index": start + frame_i, "task_index": np.zeros_like(frame_i),
+    }  # fmt: skip
+    return dict(episode.values) | {name: indices[name].astype(dtype) for name, dtype in INDICES.items()}
+
+
+def _table(columns: Columns) -> pa.Table:
+    """Convert the features to a table: features with one component become numbers, others lists of fixed length."""
+    arrays = {}
+    for name, values in columns.items():
+        flat, length = pa.array(np.ascontiguousarray(values).ravel()), values.shape[1]
+        arrays[name] = flat if length == 1 else pa.FixedSizeListArray.from_arrays(flat, length)
+    return pa.table(arrays)
+
+
+def _file_numbers(bytes_n: Sequence[int]) -> list[int]:
+    """Return the number of the data file of each episode; a file has several episodes, up to `FILE_MB` in total."""
+    numbers, size_n, number = [], 0, 0
+    for episode_bytes_n in bytes_n:
+        if size_n and size_n + episode_bytes_n > FILE_MB * 2**20:
+            size_n, number = 0, number + 1
+        size_n += episode_bytes_n
+        numbers.append(number)
+    return numbers
+
+
+def _location(number: int) -> dict[str, int]:
+    return {"chunk_index": number // FILES_PER_CHUNK_N, "file_index": number % FILES_PER_CHUNK_N}
+
+
+def statistics(values: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"]) -> dict[str, list[float] | list[int]]:
+    """Return LeRobot's statistics of each component of a feature: over its known values, or NaN if there are none."""
+    known, count = np.isfinite(values), {"count": [len(values)]}
+    if known.all():
+        return count | {key: value.tolist() for key, value in _statistics(values).items()}
+    parts = [_statistics(column[mask, None]) for column, mask in zip(values.T, known.T, strict=True)]
+    return count | {key: np.concatenate([part[key] for part in parts]).tolist() for key in parts[0]}
+
+
+def _statistics(
+    known: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"],
+) -> dict[str, Float[np.ndarray, " n"] | Int[np.ndarray, " n"]]:
+    if not len(known):
+        return {key: np.full(known.shape[1], np.nan) for key in ("min", "max", "mean", "std", *QUANTILES)}
+    exact = known.astype(float)
+    quantiles = np.quantile(exact, list(QUANTILES.values()), axis=0)
+    moments = {"min": known.min(axis=0), "max": known.max(axis=0), "mean": exact.mean(axis=0), "std": exact.std(axis=0)}
+    return moments | dict(zip(QUANTILES, quantiles, strict=True))
+
+
+def _task_table(task: str) -> pa.Table:
+    """Return the table of tasks as pandas writes it: the task is the index of the data frame, not a column."""
+    index = "__index_level_0__"
+    kinds = {"task_index": ("int64", "int64"), index: ("unicode", "object")}
+    described = [
+        {
+            "name": None if name == index else name,
+            "field_name": name,
+            "pandas_type": kind,
+            "numpy_type": dtype,
+            "metadata": None,
+        }
+        for name, (kind, dtype) in kinds.items()
+    ]
+    metadata = {"index_columns": [index], "column_indexes": [], "columns": described}
+    table = pa.table({"task_index": pa.array([0], pa.int64()), index: [task]})
+    return table.replace_schema_metadata({"pandas": json.dumps(metadata)})

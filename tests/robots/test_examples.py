@@ -1,0 +1,97 @@
+"""Tests that the commands and examples in docs/robots.md run, with fakes of LeRobot and of the board."""
+
+import json
+import re
+import shlex
+import shutil
+import sys
+from copy import copy
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+import reskin
+from reskin import cli
+from reskin.robots import ros2, sensor
+from tests.stages.checkout import ROOT
+from tests.test_predicting import write_stream
+from tests.universal.test_export import coarse, quiet
+
+PAGE = (ROOT / "docs/robots.md").read_text(encoding="utf-8")
+EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGE, re.DOTALL))
+COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines()]
+
+
+def command(beginning: str) -> list[str]:
+    (line,) = (line for line in COMMANDS if line.startswith(beginning))
+    return shlex.split(line)
+
+
+def test_export_command(tmp_path, monkeypatch, capsys):
+    captures = tmp_path / "captures"
+    captures.mkdir()
+    write_stream(captures, "binary")
+    shutil.copytree(captures / "run1", captures / "run2")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", command("reskin export"))
+    with pytest.raises(SystemExit) as done:
+        cli.main()
+    assert not done.value.code
+    assert "wrote datasets/poking: episodes_n 2, frames_n 120, fps 30" in capsys.readouterr().out
+    assert "press the button" in str((tmp_path / "datasets/poking/meta/tasks.parquet").read_bytes())
+    features = json.loads((tmp_path / "datasets/poking/meta/info.json").read_text())["features"]
+    assert all(f"`{name}`" in PAGE for name in features if "." in name)
+
+
+def test_lerobot_example(monkeypatch):
+    frames, calls = [], []
+
+    class FakeSensor(sensor.SkinSensor):
+        observation_features = dict.fromkeys(["Bx0_uT", *sensor.ESTIMATE], float)
+
+        def connect(self) -> None:
+            calls.append(self.config.port)
+
+        def disconnect(self) -> None: ...
+
+        def async_read(self) -> dict[str, float]:
+            return {name: float(i) for i, name in enumerate(self.observation_features)}
+
+    class Dataset:
+        @staticmethod
+        def create(_name: str, *, fps: int, features: dict) -> SimpleNamespace:
+            assert features["observation.skin"]["shape"] == (len(features["observation.skin"]["names"]),)
+            steps = {name: lambda name=name: calls.append(name) for name in ("save_episode", "finalize")}
+            return SimpleNamespace(add_frame=frames.append, **steps)
+
+    contents = {"lerobot": {}, "lerobot.datasets": {}, "lerobot.datasets.lerobot_dataset": {"LeRobotDataset": Dataset}}
+    for name, content in contents.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(sensor, "SkinSensor", FakeSensor)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    exec(EXAMPLES["lerobot"], {})
+    assert calls == ["/dev/ttyACM0", "save_episode", "finalize"]
+    assert len(frames) == 300
+    np.testing.assert_array_equal(frames[0]["observation.skin"], np.arange(8))
+
+
+def test_ros_2_command_has_parameters_of_the_node():
+    given = [word.partition(":=")[0] for word in command("python -m reskin.robots.ros2") if ":=" in word]
+    assert given
+    assert set(given) <= set(ros2.PARAMETERS)
+
+
+def test_onnx_examples(tmp_path, monkeypatch):
+    pytest.importorskip("onnx", reason="extra `onnx` is not installed")
+    pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(reskin, "load_universal", lambda file: copy(coarse("unlabelled")))
+    variables = {"noload_uT": quiet(), "b_uT": quiet()[:3]}
+    exec(EXAMPLES["export"], variables)
+    exec(EXAMPLES["onnx"], variables)
+    assert variables["place_mm"].shape == (3, 2)
+    assert not variables["contact"].any()
+    assert (tmp_path / "skin.h").is_file()
