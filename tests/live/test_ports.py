@@ -47,7 +47,9 @@ def test_other_devices_are_not_boards():
 @given(st.binary(max_size=3000), st.integers(1, 700))
 def test_arbitrary_bytes_are_described_without_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
-    assert str(find.recognise("port", chunks)).startswith("port: ")
+    found = find.recognise("port", chunks)
+    assert str(found).startswith("port: ")
+    assert found.describe_rate().startswith("port: ")
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
@@ -56,7 +58,9 @@ def test_frames_of_random_values_are_described(seed, chips_n):
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
     data = b"".join(row.tobytes() + b"\r\n" for row in values)
-    assert str(find.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
+    found = find.recognise("port", [(data, 0.0), (data, 1.0)])
+    assert str(found).startswith("port: ")
+    assert found.describe_rate().startswith("port: ")
 
 
 def test_chips_without_noise_have_no_lsb():
