@@ -197,7 +197,7 @@ class Session:
         self._error = ""
         self._presses: Presses | None = None
         self._adapted = ""
-        self._recording: tuple[Path, Header] | None = None
+        self._recording: tuple[Path, Header, CaptureWriter] | None = None
         self._recorded = ""
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
@@ -318,17 +318,18 @@ class Session:
             part, header = begin_capture(
                 folder, NO_INFO, wire=detected.wire, chips_n=detected.chips_n, by="reskin live"
             )
-            self.skin.reader.write_to(CaptureWriter(part, detected.wire))
-            self._recording, self._recorded = (folder, header), ""
+            writer = CaptureWriter(part, detected.wire, detected.chips_n)
+            self.skin.reader.write_to(writer)
+            self._recording, self._recorded = (folder, header, writer), ""
         except (OSError, ReskinError) as error:
             self._recorded = str(error)
 
     def _end_recording(self) -> None:
         if self._recording is not None:
-            (folder, header), self._recording = self._recording, None
+            (folder, header, writer), self._recording = self._recording, None
             self.skin.reader.write_to(None)
             try:
-                end_capture(folder, header)
+                end_capture(folder, header, writer.rate())
                 self._recorded = f"recorded {folder}"
             except OSError as error:
                 self._recorded = f"cannot close {folder}.part: {error.strerror}"
