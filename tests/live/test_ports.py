@@ -69,9 +69,12 @@ def test_chips_without_noise_have_no_lsb():
     assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
 
 
-def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
+def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
+        found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
+    with monkeypatch.context() as listened:  # to all ports once, because listening takes 1.5 s
+        listened.setattr(find, "detect_board", lambda port, _: found[port])
         assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
             find.find_board([name, other])
