@@ -25,6 +25,7 @@ class Experiment(Strict):
         drawn for the experiment.
     settings: whether the scene's file must have a section of settings for the experiment, named after the stage.
     recorded: whether scenes with recorded captures may run the experiment.
+    without_contact: whether the experiment reads recordings in which nothing touches the skin.
     alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
     """
 
@@ -37,6 +38,7 @@ class Experiment(Strict):
     folds: tuple[str, ...] | None = None
     settings: bool = False
     recorded: bool = False
+    without_contact: bool = False
     alone: bool = False
 
 

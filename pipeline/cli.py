@@ -77,6 +77,9 @@ def add(
     force_axis: Annotated[
         Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
     ] = None,
+    pad: Annotated[
+        int | None, Option(help="Layout leaphand: number of the pad, counted from 1. Add each pad separately.", min=1)
+    ] = None,
     allow_copy: Annotated[
         bool,
         Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
@@ -94,7 +97,7 @@ def add(
         {
             "--probe": (probe, native), "--mark": (mark, native), "--chips": (chips_n, serial),
             "--rate-hz": (rate_hz, serial), "--wire": (wire, serial), "--rows-late": (rows_late, {"ini"}),
-            "--force-axis": (force_axis, {"eflesh"}),
+            "--force-axis": (force_axis, {"eflesh"}), "--pad": (pad, {"leaphand"}),
         },
     )  # fmt: skip
     names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
@@ -110,7 +113,8 @@ def add(
             prepared = preparing.dump(recording, names, dump_options)
         else:
             options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
-            options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
+            options |= {"rows_late": str(rows_late)} if rows_late is not None else {}
+            options |= {"pad": str(pad)} if pad is not None else {}
             prepared = preparing.foreign(recording, layout, names, options)
         header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); next: dvc repro report@{scene}")
@@ -131,19 +135,20 @@ def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) 
 
 @app.command(rich_help_panel=RECORDINGS)
 def fetch(
-    source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7. Default: list these sources.")] = None,
+    source: Annotated[str | None, Argument(help="lab, ini, eflesh, eflash7 or leaphand. Default: list them.")] = None,
     origin: Annotated[
         str | None, Option("--from", help="Take the files from this git mirror or folder instead of their home.")
     ] = None,
+    scene: Annotated[str | None, Option(help="Add the recordings to this scene. Default: the source's scene.")] = None,
     yes: Annotated[bool, Option("--yes", help="Do not ask before using data that has no licence.")] = False,
 ) -> None:
-    """Fetch public recordings, verify them, and add them to their scene."""
+    """Fetch public recordings, verify them, and add them to a scene."""
     from pipeline.manage import fetch as fetching
 
     def agree(question: str) -> bool:
         return yes or (sys.stdin.isatty() and typer.confirm(question))
 
-    fetching.fetch(ROOT, source, origin, agree=agree, say=typer.echo)
+    fetching.fetch(ROOT, source, origin, scene, agree=agree, say=typer.echo)
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -195,6 +200,31 @@ def compare(
 
     names = [scene] if scene else checked_plan().scenes
     sys.exit(max((compare_scene(ROOT, name, against, typer.echo) for name in names), default=0))
+
+
+@app.command(rich_help_panel=PIPELINE)
+def score(
+    predictions: Annotated[Path, Argument(help="A .csv or .parquet file in the format of docs/benchmark.md.")],
+    enter: Annotated[
+        bool, Option("--enter", help="Write the scores to benchmark/entries, as an entry; needs the next four options.")
+    ] = False,
+    method: Annotated[str | None, Option(help="Name of your method.")] = None,
+    by: Annotated[str | None, Option(help="Names of the authors.")] = None,
+    trained_on: Annotated[str | None, Option(help="What your method learned from, such as: labels.")] = None,
+    code: Annotated[str | None, Option(help="Where your code or paper is, such as a URL.")] = None,
+    data: Annotated[
+        Path | None, Option(help="Folder of the recordings. Default: the one to which `reskin fetch` writes them.")
+    ] = None,
+) -> None:
+    """Check a file of predictions for the benchmark; print its scores and write them as JSON beside the file."""
+    from pipeline.benchmark.entries import score_and_write
+    from pipeline.benchmark.scoring import table_of
+    from pipeline.report.formatting import to_markdown
+
+    about = {"method": method, "by": by, "trained_on": trained_on, "code": code}
+    entry, written = score_and_write(predictions, about, data, enter=enter)
+    typer.echo(to_markdown(table_of([entry])))
+    typer.echo(f"dataset {entry.dataset} ({entry.version}), {entry.source}; wrote {written}")
 
 
 @app.command(rich_help_panel=PIPELINE)

@@ -5,9 +5,14 @@
 `record`, `lifted`, `touch`            record a board, with labels from a robot's program
 `load_universal`                       the universal model, which can be calibrated to any skin
 `load_model`, `Model`                  a trained network
+`load_recording`                       a recording of any kind, as a pandas DataFrame with units
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
+`simulate_recording`                   a recording of a simulated board, like that of `record`
+`ContactRegressor`                     the paper's network, with scikit-learn's fit and predict
+`UniversalRegressor`                   the same for the universal model: `fit` calibrates it to a skin
+`SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
 =====================================  ==========================================================
 
     >>> import reskin
@@ -19,8 +24,10 @@
 The modules behind these names are imported at the first use of a name, so that `import reskin` is quick.
 """
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from reskin.errors import missing_package
 from reskin.numerics import pin
 
 pin()  # must run before NumPy is imported
@@ -33,13 +40,18 @@ if TYPE_CHECKING:
         draw_skin,
         lifted,
         load_model,
+        load_recording,
         load_rows,
         load_universal,
         open,
         record,
         simulate_pokes,
+        simulate_recording,
         touch,
     )
+    from reskin.estimators import SCORERS as SCORERS
+    from reskin.estimators import ContactRegressor as ContactRegressor
+    from reskin.estimators import UniversalRegressor as UniversalRegressor
 
 __all__ = [
     "Model",
@@ -48,16 +60,26 @@ __all__ = [
     "draw_skin",
     "lifted",
     "load_model",
+    "load_recording",
     "load_rows",
     "load_universal",
     "open",
     "record",
     "simulate_pokes",
+    "simulate_recording",
     "touch",
 ]
+# Names that need scikit-learn. They are not in `__all__`, so that `from reskin import *` works without it.
+_ESTIMATORS = ("SCORERS", "ContactRegressor", "UniversalRegressor")
 
 
 def __getattr__(name: str) -> Any:
+    if name in _ESTIMATORS:
+        if find_spec("sklearn") is None:
+            raise missing_package("scikit-learn", f"reskin.{name}", extra="learn")
+        from reskin import estimators
+
+        return getattr(estimators, name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from reskin import api
@@ -66,4 +88,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *(_ESTIMATORS if find_spec("sklearn") else ())})

@@ -8,6 +8,7 @@ its dependencies when it is called, so that `import reskin` is quick.
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,6 +23,8 @@ from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from reskin.data.rows import Rows
     from reskin.live.tracker import LiveSkin, LiveSkins
     from reskin.models.trained import Network
@@ -223,6 +226,63 @@ def simulate_pokes(
     return Pokes(noload_uT, b_uT, response.force_N[:, 0, 2])
 
 
+def simulate_recording(
+    folder: Path | str,
+    *,
+    skin: str = "b0_s0",
+    board: str = "b0",
+    depths_mm: Sequence[float] = (0.4, 0.8, 1.2),
+    passes_n: int = 1,
+    seed: int = 0,
+) -> Path:
+    """Simulate a labelled recording of a board, and write it to a folder like `reskin record`.
+
+    A robot presses the skin at the 65 places of the paper's grid. The header says that the capture is simulated.
+
+    Parameters
+    ----------
+    folder : path
+        Folder to create for the capture.
+    skin, board, seed : str, str, int
+        The same names and seed give the same skin (`draw_skin`), board (`draw_board`) and noise.
+    depths_mm : sequence of float
+        Depths of the indentations: all places are pressed at the first depth, then at the next one.
+    passes_n : int
+        Number of repetitions.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    ReskinError
+        If the folder exists, a name is not allowed, or a setting is out of range.
+
+    Examples
+    --------
+    >>> folder = reskin.simulate_recording("captures/run1", depths_mm=[1.0])  # doctest: +SKIP
+    """
+    from reskin.recordings import header as headers
+    from reskin.simulation.capture import simulate_capture, to_files
+    from reskin.simulation.defaults import SHARED
+    from reskin.simulation.settings import MAIN, parse_simulation
+
+    target, where = Path(folder), "simulate_recording"
+    if target.exists():
+        raise ParamsError(f"{where}: {target} exists. Choose another folder.")
+    for what, name in (("folder", target.name), ("skin", skin), ("board", board)):
+        if not re.fullmatch(headers.NAME, name):
+            raise ParamsError(where, what, "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another name.")
+    presses = nominal("protocols")[MAIN] | {"depths_mm": list(depths_mm), "passes_n": passes_n}
+    section = {"boards": nominal("boards"), "protocols": {MAIN: presses}}
+    simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, where)
+    header, files = to_files(simulate_capture(simulation, MAIN, board=board, skin=skin, seed=seed), simulation)
+    headers.write_capture(target, header.model_copy(update={"capture": target.name}), files)
+    return target
+
+
 class Model:
     """A trained network, as `load_model` returns it.
 
@@ -337,7 +397,11 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(
-    calibration: Path | str | None = None, *, file: Path | str | None = None, external_uT: float = 0.0
+    calibration: Path | str | None = None,
+    *,
+    file: Path | str | None = None,
+    external_uT: float = 0.0,
+    new_day: bool = False,
 ) -> Universal:
     """Load the universal model for the paper's board, or one for another board. It needs no data from your skin.
 
@@ -355,6 +419,9 @@ def load_universal(
     external_uT : float
         For a board that a robot moves: standard deviation in uT of each component of the external field's change since
         the no-load reading, about 30 for the earth's field. Default: 0, no external field.
+    new_day : bool
+        Whether the skin may slide under presses in another way than when the calibration was saved, as after a day or
+        two. A few further presses then tell whether it does (`slide`). Default: False, it slides in the same way.
 
     Returns
     -------
@@ -363,8 +430,8 @@ def load_universal(
     Raises
     ------
     ReskinError
-        If a file is missing or is not a calibration or a model, the calibration is for another board, or `external_uT`
-        is out of range.
+        If a file is missing or is not a calibration or a model, the calibration is for another board, `external_uT` is
+        out of range, or `new_day` is set without a calibration.
 
     Examples
     --------
@@ -376,7 +443,57 @@ def load_universal(
     from reskin.universal.model import FILE
     from reskin.universal.model import load_universal as load
 
-    return load(calibration, file=FILE if file is None else file, external_uT=external_uT)
+    return load(calibration, file=FILE if file is None else file, external_uT=external_uT, new_day=new_day)
+
+
+def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 400.0) -> pd.DataFrame:
+    """Load a recording as a pandas DataFrame. Requires the package pandas (`pip install '.[learn]'`).
+
+    Parameters
+    ----------
+    path : path
+        One of these recordings, which are told apart by their content:
+
+        - a capture's folder, as `reskin record` and `reskin add` write it
+        - the log of an SD card
+        - a file that `reskin decode` wrote
+        - a table with labels (CSV or Parquet, layout `table` in data/README.md)
+        - an ingested capture, `data/indentations/SCENE/CAPTURE.parquet`
+    frames : bool
+        Whether to load all frames of a capture that has labels, instead of its labelled readings.
+    rate_hz : float
+        Frames per second, only for a decoded file without a clock.
+
+    Returns
+    -------
+    DataFrame
+        Column names end in units; `frame.attrs["units"]` maps each column to its unit ("1" for counts, "" for text).
+        `frame.attrs["counts"]` tells how many frames and rows were read, and how many were dropped for which reason.
+
+        If the recording has labels, there is one row per reading in contact, as in an ingested capture: the columns of
+        data/README.md (`board`, `x_mm`, `Fz_N`, ...), with one column per channel for the field (`bx0_uT`, `by0_uT`,
+        ...), the no-load reading (`noload_bx0_uT`, ...) and their difference (`dbx0_uT`, ...).
+
+        Otherwise, or with `frames`, there is one row per frame: time `t_s`, field `bx0_uT`, ..., and temperature
+        `temperature0_degC`, ...; for a capture's folder also its names (`capture`, `board`, `skin`, `source`).
+
+        Faulty readings are dropped as in `params.yaml: faults`.
+
+    Raises
+    ------
+    ReskinError
+        If the path does not exist, is none of these recordings, or the recording is damaged; or if pandas is missing.
+
+    Examples
+    --------
+    >>> frame = reskin.load_recording("captures/run1")  # doctest: +SKIP
+    >>> frame.attrs["units"]["Fz_N"]  # doctest: +SKIP
+    'N'
+    >>> X, y = frame.filter(like="db"), frame[["x_mm", "y_mm", "Fz_N"]]  # doctest: +SKIP
+    """
+    from reskin.recordings import loading
+
+    return loading.load_recording(Path(path), frames=frames, rate_hz=rate_hz)
 
 
 @overload

@@ -20,7 +20,7 @@ from typer import Argument, Option
 from reskin.errors import ParamsError, ReskinError, explaining
 
 CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
-    "add", "check-cache", "compare", "fetch", "merge", "model", "publish", "readme", "remove", "scenes",
+    "add", "check-cache", "compare", "fetch", "merge", "model", "publish", "readme", "remove", "scenes", "score",
     "verify-reports",
 )  # fmt: skip
 
@@ -62,6 +62,7 @@ MODEL = (
     "two. Default: the universal model for the paper's board."
 )
 EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
+NEW_DAY = "The calibration is of an earlier day, so the skin may slide in another way (docs/live.md)."
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -195,19 +196,23 @@ def emulate(
     speed: Annotated[float, Option(help="Speed relative to the source; inf: as fast as possible.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
+    true_places: Annotated[
+        bool, Option("--true-places", help="Print the true place and force of each touch of a simulation.")
+    ] = False,
 ) -> None:
     """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""
-    from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
+    from reskin.live.emulator import TouchPrinter, inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
     script = read_script(source)
     for spec in faults:
         script = inject(script, spec)
+    on_sent = TouchPrinter(script, source, typer.echo) if true_places else lambda piece_i: None
     emulated, stop = make_port(port), threading.Event()
     typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C: stop")
     started_s = time.monotonic()
     try:
-        sent_n = play(script, emulated, stop, speed=speed, loop=loop)
+        sent_n = play(script, emulated, stop, speed=speed, loop=loop, on_sent=on_sent)
         typer.echo(f"sent {sent_n} bytes in {time.monotonic() - started_s:.1f} s")
     except KeyboardInterrupt:
         typer.echo("stopped")
@@ -229,6 +234,10 @@ def live(
     http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
+    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
+    skins: Annotated[Path, Option(help="Folder in which the page saves what it has learnt about skins.")] = Path(
+        "skins"
+    ),
 ) -> None:
     """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
@@ -238,21 +247,28 @@ def live(
     from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
     from reskin.live.session import open_sessions
+    from reskin.live.skins import SkinFolder
     from reskin.predicting import read_models
     from reskin.recordings.fault_policy import override
+    from reskin.recordings.recorder import CAPTURES
 
     fault_policy = override(LIVE_POLICY, on_fault or (), "--on-fault")
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
-    models = read_models(model or (), external_uT)
+    models, skin_folder = read_models(model or (), external_uT, new_day=new_day), SkinFolder(skins)
     with ExitStack() as stack:
-        description = "a board"
+        description, emulated = "a board", None
         if source := replay or emulate:
             script = read_script(source)
-            port, description = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        sessions = open_sessions(port or [found.port for found in find_boards()], models, description, fault_policy)
-        serve(sessions, host=host, http_port=http_port, say=typer.echo)
+            emulated = stack.enter_context(playing(script))
+            port, description = [emulated.port], f"{script.source}: {source}, played"
+        sessions = open_sessions(
+            port or [found.port for found in find_boards()], models, description, fault_policy, skins=skin_folder,
+            model_name=", ".join(file.name for file in model or ()), emulated=emulated,
+        )  # fmt: skip
+        where = f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}"
+        serve(sessions, host=host, http_port=http_port, say=typer.echo, where=where)
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -280,12 +296,13 @@ def predict(
         float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
     ] = 400.0,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
+    new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
 ) -> None:
     """Estimate contacts, places and forces from a log that begins with at least 0.5 s without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
-    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT)
+    counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT, new_day=new_day)
     numbers = {key: count for key, count in counts.items() if not isinstance(count, list)}
     typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in numbers.items()))
     for sentence in warnings(counts):

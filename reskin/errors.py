@@ -126,7 +126,12 @@ def require(package: str, where: object) -> None:
         raise missing_package(package, where)
 
 
-def missing_package(package: str, where: object) -> ParamsError:
-    """Create the error for a missing package, with the command that installs the package."""
-    extra = EXTRAS.get(package, "pipeline")
-    return ParamsError(f"{where}: the Python package `{package}` is not installed. In the checkout: pip install '.[{extra}]'")
+def missing_package(package: str, where: object, *, extra: str | None = None) -> ParamsError:
+    """Create the error for a missing package, with the command that installs the package.
+
+    extra: the smallest extra with all that `where` needs; by default, the one in `EXTRAS`.
+    """
+    extra = extra or EXTRAS.get(package, "pipeline")
+    return ParamsError(
+        f"{where}: the Python package `{package}` is not installed. In the checkout: pip install '.[{extra}]'"
+    )

@@ -216,6 +216,13 @@ def read_table(path: Path) -> pa.Table:
         return file.read()
 
 
+def read_column_names(path: Path) -> list[str]:
+    """Read the names of a table's columns, without its rows."""
+    with _parquet(path) as file:
+        names: list[str] = file.schema_arrow.names
+    return names
+
+
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
     """Write the readings of one capture block by block, then `counts`. Iterating over `blocks` may update `counts`."""
     with replacing(path) as temporary:

@@ -38,6 +38,29 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
     return numbers
 
 
+def median_error_mm(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"]) -> float:
+    """Return the median distance between predicted and true places."""
+    return float(np.median(np.linalg.norm(predicted_mm - true_mm, axis=1)))
+
+
+def coverage_pct(
+    true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
+) -> float:
+    """Return the percentage of true values that are inside their intervals."""
+    return 100 * float(((low <= true) & (true <= high)).mean())
+
+
+def interval_score(
+    true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
+) -> float:
+    """Return the mean interval score of 90 % intervals: width plus 20 times the distance of true values outside.
+
+    The score is smallest for intervals that are as narrow as their coverage allows (Gneiting & Raftery, JASA 2007).
+    """
+    outside = np.maximum(low - true, 0) + np.maximum(true - high, 0)
+    return float((high - low + 2 / 0.1 * outside).mean())
+
+
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift all predicted places by one constant offset that makes the mean error of x and of y zero.
 

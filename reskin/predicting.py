@@ -12,24 +12,25 @@ import pyarrow as pa
 from jaxtyping import Float32
 
 from reskin import io
-from reskin.board.stream import decode_all
-from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.errors import ParamsError, SchemaError
 from reskin.logs import Estimator, LogEstimates, describe, estimate, quiet_start
 from reskin.models.trained import SUFFIX, Network, read_network
 from reskin.recordings import tables
-from reskin.recordings.decode import read_frames
-from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
-from reskin.recordings.ingest import read_header, timer
-from reskin.recordings.readers import sd_card
+from reskin.recordings.loading import read_any_log
 from reskin.universal.calibration import is_calibration
 from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
 FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the model's force range is "at the limit"
-PARQUET_MAGIC = b"PAR1"
 
 
 def predict(
-    log: Path, model: Path | Sequence[Path] | None, out: Path, *, rate_hz: float = 400.0, external_uT: float = 0.0
+    log: Path,
+    model: Path | Sequence[Path] | None,
+    out: Path,
+    *,
+    rate_hz: float = 400.0,
+    external_uT: float = 0.0,
+    new_day: bool = False,
 ) -> dict[str, Any]:
     """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
@@ -40,6 +41,7 @@ def predict(
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
     external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
+    new_day : whether the calibration is of an earlier day (see `load_universal`)
 
     Returns
     -------
@@ -48,7 +50,7 @@ def predict(
     the skin is turned by a quarter, and the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
-    models = read_models(files, external_uT)
+    models = read_models(files, external_uT, new_day=new_day)
     if len(files) > 1 and not isinstance(models, Universal):
         raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
@@ -116,47 +118,19 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
-    """Read the frames of a capture's folder, of a table that `reskin decode` wrote, or of an SD card's log."""
-    if log.is_dir():
-        return _read_capture(log)
-    if not 0 < rate_hz <= RATE_MAX_HZ:
-        raise ParamsError(f"--rate-hz: {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
-    if log.is_file():
-        with log.open("rb") as stream:
-            is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-        if is_parquet:
-            return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
-    return sd_card.read_log(log)
-
-
-def _read_capture(folder: Path) -> sd_card.Log:
-    """Read the frames of a capture; drop frames after the last recorded arrival time, because they have no time."""
-    header = read_header(folder)
-    if header.layout == "sd-card":
-        return sd_card.read_log(folder / LOG_FILE)
-    if header.wire is None:
-        raise CaptureError(
-            f"{folder}: cannot predict from a capture of layout {header.layout}. Use a capture that `reskin record` "
-            "wrote, or the log of an SD card."
-        )
-    stream = folder / STREAM_FILE
-    frames, decoded = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
-    t_s = timer(folder, header)(frames, 0)
-    timed = np.isfinite(t_s)
-    kept = frames.where(timed)
-    *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
-    return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
-
-
-def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Network] | Universal:
+def read_models(
+    files: Sequence[Path], external_uT: float = 0.0, *, new_day: bool = False
+) -> Sequence[Network] | Universal:
     """Read trained networks, or one universal model, one calibration of it, or both.
 
     Without a universal model, a calibration is for the shipped one; without any file, the model is the shipped one.
-    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0.
+    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0. `new_day` is
+    an option for a calibration.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
+    if new_day and not calibrations:
+        raise ParamsError("--new-day: there is no calibration of an earlier day. Pass one with --model.")
     if not (made or calibrations):
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
@@ -168,7 +142,7 @@ def read_models(files: Sequence[Path], external_uT: float = 0.0) -> Sequence[Net
         remedy = "Use it alone, or a universal model with one calibration."
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
     calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
-    return load_universal(calibration, file=model, external_uT=external_uT)
+    return load_universal(calibration, file=model, external_uT=external_uT, new_day=new_day)
 
 
 def _is_calibration(file: Path) -> bool:

@@ -58,12 +58,15 @@ class Readings:
 
 
 LABELS = ("capture", "board", "skin", "source")
-# Column -> unit, for numeric columns: the suffix of the column's name if it is a unit, or else "1" (no unit).
-UNITS = {
-    field.name: suffix if (suffix := field.name.rpartition("_")[2]) in ("mm", "N", "uT", "degC", "s") else "1"
-    for field in fields(Readings)
-    if field.name not in LABELS
-}
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a numeric column: the suffix of its name if it is a unit, or else "1" (no unit)."""
+    suffix = column.rpartition("_")[2]
+    return suffix if suffix in ("mm", "N", "uT", "degC", "s") else "1"
+
+
+UNITS = {field.name: unit_of(field.name) for field in fields(Readings) if field.name not in LABELS}  # column -> unit
 _INTEGERS = ("indentation", "pass_i", "reading_i", "n_contacts")
 _PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperature_degC": 1}
 

@@ -21,11 +21,13 @@ from reskin.recordings.header import Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
 from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
-from reskin.recordings.readers import table
+from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
 from tests.board.signals import make_frames
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import PRESSES, row, write
+from tests.recordings.readers.test_leaphand import numbers
+from tests.recordings.readers.test_leaphand import write as write_leaphand
 from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout, run
 from tests.universal.skins import fields_uT
@@ -210,7 +212,7 @@ def test_broken_recording_leaves_no_files(root, tmp_path, content):
 
 def test_missing_recording_is_an_error(root, tmp_path):
     missing = "none: file not found"
-    for layout in ("lab", "ini", "eflesh", "eflash7"):
+    for layout in ("lab", "ini", "eflesh", "eflash7", "leaphand"):
         assert_refused(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
     assert_refused(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
 
@@ -236,7 +238,7 @@ def test_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
 
 
 def test_recording_in_a_wrong_layout_is_an_error(root, lab_file):
-    for layout in ("ini", "eflesh", "eflash7"):
+    for layout in ("ini", "eflesh", "eflash7", "leaphand"):
         assert_refused(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
     assert_refused(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
 
@@ -412,6 +414,13 @@ def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root, lab_file, m
     again = output_of([*arguments, "small", "--name", "again"])
     assert "scene mine exists already" in again
     assert (root / SCENES / "mine.yaml").read_text() == text
+
+
+def test_recording_without_contact_needs_an_experiment_that_reads_it(root, tmp_path):
+    write_leaphand(tmp_path, numbers(30))
+    prepared = preparing.foreign(tmp_path / leaphand.READINGS, "leaphand", labels(), {"pad": "1"})
+    message = "nothing touches the skin in this recording, and no experiment of scene small uses such recordings"
+    assert_refused(root, lambda: add.add(root, "small", prepared, allow_copy=False), message)
 
 
 def test_scene_with_too_little_data_is_an_error(root, lab_file):

@@ -26,16 +26,28 @@ ROOT = Path(__file__).resolve().parents[1]
 QUIET_CHIP = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
 
 
-@pytest.mark.parametrize("name", ["reskin", "reskin.api", "reskin.errors", "reskin.live.emulator"])
+@pytest.mark.parametrize("name", ["reskin", "reskin.api", "reskin.errors", "reskin.estimators", "reskin.live.emulator"])
 def test_examples_in_docstrings_run(name):
     done = doctest.testmod(importlib.import_module(name), extraglobs={"reskin": reskin})
     assert (done.failed, done.attempted > 0) == (0, True)
 
 
 def test_import_is_cheap():
-    code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
+    modules = ("torch", "scipy", "pandas", "sklearn", "mlflow")
+    code = f"import sys, reskin; print([name for name in {modules} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_estimators_need_scikit_learn_but_the_library_does_not(monkeypatch):
+    assert {"ContactRegressor", "UniversalRegressor", "SCORERS"} < set(dir(reskin))
+    monkeypatch.setattr("reskin.find_spec", lambda name: None)
+    with pytest.raises(
+        ReskinError, match=r"reskin.SCORERS: the Python package `scikit-learn` is not installed.*'\.\[learn\]'"
+    ):
+        _ = reskin.SCORERS
+    assert "ContactRegressor" not in dir(reskin)
+    assert all(hasattr(reskin, name) for name in reskin.__all__)
 
 
 def test_load_rows_equals_the_pipeline(tmp_path):
@@ -130,3 +142,20 @@ def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
         reskin.load_model(model).predict(b_uT)
     with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):
         loaded.predict([1.0, 2.0])
+
+
+def test_simulated_recording_is_loaded_like_a_recorded_one(tmp_path):
+    folder = reskin.simulate_recording(tmp_path / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
+    frame = reskin.load_recording(folder)
+    assert [frame[name].unique().tolist() for name in ("capture", "board", "skin", "source")] == [
+        ["run1"], ["b1"], ["b1_s0"], ["simulated"],
+    ]  # fmt: skip
+    assert (frame["indentation"].nunique(), frame["depth_mm"].unique().tolist()) == (65, [1.0])
+    again = reskin.simulate_recording(tmp_path / "again" / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
+    assert reskin.load_recording(again).equals(frame)
+    with pytest.raises(ReskinError, match="run1 exists. Choose another folder"):
+        reskin.simulate_recording(folder)
+    for wrong in ({"depths_mm": [-1.0]}, {"passes_n": 0}, {"board": "a b"}):
+        with pytest.raises(ReskinError, match="simulate_recording"):
+            reskin.simulate_recording(tmp_path / "wrong", **wrong)
+    assert not (tmp_path / "wrong").exists()

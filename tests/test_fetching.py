@@ -21,7 +21,7 @@ from pipeline.scenes import read_plan
 from reskin.errors import ReskinError
 from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
-from reskin.recordings.readers import eflash7, eflesh, ini, lab
+from reskin.recordings.readers import eflash7, eflesh, ini, lab, leaphand
 from tests import repositories
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.recordings.readers.test_lab import PRESSES, write
@@ -82,9 +82,10 @@ def write_source(root: Path, source: dict[str, object]) -> None:
         YAML().dump({"rig": source}, stream)
 
 
-def fetch(root: Path, origin: str | Path | None = None, *, consent: bool = False) -> str:
+def fetch(root: Path, origin: str | Path | None = None, *, scene: str | None = None, consent: bool = False) -> str:
     output: list[str] = []
-    fetching.fetch(root, "rig", None if origin is None else str(origin), agree=lambda _: consent, say=output.append)
+    where = None if origin is None else str(origin)
+    fetching.fetch(root, "rig", where, scene, agree=lambda _: consent, say=output.append)
     return "\n".join(output)
 
 
@@ -169,6 +170,26 @@ def test_mirror_or_folder_replaces_the_home(root, example, tmp_path):
 def test_missing_commit_is_an_error(root, example):
     write_source(root, source_of(example.files, example.url, "1" * 40))
     assert_refused(root, f"the repository does not have commit {'1' * 40}, at which")
+
+
+@pytest.mark.usefixtures("without_adding")
+def test_files_can_be_pinned_at_different_commits(root, example, tmp_path):
+    first = repositories.commit(tmp_path / "home", {"data/board1.csv": example.files["board1.csv"]})
+    later = {"data/board1.csv": b"edited\n", "data/board2.csv": example.files["board2.csv"]}
+    second = repositories.commit(tmp_path / "home", later)
+    source = source_of(example.files, str(tmp_path / "home"), first)
+    source["files"][1]["commit"] = second
+    write_source(root, source)
+    assert f"commits {', '.join(sorted([first, second]))}" in fetch(root)
+    assert fetched_files(root) == example.files
+
+
+def test_recordings_can_be_added_to_another_scene(root):
+    with (root / SCENES / "other.yaml").open("w") as stream:
+        YAML().dump(recorded_scene(), stream)
+    fetch(root, scene="other")
+    assert list(read_registry(root).captures) == ["other"]
+    assert len(read_registry(root).captures["other"]) == 2
 
 
 def test_wrong_checksum_is_an_error(root, example):
@@ -300,8 +321,14 @@ def test_sources_have_recordings_and_a_known_scene_or_a_note(name):
 def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, tmp_path):
     folder = {"eflesh_forces": "eflesh"}.get(name, name)
     fetching.download(SOURCES[name], str(shared_data / folder), tmp_path / name)
-    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # numbers of rows, as in data/README.md
-    readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
+    counts = {
+        "lab": 7150,
+        "ini": 23300,
+        "eflesh": 4805,
+        "eflash7": 268,
+        "leaphand": 301,
+    }  # numbers of rows, as in data/README.md
+    readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7, "leaphand": leaphand}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)

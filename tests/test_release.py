@@ -94,7 +94,9 @@ def test_library_imports_only_required_packages():
 
 
 def test_missing_package_names_its_extra():
-    with pytest.raises(ParamsError, match=r"model.safetensors: the Python package `nowhere` is not installed.*\[pipeline\]"):
+    with pytest.raises(
+        ParamsError, match=r"model.safetensors: the Python package `nowhere` is not installed.*\[pipeline\]"
+    ):
         require("nowhere", "model.safetensors")
     with pytest.raises(ParamsError, match=r"package `torch` is not installed.*'\.\[train\]'"), explaining("reskin"):
         raise ModuleNotFoundError("", name="torch.nn")

@@ -68,7 +68,7 @@ def test_stages_with_a_section_are_those_with_scene_settings():
 
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
 def test_params_cover_the_settings_a_stage_reads(stage):
-    scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if scene_runs(one, stage))
+    scene = next(one for one in ("ci", "lab", "eflash7", "hand", "decide", "universal") if scene_runs(one, stage))
     settings = read_settings(scene, ROOT)
     scene_mapping, shared_mapping = RecordingMapping(settings.of_scene), RecordingMapping(settings.shared)
     Settings(scene, settings.where, scene_mapping, shared_mapping, settings.captures).section(MODELS[stage], stage)

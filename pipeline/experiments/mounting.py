@@ -29,12 +29,11 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic
 from pipeline.training.universal import draw_prior_skins, law_error
-from pipeline.training.universal_variants import KnownBoards
 from reskin.config import Strict
 from reskin.data.grid import CENTRE_MM
 from reskin.seeds import rng_for
 from reskin.universal.batches import NOMINAL_NAME, SkinPrior
-from reskin.universal.law import to_chips
+from reskin.universal.law import Setup, to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.model import MISFIT_MAX, Universal, load_universal
 from reskin.universal.mounting import frames
@@ -82,7 +81,7 @@ def mounting(settings: Settings, section: Mounting, indentations: Path, folds: P
     known = read_known_boards(settings, indentations, folds)
     recorded = {board: board_presses(known, board) for board in known.presses}
     boards = [skin_of_board(board) for board in recorded.values()]
-    skins = simulated_skins(known, section.skins_n, settings.seed)
+    skins = simulated_skins(known.setup, section.skins_n, settings.seed, "mounting")
     say(f"{settings.scene} mounting: {len(skins)} skins simulated")
     orientation = [
         {"source": source, "change": change} | orientations([skin.changed(change) for skin in group], settings.seed)
@@ -107,10 +106,13 @@ def skin_of_board(board: BoardPresses) -> Skin:
     return Skin(board.board, rest_uT, db_uT, presses.place_mm + CENTRE_MM, presses.force_N)
 
 
-def simulated_skins(known: KnownBoards, skins_n: int, seed: int) -> list[Skin]:
-    """Draw skins from the prior of the shipped model, with errors of the law as in its training."""
-    prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, known.setup)
-    drawn = draw_prior_skins(prior, skins_n, seed, "mounting", law_error())
+def simulated_skins(setup: Setup, skins_n: int, seed: int, name: str) -> list[Skin]:
+    """Draw skins from the prior of the shipped model, with errors of the law as in its training.
+
+    name: name of the random stream.
+    """
+    prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)
+    drawn = draw_prior_skins(prior, skins_n, seed, name, law_error())
     parts = zip(drawn.rest_uT, drawn.db_uT, drawn.place_mm, drawn.force_N, strict=True)
     return [
         Skin(

@@ -26,7 +26,7 @@ from pipeline.training.universal import FORCE_MIN_N, WAYS, coverage
 from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
 from reskin.config import Strict
 from reskin.errors import SchemaError
-from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.metrics import ACCURACY_LIMIT_MM, interval_score
 from reskin.seeds import rng_for
 from reskin.universal.calibration import (
     CalibrationData,
@@ -207,10 +207,7 @@ class CalibratedBoard:
         self, labels: LabelledPresses, tested: LabelledPresses, powers: LikelihoodPowers, presses_n: int
     ) -> dict[str, float]:
         """Calibrate to labels and score the tested readings, also with forces that are not calibrated."""
-        folds = list(self.calibration.held_out(labels))
-        power = lower_by_misfit(powers.power_for(presses_n, len(labels), even=False), self.misfit)
-        held_out = [([fold.evaluation.combined(power)], fold.labels.place_mm) for fold in folds]
-        power = lower_by_residuals(power, *variance_inflations(1, held_out))
+        folds, power = self._held_out(labels, powers, presses_n)
         model = self.calibration.with_labels(labels)
         line = line_of_labels(folds)
 
@@ -222,6 +219,23 @@ class CalibratedBoard:
         log_N, _ = line_of_combined(folds).apply(np.log(raw.force_N))
         scores = score_estimate(calibrated, tested)
         return scores | {"r2_line_f": r2(np.exp(log_N), tested.force_N), "r2_raw_f": r2(raw.force_N, tested.force_N)}
+
+    def estimate(
+        self, labels: LabelledPresses, db_uT: Float[np.ndarray, "t ch"], powers: LikelihoodPowers, presses_n: int
+    ) -> Estimate:
+        """Calibrate to labels and estimate places and forces of readings."""
+        folds, power = self._held_out(labels, powers, presses_n)
+        model = replace(self.calibration.with_labels(labels), line=line_of_labels(folds))
+        return model.estimate(db_uT, [power])[0]
+
+    def _held_out(
+        self, labels: LabelledPresses, powers: LikelihoodPowers, presses_n: int
+    ) -> tuple[list[HeldOutLabels], float]:
+        """Evaluate the labels by cross-validation; return the result and the likelihood power that follows from it."""
+        folds = list(self.calibration.held_out(labels))
+        power = lower_by_misfit(powers.power_for(presses_n, len(labels), even=False), self.misfit)
+        held_out = [([fold.evaluation.combined(power)], fold.labels.place_mm) for fold in folds]
+        return folds, lower_by_residuals(power, *variance_inflations(1, held_out))
 
 
 def line_of_combined(folds: Sequence[HeldOutLabels]) -> ForceLine:
@@ -235,8 +249,13 @@ def line_of_combined(folds: Sequence[HeldOutLabels]) -> ForceLine:
 def calibrate(model: PriorModel, board: BoardPresses, draw: Draw) -> CalibratedBoard:
     """Calibrate a variant to the no-load field and the unlabelled presses."""
     db_uT = board.presses.db_uT[draw.unlabelled]
-    calibration = model.calibrate(CalibrationData(board.rest_uT, db_uT, area_uT=db_uT))
-    return CalibratedBoard(calibration, float(np.median(calibration.skin.evaluator.evaluate(db_uT).misfit())))
+    return calibrate_board(model, CalibrationData(board.rest_uT, db_uT, area_uT=db_uT))
+
+
+def calibrate_board(model: PriorModel, data: CalibrationData) -> CalibratedBoard:
+    """Calibrate a variant to the data of a board, and compute the median misfit of its unlabelled presses."""
+    calibration = model.calibrate(data)
+    return CalibratedBoard(calibration, float(np.median(calibration.skin.evaluator.evaluate(data.presses_uT).misfit())))
 
 
 def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str, float]:
@@ -267,24 +286,16 @@ def place_scores(error_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
 
 def score_estimate(estimate: Estimate, tested: LabelledPresses) -> dict[str, float]:
     """Score estimates of tested readings, and coverage and score of their 90 % intervals."""
-    error_mm = estimate.place_mm - tested.place_mm
+    error_mm, half_width_mm = estimate.place_mm - tested.place_mm, NORMAL_90 * estimate.sd_mm
     error_log = np.log(estimate.force_N / tested.force_N)
     return place_scores(error_mm) | {
         "r2_f": r2(estimate.force_N, tested.force_N),
         "coverage_pct": 100 * coverage(estimate, tested.place_mm),
-        "interval_score_mm": interval_score(error_mm, NORMAL_90 * estimate.sd_mm),
+        "interval_score_mm": interval_score(error_mm, -half_width_mm, half_width_mm),
         "half_width_mm": NORMAL_90 * float(np.median(estimate.sd_mm)),
         "coverage_f_pct": 100 * float((np.abs(error_log) <= NORMAL_90 * estimate.sd_log_N).mean()),
         "half_width_f_factor": float(np.exp(NORMAL_90 * np.median(estimate.sd_log_N))),
     }
-
-
-def interval_score(error: Float[np.ndarray, "..."], half_width: Float[np.ndarray, "..."]) -> float:
-    """Return the mean interval score of 90 % intervals: width plus 20 times the distance of values outside.
-
-    The score is smallest for intervals that are as narrow as their coverage allows (Gneiting & Raftery, JASA 2007).
-    """
-    return float((2 * half_width + 2 / 0.1 * np.maximum(np.abs(error) - half_width, 0)).mean())
 
 
 def r2(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t"]) -> float:

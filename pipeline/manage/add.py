@@ -13,7 +13,7 @@ from typing import Any
 from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import require_idle
-from pipeline.scenes import Scene, read_plan, read_scene, read_shared
+from pipeline.scenes import EXPERIMENTS, Scene, read_plan, read_scene, read_shared
 from pipeline.stage import say
 from reskin import config, io
 from reskin.board.rates import REPEATED_MAX, RepeatCounter
@@ -49,7 +49,13 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     with io.restoring(root / REGISTRY, root / PLAN), _removing_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
+            fingerprints, touched = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
+        if not touched and not any(experiment.without_contact for experiment in settings.entries):
+            known = ", ".join(name for name, experiment in EXPERIMENTS.items() if experiment.without_contact)
+            raise ParamsError(
+                f"{header.capture}: nothing touches the skin in this recording, and no experiment of scene {scene} "
+                f"uses such recordings. Add it to a scene that runs {known}, such as scene hand."
+            )
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
@@ -83,15 +89,17 @@ def _check_free(target: Path, registered: bool) -> None:
         raise ParamsError(f"{target}: the folder exists already. {remedy}")
 
 
-def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a whole capture as stage ingest does; return its fingerprints: SHA-256 of the readings and of the stream.
+def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], bool]:
+    """Read a whole capture as stage ingest does; return its fingerprints, and whether anything touches the skin.
 
-    Copies of a recording with other names or in another layout have a fingerprint in common.
+    The fingerprints are the SHA-256 of the readings and of the stream. Copies of a recording with other names or in
+    another layout have a fingerprint in common. An unknown force (NaN) counts as a touch.
     """
     _, blocks, counts = open_capture(folder, policy)
-    rows_n, readings, repeats = 0, hashlib.sha256(), RepeatCounter(header.chips_n)
+    rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
     for block in blocks:
         rows_n += len(block)
+        touched |= bool((block.Fz_N != 0).any())
         readings.update(block.b_uT.tobytes())
         repeats.feed(block.b_uT)
     check_losses(counts, limit, folder.name)
@@ -105,7 +113,8 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
             f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Was the board, "
             "or the program that recorded it, faster than the chips? See reskin ports --rate. It was added anyway."
         )
-    return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+    stream = tuple(header.files[name] for name in (STREAM_FILE,) if name in header.files)
+    return (readings.hexdigest(), *stream), touched
 
 
 def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:

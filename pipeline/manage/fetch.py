@@ -34,6 +34,7 @@ FETCHED = "data/fetched"
 # Disk space must be free for this many copies of each file: as fetched, in data/raw, in DVC's cache, one in reserve.
 COPIES_N = 4
 USE_FROM = "--from takes a git mirror or a folder that contains the files."
+PART = "pad"  # option that selects one of several captures in the same files (layout leaphand)
 Say = Callable[[str], None]
 
 
@@ -44,13 +45,18 @@ def _check_relative(path: str) -> str:
 
 
 RelativePath = Annotated[str, AfterValidator(_check_relative)]
+Commit = Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")]
 
 
 class File(Strict):
-    """A file to fetch: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk."""
+    """A file to fetch: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk.
+
+    commit: the commit that has the file, if it is not the commit of the source.
+    """
 
     path: RelativePath
     at: str
+    commit: Commit | None = None
     bytes_n: Annotated[int, Field(gt=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -69,12 +75,23 @@ class Source(Strict):
     """A public set of recordings. If `scene` is None, they are fetched but not added, and `note` gives the reason."""
 
     home: str
-    commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
+    commit: Commit | None
     licence: str | None
     scene: str | None
     note: str | None
     files: Annotated[tuple[File, ...], Field(min_length=1)]
     recordings: tuple[Recording, ...]
+
+    def commit_of(self, file: File) -> str | None:
+        """Return the commit at which a file is pinned; None if no commit is pinned."""
+        return file.commit or self.commit
+
+    @property
+    def commits(self) -> str:
+        """The pinned commits, in words."""
+        pinned = sorted({commit for file in self.files if (commit := self.commit_of(file))})
+        unpinned = "newest commit (none is pinned; checksums are checked)"
+        return f"commit{'s' * (len(pinned) > 1)} {', '.join(pinned)}" if pinned else unpinned
 
     @property
     def size(self) -> str:
@@ -91,12 +108,15 @@ def read_sources(root: Path) -> Mapping[str, Source]:
     return {name: parse(Source, section, f"{where}: {name}") for name, section in read_yaml(where).items()}
 
 
-def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[str], bool], say: Say) -> None:
-    """Fetch a source and add its recordings to their scene; without a name, list the sources.
+def fetch(
+    root: Path, name: str | None, where: str | None, scene: str | None = None, *, agree: Callable[[str], bool], say: Say
+) -> None:
+    """Fetch a source and add its recordings to a scene; without a name, list the sources.
 
     Parameters
     ----------
     where : git repository or folder from which to take the files, instead of the source's home.
+    scene : scene to which the recordings are added; None: the scene of the source.
     agree : function that asks the user a yes-or-no question, here whether to use files without a licence.
     """
     sources = read_sources(root)
@@ -111,8 +131,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
     if all(_is_unchanged(folder / file.path, file) for file in source.files):
         say(f"{folder}: {source.size}, already present and unchanged")
     else:
-        commit = f"commit {source.commit}" if source.commit else "newest commit (none is pinned; checksums are checked)"
-        say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {commit}")
+        say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {source.commits}")
         if where is not None:
             say(f"taken from: {where}")
         if source.licence is None and not agree("These files have no licence. Fetch them, for use here only?"):
@@ -120,10 +139,11 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
             raise ParamsError(f"reskin fetch {name}: the use of files without a licence was not confirmed. {remedy}")
         download(source, where or source.home, folder)
         say(f"{folder}: {source.size}, all checksums match")
-    if source.scene is None:
+    scene = scene or source.scene
+    if scene is None or not source.recordings:
         return say(source.note or "no layout reads it, so nothing is added")
-    _add_all(root, source.scene, source, folder, say)
-    _say_what_runs(root, source.scene, running, say)
+    _add_all(root, scene, source, folder, say)
+    _say_what_runs(root, scene, running, say)
 
 
 def _is_unchanged(path: Path, file: File) -> bool:
@@ -140,11 +160,14 @@ def download(source: Source, where: str, folder: Path) -> None:
                 what = f"needs {needed_B / 1e6:.0f} MB of free disk space; {free_B / 1e6:.0f} MB are free"
                 raise CaptureError(f"{folder.parent.absolute()}: {what}. Free some disk space, and run it again.")
             with TemporaryDirectory(prefix=".git-", dir=folder.parent) as scratch:
-                origin = open_origin(where, source.commit, Path(scratch))
+                origins: dict[str | None, Origin] = {}
                 for file in source.files:
+                    commit = source.commit_of(file)
+                    if commit not in origins:
+                        origins[commit] = open_origin(where, commit, Path(scratch) / str(len(origins)))
                     target = temporary / file.path
                     target.parent.mkdir(parents=True, exist_ok=True)
-                    target.write_bytes(_read_checked(origin, file))
+                    target.write_bytes(_read_checked(origins[commit], file))
     except OSError as error:
         reason = f"{error.strerror or error} at {error.filename or folder}"
         raise CaptureError(
@@ -192,6 +215,8 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
 def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
     """Return the name of the scene's capture with the same files as a prepared recording; None if there is none.
 
+    If the files contain several captures, it is the same part of the files.
+
     A capture whose files are not on disk is compared by its name.
     """
     header, files = prepared
@@ -204,7 +229,7 @@ def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
         if not (raw / HEADER_FILE).is_file():
             if capture == header.capture:
                 return capture
-        elif read_header(raw).files == hashes:
+        elif (present := read_header(raw)).files == hashes and present.options.get(PART) == header.options.get(PART):
             return capture
     return None
 
@@ -243,7 +268,7 @@ class Origin:
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
-    """Open a folder, or a git repository at a commit (None: the newest); `scratch` is an empty folder for git."""
+    """Open a folder, or a git repository at a commit (None: the newest); git creates the folder `scratch`."""
     folder = Path(where)
     if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither an existing path nor a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")

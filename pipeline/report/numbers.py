@@ -433,6 +433,11 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         },
         "shear": _means(numbers["shear"], SHEAR_METRICS) if "shear" in numbers else {},
         "touches": _means(numbers.get("touches", {}).get("superposition", {}), TOUCHES_METRICS),
+        "moving_hand": {
+            f"{row['group']}, external_uT={row['external_uT']:g}": {"live_false_pct": row["live_false_pct"]}
+            for row in numbers.get("moving_hand", {}).get("contacts", ())
+            if row["method"] == "none"
+        },
     }
     return {name: part for name, part in parts.items() if part}
 

@@ -1,4 +1,4 @@
-"""Fill in the generated blocks of README.md and docs from the results in `reports/`."""
+"""Fill in the generated blocks of README.md and docs, and what the live page shows, from the results in `reports/`."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,6 +9,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import FLOW
+from pipeline.benchmark import entries
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.tables import make_tables, skins_table, summary_table
@@ -21,13 +22,18 @@ from reskin.errors import ParamsError, SchemaError
 
 TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
+MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
     "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
     "them run side by side, so less time passes."
 )
+BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README.md shows HEADLINE
+# The scene in which the shipped universal model is tested, and its name there.
+SHIPPED_SCENE, SHIPPED_NAME = "lab", "universal, simulated alone"
+MEASURED = "reskin/universal/measured.json"  # what the live page shows of this model
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
@@ -51,11 +57,53 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     times = io.read_json(root / TIMES) if (root / TIMES).exists() else None
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(page): page.read_text(encoding="utf-8") for page in pages}
-    after = fill(before, blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times))
+    blocks = blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times)
+    blocks |= entries.blocks(entries.read_entries(root / BENCHMARK), numbers.get("lab", {}))
+    after = fill(before, blocks)
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
+    if SHIPPED_SCENE in numbers:
+        file, measured = root / MEASURED, measured_of(numbers[SHIPPED_SCENE])
+        if not file.exists() or io.read_json(file) != measured:
+            changed.append(str(file))
+            if write:
+                io.write_json(file, measured)
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
+
+
+def measured_of(numbers: Numbers) -> dict[str, Any]:
+    """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
+
+    The places are those of presses at random places, tested on the other colour of a checkerboard of places.
+    """
+
+    def by_board(row: Numbers) -> dict[str, list[float]]:
+        return {name: row[name]["values"] for name in ("accuracy_pct", "median_mm", "mse_xy_mm2")}
+
+    limits = numbers["recorded_limits"]
+    places = [
+        {"presses_n": 0, "labels_n": 0} | by_board(row)
+        for row in limits["registration"]["rows"]
+        if (row["method"], row["presses_n"], row["known"]) == (SHIPPED_NAME, 0, "not used")
+    ] + [
+        {"presses_n": row["presses_n"], "labels_n": int(row["labels"])} | by_board(row)
+        for row in numbers["random_presses"]["rows"]
+        if (row["method"], row["tested"]) == (SHIPPED_NAME, "other colour of a checkerboard")
+        and row["labels"].isdecimal()
+    ]
+    detection = [
+        row
+        for row in limits["detection"]["rows"]
+        if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")
+    ]
+    columns = {"lightest_N": "smallest_N", "detected_pct": "detected_pct", "false_alarm_pct": "false_alarm_pct"}
+    return {
+        "scene": numbers["provenance"]["scene"],
+        "source": numbers["provenance"]["source"],
+        "places": sorted(places, key=lambda row: (row["presses_n"], row["labels_n"])),
+        "detection": {name: [row[column] for row in detection] for name, column in columns.items()},
+    }
 
 
 def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
@@ -84,11 +132,13 @@ def blocks_of(
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
+    moving = [numbers for numbers in recorded if "moving_hand" in numbers]
     skins = {
         f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
+        if numbers not in moving  # their presses are those of another scene
     }
     return {
         "headline": _summary(results[-1]),
@@ -98,6 +148,7 @@ def blocks_of(
         "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
+        "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),
     }
@@ -115,8 +166,10 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     # Tables are made only for the experiments that are shown, because the current code may be unable to read the
     # committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
+    trained = provenance["trained"]  # empty if the scene trains no networks
+    code = f"trained by code {trained}" if trained else f"code {provenance['git']}"
     heading = (
-        f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
+        f"Scene `{provenance['scene']}`, **{provenance['source']}**; {code}, "
         f"seed {provenance['seed']}, {provenance['device']}:"
     )
     return "\n\n".join([heading] + [to_markdown(tables[name]) for name in names if name in tables])

@@ -50,8 +50,8 @@ class Frame:
 
     def field(self, b_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n ch"]:
         """Rotate readings from the chips' axes to the board's axes."""
-        of_chips = b_uT.astype(float).reshape(len(b_uT), -1, 3)
-        return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
+        of_chips = b_uT.astype(float).reshape(len(b_uT), len(self.turn), 3)
+        return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(b_uT.shape)
 
     def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         """Convert label coordinates to places in the board's frame."""

@@ -37,6 +37,8 @@ def open_port(port: str, baud: int) -> Device:
             reason = f"no such port. {found_ports()}"
         elif number == errno.EAGAIN:
             reason = "another program uses it (reskin live, a serial monitor?). Close that program."
+        elif "Could not configure port" in str(error):  # pyserial's text for devices without a baud rate
+            reason = f"it is not a serial port. {found_ports()}"
         raise CaptureError(f"{port}: cannot open the port: {reason}") from None
     if not isinstance(device, serial.Serial):
         device.timeout = 0

@@ -10,7 +10,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -30,7 +30,7 @@ from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
-from reskin.simulation.capture import list_captures, simulate_capture
+from reskin.simulation.capture import SimulatedCapture, list_captures, simulate_capture
 from reskin.simulation.defaults import NOMINAL, SHARED, nominal
 from reskin.simulation.settings import MAIN, parse_simulation
 
@@ -75,6 +75,8 @@ class Script:
     t_s: Float64[np.ndarray, " f"]  # due time of each piece, from the start of the script
     # Index of a piece -> time for which the board is unplugged before this piece is sent.
     unplugged_s: dict[int, float] = field(default_factory=dict)
+    # True x_mm, y_mm and F_N of each frame; NaN without contact. None if the true contacts are unknown.
+    true_contacts: Float64[np.ndarray, "f 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.pieces)
@@ -141,7 +143,24 @@ def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
     board, skin = list_captures(simulation, protocol)[0]
     capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
-    return _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
+    script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
+    return replace(script, true_contacts=true_contacts_of(capture))
+
+
+def true_contacts_of(capture: SimulatedCapture) -> Float64[np.ndarray, "f 3"] | None:
+    """Return the true x_mm, y_mm and F_N of each frame, NaN without contact; None for a protocol with a robot.
+
+    In protocol `log`, the probe log has one dwell per frame in contact, without errors of place, force and clock. In
+    other protocols, the log has the errors of the simulated robot.
+    """
+    if capture.card_rate_hz is None:
+        return None
+    log, rate_hz = capture.probe, capture.card_rate_hz
+    true = np.full((len(capture.b_uT), 3), np.nan)
+    # The dwell of frame i begins half a frame before the frame, at (i + 0.5) / rate.
+    frame_i = np.rint(log.t_start_s[log.contact] * rate_hz - 0.5).astype(int)
+    true[frame_i] = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[log.contact]
+    return true
 
 
 def _binary_script(source: Source, b_uT: np.ndarray, temperature_degC: np.ndarray, t_s: np.ndarray) -> Script:
@@ -387,7 +406,15 @@ def make_port(kind: str) -> EmulatedPort:
     raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT, or ./NAME of a link to create. Try: pty")
 
 
-def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: float = 1.0, loop: bool = False) -> int:
+def play(
+    script: Script,
+    port: EmulatedPort,
+    stop: threading.Event,
+    *,
+    speed: float = 1.0,
+    loop: bool = False,
+    on_sent: Callable[[int], None] = lambda piece_i: None,
+) -> int:
     """Send each piece of a script to a port at its due time.
 
     Parameters
@@ -395,6 +422,7 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
     stop : event that another thread sets to end sending
     speed : factor by which due times are divided; with `math.inf`, the script is sent as fast as the reader reads
     loop : whether to restart the script at its end, and whenever a reader opens the port
+    on_sent : called with the index of the last piece that was sent
 
     Returns
     -------
@@ -417,6 +445,7 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
             start_s += blocked_s
             first, i = i, _end_of_batch(script, i, (now_s - blocked_s) * speed)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
+            on_sent(i - 1)
             if port.was_opened():
                 if loop and not replugged:
                     i, start_s = 0, time.monotonic()
@@ -436,14 +465,66 @@ def _end_of_batch(script: Script, first: int, script_s: float) -> int:
     return last
 
 
+class EmulatedBoard:
+    """A board that is emulated by this process: its port, and its true contact at any time."""
+
+    def __init__(self, script: Script, port: EmulatedPort) -> None:
+        self.port, self.source = port.name, script.source
+        self._true_contacts = script.true_contacts
+        self._sent_i = 0
+
+    @property
+    def has_true_contacts(self) -> bool:
+        return self._true_contacts is not None
+
+    def note_sent(self, piece_i: int) -> None:
+        self._sent_i = piece_i
+
+    def true_contact(self) -> tuple[float, float, float]:
+        """Return the true x_mm, y_mm and F_N of the frame that was sent last; NaN without contact, or if unknown."""
+        if self._true_contacts is None:
+            return (np.nan, np.nan, np.nan)
+        x_mm, y_mm, force_N = self._true_contacts[self._sent_i].tolist()
+        return x_mm, y_mm, force_N
+
+
+class TouchPrinter:
+    """Prints the true place and the largest true force of each touch when its first frame has been sent.
+
+    Raises `ParamsError` if the true contacts of the script are unknown.
+    """
+
+    def __init__(self, script: Script, source: str, say: Callable[[str], object]) -> None:
+        if script.true_contacts is None:
+            remedy = "Use nominal, or a simulated scene with protocol log."
+            raise ParamsError(f"--true-places: the true places of {source} are unknown. {remedy}")
+        contact = np.isfinite(script.true_contacts[:, 0])
+        edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))  # starts and ends in turn
+        self._texts = {}
+        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            x_mm, y_mm, force_N = script.true_contacts[first:end].max(axis=0)
+            self._texts[first] = f"true place: x {x_mm:.1f} mm, y {y_mm:.1f} mm, up to {force_N:.2f} N"
+        self._say, self._sent_i = say, -1
+
+    def __call__(self, piece_i: int) -> None:
+        if piece_i < self._sent_i:  # the script has restarted
+            self._sent_i = -1
+        for i in range(self._sent_i + 1, piece_i + 1):
+            if i in self._texts:
+                self._say(self._texts[i])
+        self._sent_i = piece_i
+
+
 @contextmanager
-def playing(script: Script) -> Iterator[str]:
-    """Send a script in a loop from another thread; yield the name of the emulated port."""
+def playing(script: Script) -> Iterator[EmulatedBoard]:
+    """Send a script in a loop from another thread; yield the emulated board."""
     port, stop = (Terminal() if hasattr(os, "openpty") else TcpServer()), threading.Event()
-    player = threading.Thread(target=play, args=[script, port, stop], kwargs={"loop": True}, daemon=True)
+    board = EmulatedBoard(script, port)
+    options = {"loop": True, "on_sent": board.note_sent}
+    player = threading.Thread(target=play, args=[script, port, stop], kwargs=options, daemon=True)
     player.start()
     try:
-        yield port.name
+        yield board
     finally:
         stop.set()
         player.join()

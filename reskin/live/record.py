@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reskin.board.find import BAUD, DetectedBoard
+from reskin.board.port import check_name
 from reskin.errors import ParamsError
 from reskin.live.health import Health
 from reskin.recordings.label_sources import (
@@ -52,6 +53,8 @@ def label_source(
     port, _, baud = (gauge or "").partition("@")
     if baud and not baud.isdecimal():
         raise ParamsError(f"--gauge: {gauge} is not PORT or PORT@BAUD. Try: --gauge /dev/ttyUSB0@9600")
+    if gauge:
+        check_name(port)
     gauge_baud = int(baud or GAUGE_BAUD)
     if labels is None:
         return from_gauge(port, gauge_baud) if gauge else None
@@ -90,6 +93,7 @@ def record_board(
     names : values for the capture's header: names of the board and the skin, and the order of places, under the keys
         board, skin and scan
     """
+    check_name(board.port)  # before a folder is created
     folder, health = folder or new_folder(), Health(board.chips_n)
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
     settings = PortSettings(

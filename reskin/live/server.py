@@ -1,7 +1,8 @@
 """The web server of `reskin live`: an HTML page, and one websocket per page and board.
 
 By default, only this machine can connect. If the server listens on another address, requests need a token. A client can
-request only fixed files, boards and button actions, so it cannot choose which files are read or written.
+request only fixed files, boards and actions. Of the files that are read or written, it can choose only the names of
+saved skins, all of which are in one folder.
 """
 
 import asyncio
@@ -22,7 +23,7 @@ from reskin.errors import ParamsError
 from reskin.live.session import Session
 
 PAGE = Path(__file__).parent / "page"
-FILES = {"/": "index.html", "/live.js": "live.js", "/trace.js": "trace.js", "/live.css": "live.css"}
+FILES = {"/": "index.html"} | {f"/{name}": name for name in ("live.js", "skin.js", "trace.js", "live.css")}
 LOCAL = ("127.0.0.1", "localhost", "::1")
 LOCAL_HOST = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
 COOKIE = "reskin-token"
@@ -118,22 +119,28 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a JSON message from a page: the name of a pressed button, or the number of the data that it has shown."""
+    """Handle a JSON message from a page (see `Session.request`); ignore anything else."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):
-            session.press(message.get("press"))
-            session.confirm(message.get("seen"))
+            session.request(message)
 
 
-def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None]) -> None:
-    """Serve the page of one or more boards until Ctrl-C."""
+def serve(
+    sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None], where: str = ""
+) -> None:
+    """Serve the page of one or more boards until Ctrl-C.
+
+    When the server listens, `say` is called with the address of the page, and with `where`, which names the folders of
+    saved files.
+    """
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:
         session.start()
     try:
         address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
         announcement = f"{', '.join(map(str, sessions))}: open {address}; press Ctrl-C to stop"
+        announcement += f"\n{where}" if where else ""
         app = Server(sessions, token).application()
         # aiohttp calls `print` once, when the server listens.
         web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)

@@ -1,23 +1,25 @@
 """One board on the page of `reskin live`: the thread that estimates, messages to the page, and button actions."""
 
-import re
+import math
 import struct
 import threading
 from collections import deque
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin.errors import ReskinError, SchemaError
+from reskin.errors import CaptureError, ParamsError, ReskinError, SchemaError
+from reskin.live.emulator import EmulatedBoard
 from reskin.live.health import LIVE_POLICY
+from reskin.live.page_recording import LabelledPress, PageRecording
+from reskin.live.skins import SkinFolder
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
+from reskin.live.used_model import describe
 from reskin.recordings.fault_policy import FaultPolicy
-from reskin.recordings.header import Header
-from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
-from reskin.recordings.stream_recorder import CaptureWriter
+from reskin.recordings.labels import Label
 from reskin.seeds import rng_for
 from reskin.universal.layout import BoardLayout, paper_layout
 
@@ -30,8 +32,11 @@ WINDOW_S, BIN_S = 10.0, 0.02  # duration and bin width of traces; must equal the
 BINS_N = round(WINDOW_S / BIN_S)
 LATENCIES_N = 4000  # number of latest latencies in the statistics; 10 s at 400 Hz
 UNCONFIRMED_MAX_N = 64  # largest number of sent messages for which a confirmation is awaited
+UNKNOWN_CONTACT = (math.nan,) * 3
 HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading
-NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
+# x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, four latencies in ms, dropped frames, and the true place and
+# force of an emulated board (x, y, F; NaN for real boards and without contact)
+NUMBERS_N = 16
 
 PRESSES_N = 12
 # Grid of places to press along x and along y, relative to the board's centre, as fractions of the area's half width.
@@ -72,10 +77,19 @@ class Traces:
             self._low[i] = np.fmin(self._low[i], np.fmin.reduce(rows))
             self._high[i] = np.fmax(self._high[i], np.fmax.reduce(rows))
 
-    def message(self, after_bin: int, *, rate_hz: float, lost_bytes_n: int) -> bytes:
+    def message(
+        self,
+        after_bin: int,
+        *,
+        rate_hz: float,
+        lost_bytes_n: int,
+        dropped_frames_n: int = 0,
+        true_contact: Sequence[float] = UNKNOWN_CONTACT,
+    ) -> bytes:
         """Return a binary message with the last reading and the bins from `after_bin` on; b"" before the first reading.
 
-        Bin `after_bin` was already sent and is sent again, because readings may have been added to it.
+        Bin `after_bin` was already sent and is sent again, because readings may have been added to it. `true_contact`
+        is x_mm, y_mm and F_N of an emulated board.
         """
         last = self._last
         if last is None:
@@ -97,12 +111,17 @@ class Traces:
         parts = [
             np.array(now),
             *latencies_ms,
+            np.array([dropped_frames_n, *true_contact]),
             change_uT.ravel(),
             numbers * BIN_S - t_s,  # relative to t_s, because float32 cannot resolve 20 ms after days
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
         return head + np.concatenate(parts).astype("<f4").tobytes()
+
+    def bins_of(self, times_s: Sequence[float]) -> list[int]:
+        """Return the numbers of the bins of some times."""
+        return [int((t_s - self._start_s) / BIN_S) for t_s in times_s]
 
     def confirm(self, message_i: int, now_s: float) -> None:
         """Record the time from the arrival of a reading until a page has drawn the message with this reading."""
@@ -183,22 +202,49 @@ class GuidedPresses(Presses):
 
 
 ADAPTING = ("adapt", "places")  # names of the buttons that request presses
+PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0  # limits of typed labels, to detect wrong units
 
 
 class Session:
-    """One board on the page: a thread that polls the board, the traces, the current recording, and the calibration."""
+    """One board on the page: a thread that polls the board, the traces, the current recording, and the calibration.
+
+    Parameters
+    ----------
+    port : the board's port
+    models : the model that estimates
+    source : what the board is, for the page
+    fault_policy : which faulty readings give no estimate
+    alone : whether this is the only board of the page
+    skins : folder of saved calibrations
+    model_name : name of the model's file; empty for the shipped model
+    emulated : the emulated board at the port; None for a real board, whose true contacts are unknown
+    """
 
     def __init__(
-        self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
+        self,
+        port: str,
+        models: Models,
+        source: str,
+        fault_policy: FaultPolicy = LIVE_POLICY,
+        *,
+        alone: bool = True,
+        skins: SkinFolder | None = None,
+        model_name: str = "",
+        emulated: EmulatedBoard | None = None,
     ) -> None:
         self.skin, self.source = LiveSkin(port, models, fault_policy=fault_policy), source
-        self._alone = alone
+        self._models, self._model_name = models, model_name
+        self._alone, self._emulated, self._skins = alone, emulated, skins or SkinFolder()
         self.traces: Traces | None = None
         self._error = ""
         self._presses: Presses | None = None
-        self._adapted = ""
-        self._recording: tuple[Path, Header, CaptureWriter] | None = None
+        self._labelled_press: LabelledPress | None = None
+        self._guided_press: LabelledPress | None = None  # the current one of the presses at crosses, for the recording
+        self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
+        self._recording: PageRecording | None = None
         self._recorded = ""
+        # Changes of the model, which the polling thread makes, because it also estimates with the model.
+        self._changes: deque[Callable[[UniversalEstimator], str]] = deque()
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
 
@@ -220,9 +266,11 @@ class Session:
         try:
             while not self._stop.is_set():
                 estimates = self.skin.poll(POLL_S)
+                self._change_model()
                 if estimates is not None:
                     now_s = self.skin.reader.unix_s()
                     self._adapt(estimates)
+                    self._label(estimates)
                     with self._lock:
                         self.traces = self.traces or Traces(self.skin.layout, now_s - 1.0)
                         self.traces.add(estimates, now_s)
@@ -233,6 +281,19 @@ class Session:
         except Exception as error:  # an unexpected error, such as one in a model
             self._error = f"estimation stopped: {error!r}"
 
+    def _change_model(self) -> None:
+        """Make the requested changes of the model, such as the loading of a saved skin."""
+        while self._changes:
+            change, estimator = self._changes.popleft(), self.skin.estimator
+            try:
+                if not isinstance(estimator, UniversalEstimator):
+                    raise ParamsError("only the universal model can learn a skin, and the model in use is another one.")
+                if not self.skin.zeroed:
+                    raise ParamsError("there is no no-load reading yet; wait for it, then try again.")
+                self._adapted = change(estimator)
+            except (ReskinError, OSError) as error:
+                self._adapted = str(error)
+
     def _adapt(self, estimates: Estimates) -> None:
         """Collect presses if a button requested them; calibrate the universal model when there are enough.
 
@@ -240,7 +301,7 @@ class Session:
         """
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
-            presses.add(estimates)
+            self._collect(presses, estimates)
             if presses.complete:
                 try:
                     if isinstance(presses, GuidedPresses):
@@ -253,30 +314,93 @@ class Session:
                     if self._presses is presses:
                         self._presses = None
 
+    def _collect(self, presses: Presses, estimates: Estimates) -> None:
+        """Add readings to the presses; write the labels of guided presses to the recording, if there is one."""
+        before_n, next_mm = len(presses), presses.next_mm
+        if next_mm is not None and self._guided_press is None:
+            self._guided_press = LabelledPress(Label(True, x_mm=next_mm[0], y_mm=next_mm[1]), learn=False)
+        if next_mm is not None and self._guided_press is not None:
+            self._guided_press.add(estimates)
+        presses.add(estimates)
+        if len(presses) == before_n:
+            return
+        done, self._guided_press = self._guided_press, None  # the next press is at another place
+        with self._button_lock:
+            if done is not None and self._recording is not None:
+                try:
+                    if not done.complete:
+                        raise CaptureError(done.problem or "two presses followed each other too quickly")
+                    self._recording.add(done)
+                    self._labelled = ""
+                except (ReskinError, OSError) as error:
+                    self._labelled = (
+                        f"press {before_n + 1} of {presses.presses_n} has no label in the recording: {error}"
+                    )
+
+    def _label(self, estimates: Estimates) -> None:
+        """Wait for the press that the user has labelled; then record its label and calibrate the model to it."""
+        press = self._labelled_press
+        if press is None:
+            return
+        press.add(estimates)
+        if not press.complete or press.db_uT is None:
+            return
+        done, estimator = [], self.skin.estimator
+        with self._button_lock:
+            try:
+                if self._recording is not None:
+                    self._recording.add(press)
+                    done.append(f"recorded as labelled press {self._recording.touches_n}")
+            except (ReskinError, OSError) as error:
+                done.append(str(error))
+            if self._labelled_press is press:
+                self._labelled_press = None
+        if press.learn and isinstance(estimator, UniversalEstimator):
+            try:
+                done.append(estimator.add_label((press.label.x_mm, press.label.y_mm), press.label.Fz_N, press.db_uT))
+            except ReskinError as error:
+                done.append(f"not used for calibration: {error}")
+        self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'nothing used it'}"
+
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Return the next binary message, with the bins from `after_bin` on, and the number of the newest bin."""
         with self._lock:
             if self.traces is None:
                 return b"", 0
-            rate_hz, lost_bytes_n = self.skin.health.rate_hz, self.skin.lost_bytes_n
-            data = self.traces.message(after_bin, rate_hz=rate_hz, lost_bytes_n=lost_bytes_n)
+            data = self.traces.message(
+                after_bin,
+                rate_hz=self.skin.health.rate_hz,
+                lost_bytes_n=self.skin.lost_bytes_n,
+                dropped_frames_n=self.skin.dropped_frames_n,
+                true_contact=UNKNOWN_CONTACT if self._emulated is None else self._emulated.true_contact(),
+            )
             return data, self.traces.newest_bin
 
     def state(self) -> dict[str, Any]:
         """Return the JSON message for `page/live.js`, with texts, alarms and the board's layout."""
         skin, detected, presses = self.skin, self.skin.detected, self._presses
+        recording, press, traces = self._recording, self._labelled_press, self.traces
         state: dict[str, Any] = {
             "what": self.source if self._alone else str(self), "zeroed": skin.zeroed,
-            "model": skin.estimator.name if skin.estimator else "",
             "adaptable": isinstance(skin.estimator, UniversalEstimator),
             "adapting": presses.instruction if presses is not None else "",
             "next_mm": presses.next_mm if presses is not None else None,
             "adapted": self._adapted,
             "waiting": detected.problem is not None, "silent": skin.silent,
             "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
-            "recording": f"{self._recording[0]} {skin.reader.writer_problem}" if self._recording else "",
+            "recording": f"{recording.folder} {skin.reader.writer_problem}".strip() if recording else "",
             "recorded": self._recorded,
+            "labelling": "" if press is None else f"press {_place(press.label)}. {press.problem}".strip(),
+            "label_mm": None if press is None else [press.label.x_mm, press.label.y_mm],
+            "labelled": self._labelled,
+            "skins": self._skins.names(), "skins_folder": str(self._skins.folder),
+            "true_places": self._emulated is not None and self._emulated.has_true_contacts,
+            "zeroings_n": skin.zeroings_n,
+            "zero_bins": [] if traces is None else traces.bins_of(tuple(skin.zeroings_s)),
+            **describe(skin.estimator, self._models, self._model_name),
         }  # fmt: skip
+        if recording:
+            state["recording_n"] = recording.touches_n
         if detected.problem is None:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
@@ -296,48 +420,123 @@ class Session:
             with self._lock:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
 
+    def request(self, message: Mapping[str, Any]) -> None:
+        """Handle a message from a page.
+
+        Its keys are `press` (name of a button), `seen` (number of drawn data), `save` and `load` (name of a skin), or
+        `label` (place and force of the next press; null to cancel). Unknown keys are ignored.
+        """
+        self.press(message.get("press"))
+        self.confirm(message.get("seen"))
+        if "save" in message:
+            self._changes.append(partial(self._save, name=message["save"]))
+        if "load" in message:
+            self._changes.append(partial(self._load, name=message["load"]))
+        if "label" in message:
+            with self._button_lock:
+                try:
+                    self._request_label(message["label"])
+                except ReskinError as error:
+                    self._labelled = str(error)
+
     def press(self, button: object) -> None:
         """Perform the action of a button of the page; ignore unknown buttons."""
         with self._button_lock:
             if button == "zero":
                 self.skin.zero()
+            elif button == "undo":
+                self._changes.append(UniversalEstimator.undo)
             elif button in ADAPTING and isinstance(estimator := self.skin.estimator, UniversalEstimator):
                 requested = Presses() if button == "adapt" else GuidedPresses(estimator.board)
                 self._presses = requested if self._presses is None else None
+                self._labelled_press = self._guided_press = None
             elif button == "record" and self._recording is not None:
                 self._end_recording()
             elif button == "record" and self.skin.detected.problem is None:
                 self._begin_recording()
 
+    def _save(self, estimator: UniversalEstimator, *, name: object) -> str:
+        return self._skins.save(name, estimator.model)
+
+    def _load(self, estimator: UniversalEstimator, *, name: object) -> str:
+        return estimator.load(self._skins.file(name))
+
+    def _request_label(self, label: object) -> None:
+        """Wait for a press with this label: `x_mm`, `y_mm`, `force_N` (None: unknown) and `learn`; None: do not wait.
+
+        Raises
+        ------
+        ParamsError
+            If the label is invalid, nothing would use it, or other presses are being collected.
+        """
+        self._labelled_press, self._labelled = None, ""
+        if label is None:
+            return
+        if not isinstance(label, dict):
+            raise ParamsError("label: the place and the force are missing. Enter x and y in mm.")
+        x_mm = _number(label.get("x_mm"), "x", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
+        y_mm = _number(label.get("y_mm"), "y", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
+        force_N = label.get("force_N")
+        force_N = math.nan if force_N is None else _number(force_N, "the force", 0.0, FORCE_MAX_N, "N")
+        learn = label.get("learn") is True and isinstance(self.skin.estimator, UniversalEstimator)
+        if not learn and self._recording is None:
+            raise ParamsError("label: nothing would use it. Start a recording, or select that the model learns it.")
+        if self._presses is not None:
+            raise ParamsError("label: other presses are being collected. Finish them first.")
+        self._labelled_press = LabelledPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)
+
     def _begin_recording(self) -> None:
         """Start writing the byte stream to a new capture."""
-        folder, detected = new_folder(), self.skin.detected
-        if not self._alone:  # two boards may start recording in the same second
-            folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
         try:
-            part, header = begin_capture(
-                folder, NO_INFO, wire=detected.wire, chips_n=detected.chips_n, by="reskin live"
+            source = "recorded" if self._emulated is None else self._emulated.source
+            self._recording = PageRecording(
+                self.skin.detected, self.skin.reader, port_in_name=not self._alone, source=source
             )
-            writer = CaptureWriter(part, detected.wire, detected.chips_n)
-            self.skin.reader.write_to(writer)
-            self._recording, self._recorded = (folder, header, writer), ""
+            self._recorded = ""
         except (OSError, ReskinError) as error:
             self._recorded = str(error)
 
     def _end_recording(self) -> None:
         if self._recording is not None:
-            (folder, header, writer), self._recording = self._recording, None
-            self.skin.reader.write_to(None)
+            recording, self._recording = self._recording, None
             try:
-                end_capture(folder, header, writer.rate())
-                self._recorded = f"recorded {folder}"
+                self._recorded = recording.end()
             except OSError as error:
-                self._recorded = f"cannot close {folder}.part: {error.strerror}"
+                self._recorded = f"cannot close {recording.folder}.part: {error.strerror}"
+
+
+def _place(label: Label) -> str:
+    force = "" if math.isnan(label.Fz_N) else f" with {label.Fz_N:g} N"
+    return f"at x {label.x_mm:g} mm, y {label.y_mm:g} mm{force}"
+
+
+def _number(value: object, name: str, least: float, most: float, unit: str) -> float:
+    """Return a number that the page sent; raise `ParamsError` if it is not a number above `least` and below `most`."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < most:  # False for NaN
+        got = "nothing" if value is None else repr(value)[:40]
+        raise ParamsError(f"label: {name} must be a number above {least:g} and below {most:g} {unit}; got {got}.")
+    return float(value)
 
 
 def open_sessions(
-    ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY
+    ports: Sequence[str],
+    models: Models,
+    source: str,
+    fault_policy: FaultPolicy = LIVE_POLICY,
+    *,
+    skins: SkinFolder | None = None,
+    model_name: str = "",
+    emulated: EmulatedBoard | None = None,
 ) -> list[Session]:
-    """Create one session per port. Sessions share the weights of the models, but not the calibration."""
+    """Create one session per port. Sessions share the weights of the models and the folder of saved skins.
+
+    They do not share the calibration. See `Session` for the arguments.
+    """
     check_ports(ports, models, "--port")
-    return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]
+    skins, alone = skins or SkinFolder(), len(ports) == 1
+    return [
+        Session(
+            port, models, source, fault_policy, alone=alone, skins=skins, model_name=model_name, emulated=emulated
+        )
+        for port in ports
+    ]  # fmt: skip

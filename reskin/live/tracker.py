@@ -14,6 +14,7 @@ from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import itemgetter
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +55,8 @@ SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
 # Assumed limit of a network's inputs, in standard deviations of its training data. The largest observed input is 6 in
 # scene `quick` and 7 in scene `lab`, each for models that were trained in the same scene.
 UNKNOWN_SDS = 10.0
+UNDO_MAX_N = 100  # steps of learning that can be undone
+ZEROINGS_KEPT_N = 16  # number of latest no-load readings whose times are stored
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
@@ -93,31 +96,83 @@ class NetworkEstimator:
         return Prediction(targets.mean(axis=0), sd_mm, np.asarray((inputs_sds > UNKNOWN_SDS).any(axis=0)))
 
 
+class Labels(NamedTuple):
+    """Field changes of m presses at known places; a force is NaN if it is unknown."""
+
+    place_mm: Float64[np.ndarray, "m 2"]
+    force_N: Float64[np.ndarray, " m"]
+    db_uT: Float64[np.ndarray, "m ch"]
+
+    def followed_by(self, other: "Labels") -> "Labels":
+        return Labels(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
+
+class LearningState(NamedTuple):
+    """What a `UniversalEstimator` is calibrated with, besides the no-load reading.
+
+    `origin` is the model that was passed or loaded, and `origin_name` the name of a loaded skin. `presses_uT` are field
+    changes of presses at unknown places. `guided` are presses at the places that the page showed, and `typed` those
+    whose places the user entered.
+    """
+
+    origin: Universal
+    origin_name: str
+    presses_uT: Float64[np.ndarray, "n ch"]
+    guided: Labels
+    typed: Labels
+    step: str  # the last step of learning, such as "the 12 presses"
+
+    @property
+    def labels(self) -> Labels:
+        return self.guided.followed_by(self.typed)
+
+    @classmethod
+    def start(cls, origin: Universal, origin_name: str = "", step: str = "") -> "LearningState":
+        """Return the state in which nothing has been learnt from presses on the page."""
+        none_uT = np.zeros((0, origin.channels_n))
+        none = Labels(np.zeros((0, 2)), np.zeros(0), none_uT)
+        return cls(origin, origin_name, none_uT, none, none, step)
+
+
 class UniversalEstimator:
     """Predicts with a copy of a universal model, which is further calibrated to no-load readings and to presses.
 
     The model that was passed is not changed. A call of `adapt` or `label` replaces the presses of an earlier call of
-    the same method, so that the user can repeat bad presses.
+    the same method, so that the user can repeat bad presses. `undo` takes back the last of these steps.
     """
 
     name = "universal model"
 
     def __init__(self, model: Universal) -> None:
-        self._given_model, self.channels_n, self.board = model, model.channels_n, model.layout
+        self.channels_n, self.board = model.channels_n, model.layout
         # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
-        self._presses_uT = np.zeros((0, self.channels_n))  # field changes for presses at unknown places
-        self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, self.channels_n))
-        self._calibrate()
+        self._states = [LearningState.start(model)]  # the last one is in use, the ones before are for `undo`
+        self._use(self._states[0])
+
+    @property
+    def learnt(self) -> LearningState:
+        """The data that the model is calibrated with now."""
+        return self._states[-1]
+
+    @property
+    def undoable(self) -> bool:
+        """Whether there is a step of learning that `undo` can take back."""
+        return len(self._states) > 1
+
+    @property
+    def model(self) -> Universal:
+        """The calibrated model."""
+        return self._model
 
     @property
     def external_uT(self) -> float:
         """Expected size of external fields; 0 if none are expected."""
-        return self._given_model.external_uT
+        return self._model.external_uT
 
     def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
         """Return the matrix of `Universal.suppressor`."""
-        return self._given_model.suppressor(noise_uT)
+        return self._model.suppressor(noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate.
@@ -125,7 +180,7 @@ class UniversalEstimator:
         The no-load field also tells whether the skin is turned by a quarter (`Universal.mounting`).
         """
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
-        self._calibrate()
+        self._use(self.learnt)
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
         """Calibrate to the field changes of presses at unknown places.
@@ -140,8 +195,8 @@ class UniversalEstimator:
             If no press changes the field. The calibration is then unchanged.
         """
         check_presses(db_uT)
-        before, self._presses_uT = self._estimate(db_uT), db_uT.astype(np.float64)
-        self._calibrate()
+        before = self._estimate(db_uT)
+        self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=f"the {len(db_uT)} presses"))
         after = self._estimate(db_uT)
         sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
         misfit = [np.median(estimate.misfit) for estimate in (before, after)]
@@ -172,13 +227,57 @@ class UniversalEstimator:
             estimated_mm = self._estimate(db_uT[held_out]).place_mm
             return float(np.median(np.linalg.norm(estimated_mm - place_mm[held_out], axis=1)))
 
-        before_mm = error_mm()
-        self._labelled_mm, self._labelled_uT = place_mm[~held_out], db_uT[~held_out].astype(np.float64)
-        self._calibrate()
+        before_mm, kept_n = error_mm(), int((~held_out).sum())
+        guided = Labels(place_mm[~held_out], np.full(kept_n, np.nan), db_uT[~held_out].astype(np.float64))
+        self._learn(self.learnt._replace(guided=guided, step=f"the {kept_n} presses at crosses"))
         return (
-            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} other places "
+            f"adapted to {kept_n} known places: median error at {held_out.sum()} other places "
             f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
         )
+
+    def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
+        """Calibrate also to one press at a place in mm; its force in N is NaN if it is unknown.
+
+        Returns
+        -------
+        A text for the user: the error of the place and the force at this press before the calibration.
+
+        Raises
+        ------
+        SchemaError
+            If the field does not change, the place is not on the skin, or the force is out of the model's range. The
+            calibration is then unchanged.
+        """
+        check_presses(db_uT[None])
+        before = self._estimate(db_uT[None])
+        one = Labels(np.array([place_mm], float), np.array([force_N]), db_uT[None].astype(np.float64))
+        self._learn(self.learnt._replace(typed=self.learnt.typed.followed_by(one), step="the last labelled press"))
+        error_mm = float(np.linalg.norm(before.place_mm[0] - one.place_mm[0]))
+        forces = "" if np.isnan(force_N) else f", force {before.force_N[0]:.2f} N instead of {force_N:.2f} N"
+        return f"calibrated to a labelled press; before it, the place was wrong by {error_mm:.2f} mm{forces}"
+
+    def load(self, file: Path) -> str:
+        """Replace everything that was learnt by a saved calibration; return a text for the user.
+
+        Raises
+        ------
+        SchemaError
+            If the file is missing or damaged, is not a calibration, or is one for another board. The calibration is
+            then unchanged.
+        """
+        if not file.is_file():  # for example deleted since the page listed it
+            raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
+        origin = copy(self.learnt.origin).remember(file)
+        self._learn(LearningState.start(origin, file.stem, f"the loading of {file.stem}"))
+        return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
+
+    def undo(self) -> str:
+        """Take back the last step of learning; return a text for the user."""
+        if not self.undoable:
+            return "nothing to undo: the model has learnt nothing here yet"
+        step = self._states.pop().step
+        self._use(self.learnt)
+        return f"undone: {step}"
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         estimate = self._estimate(db_uT)
@@ -188,13 +287,21 @@ class UniversalEstimator:
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
         return self._model.estimate(db_uT + self._noload_uT)
 
-    def _calibrate(self) -> None:
-        model = copy(self._given_model).zero(self._noload_uT, keep=True)
-        if len(self._presses_uT):
-            model.see(self._presses_uT + self._noload_uT)
-        if len(self._labelled_uT):
-            b_uT = self._labelled_uT + self._noload_uT
-            model.label(self._labelled_mm, None, b_uT, keep=True)
+    def _learn(self, state: LearningState) -> None:
+        """Calibrate with a new state, and keep the one before for `undo`; if this fails, nothing changes."""
+        self._use(state)
+        self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
+
+    def _use(self, state: LearningState) -> None:
+        model = copy(state.origin).zero(self._noload_uT, keep=True)
+        if len(state.presses_uT):
+            model.see(state.presses_uT + self._noload_uT)
+        place_mm, force_N, db_uT = state.labels
+        known = np.isfinite(force_N)
+        if known.any():
+            model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
+        if not known.all():  # after the known forces, with which the model estimates the others
+            model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
         self._model, self.warnings = model, model.warnings
 
@@ -306,6 +413,9 @@ class LiveSkin:
         self._model_problem = ""
         self._head: list[Chunk] = []
         self._partial_first_bytes_n = 0  # bytes of frames that were cut by opening the port
+        self.dropped_frames_n = 0  # frames without an estimate because of a fault
+        self.zeroings_n = 0
+        self.zeroings_s: deque[float] = deque(maxlen=ZEROINGS_KEPT_N)  # times of the latest no-load readings
         self._restart_noload()
 
     def __enter__(self) -> "LiveSkin":
@@ -410,6 +520,7 @@ class LiveSkin:
         if not len(frames):
             return None
         sound = self.health.feed(frames, t_s[-1])
+        self.dropped_frames_n += int(len(sound) - sound.sum())
         if not self.zeroed:
             self._take_noload(frames.where(sound), t_s)
         if latest:
@@ -532,6 +643,8 @@ class LiveSkin:
                 self._suppressor = self.estimator.suppressor(rms_uT)
             self._contact_uT = float(np.median(magnitudes_uT(noise_uT, self._suppressor)) + CONTACT_SDS * rms_uT)
             self.noload_uT = noload_uT
+            self.zeroings_n += 1
+            self.zeroings_s.append(float(t_s[-1]))
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
         target, sd_mm = np.full((len(frames), 3), np.nan), np.full((len(frames), 2), np.nan)

@@ -63,8 +63,8 @@ class Network:
 
     __repr__ = one_line
 
-    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and F_N for each of f field changes in uT."""
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f t"]:
+        """Predict x_mm, y_mm and F_N (or the other targets of the training) for each of f field changes in uT."""
         scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
         return scaler.decode(self._predictor(scaler.encode(view)))
 

@@ -19,7 +19,7 @@ def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.T
     values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
     fields = [
         pa.field(name, pa.from_numpy_dtype(column.dtype), metadata={"unit": unit})
-        for (name, unit), column in zip(_columns(chips_n).items(), values, strict=True)
+        for (name, unit), column in zip(frame_columns(chips_n).items(), values, strict=True)
     ]
     arrays = [pa.array(np.ascontiguousarray(column)) for column in values]
     return pa.Table.from_arrays(arrays, schema=pa.schema(fields)), account
@@ -34,7 +34,7 @@ def read_frames(
     position and the constant rate `rate_hz`; in binary formats, lost bytes also take time.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
-    if table.column_names != list(_columns(chips_n)):
+    if table.column_names != list(frame_columns(chips_n)):
         names = ", ".join(table.column_names)[:80]
         raise CaptureError(
             f"{where}: these are not the columns of reskin decode: {names}. Decode the dump again: reskin decode."
@@ -50,7 +50,7 @@ def read_frames(
     return t_s, np.stack(values[: 3 * chips_n], axis=1), np.stack(values[3 * chips_n : -2], axis=1)
 
 
-def _columns(chips_n: int) -> dict[str, str]:
+def frame_columns(chips_n: int) -> dict[str, str]:
     """Return the columns of a decoded dump in order, as a mapping from the column's name to its unit."""
     names = {f"b{axis}{chip}_uT": "uT" for chip in range(chips_n) for axis in "xyz"}
     return names | {f"temperature{chip}_degC": "degC" for chip in range(chips_n)} | {"device_s": "s", "end_byte": "1"}

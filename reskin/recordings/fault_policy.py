@@ -57,6 +57,14 @@ REFUSE_NONE = FaultPolicy.model_validate(
     {name: get_args(field.annotation)[0] for name, field in FaultPolicy.model_fields.items()}
 )
 
+# The policy of `reskin.load_recording`; the same as in `params.yaml` (tests compare them).
+STANDARD_POLICY = FaultPolicy(
+    failed_read="drop", zeros="drop", stuck="drop", torn="drop", wrong_baud="drop",
+    constant_channel="refuse", chip_reset="refuse",
+    too_hot="flag", saturated="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
+    unplug="flag",
+)  # fmt: skip
+
 
 def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> FaultPolicy:
     """Change the actions of some faults by texts `NAME=ACTION`; `where` names the command-line option in errors.

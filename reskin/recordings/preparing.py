@@ -100,7 +100,8 @@ def layouts_of(recording: Path) -> list[str]:
 
 
 def _is_readable(recording: Path, layout: ReaderLayout) -> bool:
-    options = {"force_axis": "z"} if layout == "eflesh" else {}
+    required = {"eflesh": {"force_axis": "z"}, "leaphand": {"pad": "1"}}
+    options = required.get(layout, {})
     try:
         prepared = foreign(recording, layout, CaptureNames("board", "skin", None), options)
         with TemporaryDirectory() as folder:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,14 +61,19 @@ def check_labels(
             f"labels: each press needs x and y, a force and a reading; got {got}. Pass arrays of shapes "
             "[m, 2], [m] and [m, channels]."
         )
-    if rows_n > LABELS_MAX_N:
-        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
+    check_number(rows_n)
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
     _need("labels", "forces", "above 0 N", forces_N, forces_N > 0)
     _need("labels", "forces", "finite", forces_N, np.isfinite(forces_N))
     return places_mm, forces_N
+
+
+def check_number(labels_n: int) -> None:
+    """Raise SchemaError if there are more than LABELS_MAX_N labels."""
+    if labels_n > LABELS_MAX_N:
+        raise SchemaError(f"labels: {labels_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
@@ -98,8 +103,10 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 
 
 # Files of the first format do not tell which forces are known, and those of the first two do not tell how the skin is
-# mounted: it is then not turned.
-FORMAT, FORMAT_2, FORMAT_1 = "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
+# mounted: it is then not turned. Files of the first three have the data of one day.
+FORMAT, FORMAT_3, FORMAT_2, FORMAT_1 = "reskin-skin-4", "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
+EARLIER_DAY = "earlier_{}_"  # how names of arrays begin that are of earlier days; the first of these days has number 0
+DAYS_MAX_N = 5  # a saved skin has at most this number of days
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
 FILE_BYTES_MAX_N = 2**23  # a full set of presses and labels on a board with 64 chips takes 3.5 MB
@@ -156,8 +163,8 @@ class CalibrationData:
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
     the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter; the sign of
-    all fields here is then opposite to that of the board's fields, as if the skin were not turned. By default, there
-    are no presses on the paper's board.
+    all fields here is then opposite to that of the board's fields, as if the skin were not turned. earlier: data of
+    earlier days, in their order, without days before them. By default, there are no presses on the paper's board.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -166,6 +173,7 @@ class CalibrationData:
     area_uT: Float[np.ndarray, "a ch"] = field(default_factory=no_presses)
     labels: LabelledPresses = field(default_factory=no_labels)
     turned: bool = False
+    earlier: "tuple[CalibrationData, ...]" = ()
 
     @classmethod
     def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "CalibrationData":
@@ -173,14 +181,47 @@ class CalibrationData:
         empty = no_presses(len(rest_uT))
         return cls(rest_uT, empty, empty, empty, no_labels(len(rest_uT)))
 
+    @property
+    def presses_n(self) -> int:
+        """Number of presses on all days, labelled or not."""
+        return len(self.presses_uT) + len(self.labels) + sum(day.presses_n for day in self.earlier)
+
+    def next_day(self) -> "CalibrationData":
+        """Return the data at the beginning of another day: a day with presses becomes the last of the earlier days.
+
+        There are at most `DAYS_MAX_N` - 1 earlier days; before, the first of them is omitted.
+        """
+        pressed = len(self.presses_uT) + len(self.labels) > 0
+        earlier = (*self.earlier, replace(self, earlier=())) if pressed else self.earlier
+        data = CalibrationData.at_rest(self.rest_uT)
+        return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
+
+    def same_slide(self, last: "CalibrationData") -> "CalibrationData":
+        """Join the presses with those of the last day, on which the skin slid in the same way.
+
+        As on a single day, presses that are all over the area are then used only if no others were made after them.
+        """
+        presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
+        even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
+        area_uT = self.area_uT if len(self.presses_uT) else last.area_uT
+        labels = join_labels(last.labels, self.labels)
+        return replace(self, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT, labels=labels, earlier=())
+
 
 def write_calibration(data: CalibrationData, file: Path, board: str) -> None:
     """Write calibration data to a safetensors file, which does not contain the model, but the name of its board."""
-    labels = data.labels
-    labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
-    values = (data.presses_uT, data.even_uT, data.area_uT, *labelled)
+    tensors = _arrays(data)
+    for i, day in enumerate(data.earlier):
+        tensors |= {EARLIER_DAY.format(i) + name: values for name, values in _arrays(day).items()}
     about = {"format": FORMAT, "turned": str(data.turned).lower(), BOARD: board}
-    io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(ARRAYS, values, strict=True))}, about)
+    io.write_tensors(file, tensors, about)
+
+
+def _arrays(day: CalibrationData) -> dict[str, np.ndarray]:
+    labels = day.labels
+    labelled = labels.place_mm, labels.force_N, labels.db_uT, labels.known.astype(float)
+    values = (day.presses_uT, day.even_uT, day.area_uT, *labelled)
+    return {"rest_uT": day.rest_uT, **dict(zip(ARRAYS, values, strict=True))}
 
 
 def is_calibration(file: Path) -> bool:
@@ -188,11 +229,8 @@ def is_calibration(file: Path) -> bool:
 
     Raises SchemaError if the file is damaged, unless it is too large for a file of calibration data.
     """
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (
-        FORMAT,
-        FORMAT_2,
-        FORMAT_1,
-    )
+    formats = FORMAT, FORMAT_3, FORMAT_2, FORMAT_1
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in formats
 
 
 def read_calibration(
@@ -216,8 +254,27 @@ def read_calibration(
     if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
         added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses(channels_n)}
         tensors = {**tensors, **added}
-    elif metadata.get("format") not in (FORMAT, FORMAT_2):
+    elif metadata.get("format") not in (FORMAT, FORMAT_3, FORMAT_2):
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
+    turned = metadata.get("turned", "false")
+    if turned not in ("true", "false"):
+        raise SchemaError(file, "turned", "true or false", turned, REMEDY)
+    earlier: list[CalibrationData] = []
+    while names := [name for name in tensors if name.startswith(prefix := EARLIER_DAY.format(len(earlier)))]:
+        arrays = {name.removeprefix(prefix): tensors.pop(name) for name in names}
+        earlier.append(replace(_read_day(file, arrays, reach_mm, channels_n), turned=turned == "true"))
+    data = replace(_read_day(file, tensors, reach_mm, channels_n), turned=turned == "true", earlier=tuple(earlier))
+    labels_n = sum(len(day.labels) for day in (data, *earlier))
+    if len(earlier) >= DAYS_MAX_N or labels_n > LABELS_MAX_N:
+        rule, got = f"at most {DAYS_MAX_N} days with {LABELS_MAX_N} labels", f"{len(earlier) + 1} with {labels_n}"
+        raise SchemaError(file, "days", rule, got, REMEDY)
+    return data
+
+
+def _read_day(
+    file: Path, tensors: Mapping[str, np.ndarray], reach_mm: Float[np.ndarray, "2 2"], channels_n: int
+) -> CalibrationData:
+    """Check the arrays of one day in a file, and return its data."""
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
     shapes: dict[str, tuple[int, ...]] = {"labelled_mm": (2,), "labelled_N": (), "force_known": ()}
@@ -242,10 +299,7 @@ def read_calibration(
     rest_uT = check_readings(tensors["rest_uT"], channels_n)[0]
     labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
     presses_uT, even_uT, area_uT = (fields_uT[name] for name in UNLABELLED)
-    turned = metadata.get("turned", "false")
-    if turned not in ("true", "false"):
-        raise SchemaError(file, "turned", "true or false", turned, REMEDY)
-    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels, turned == "true")
+    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels)
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels

@@ -261,6 +261,11 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
     return Hypotheses(place_mm, log_N, mean_uT, slope_uT, expected, error_cov, external_cov)
 
 
+# How a skin slides under a press can change from day to day. These parameters describe it; the others are constant.
+# The correlations are between one day and the next, if the slide has changed: of a parameter of the slide, and of the
+# law's errors. They were chosen on simulated skins (tests/benchmarks/test_days_benchmark.py).
+SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
+SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
 SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, however many labels there are
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
@@ -321,20 +326,22 @@ class LabelledErrors:
     log_N: Float[np.ndarray, " m"]
     solved: Float[np.ndarray, "m ch"]  # inverse of the correlation matrix times the errors at these presses
     inverse: Float[np.ndarray, "m m"]  # inverse of the errors' correlation matrix
+    by_day: Float[np.ndarray, " m"]  # correlation of the errors on the day of each press with those on the current day
 
 
 @dataclass(frozen=True)
 class SkinMap:
     """Posterior distribution of one skin's parameters and of the law's errors on this skin.
 
-    mean, cov: mean and covariance of the parameters' deviations from the central law, in units of their spreads.
+    mean, cov: mean and covariance of the parameters' deviations from the central law, in units of their spreads. The
+    parameters on the current day come first; those of the slide on earlier days follow, last day first (`begin_day`).
     """
 
     tables: Tables
     residual: Residual
     hypotheses: Hypotheses
-    mean: Float[np.ndarray, " t"]
-    cov: Float[np.ndarray, "t t"]
+    mean: Float[np.ndarray, " p"]
+    cov: Float[np.ndarray, "p p"]
     labelled: LabelledErrors | None = None
 
     __repr__ = one_line
@@ -343,6 +350,12 @@ class SkinMap:
     def error_cov(self) -> Float[np.ndarray, "ch ch"]:
         """Covariance of the law's relative error between channels."""
         return self.hypotheses.error_cov
+
+    @property
+    def current(self) -> tuple[Float[np.ndarray, " t"], Float[np.ndarray, "t t"]]:
+        """Mean and covariance of the parameters on the current day."""
+        t = len(self.tables.names)
+        return self.mean[:t], self.cov[:t, :t]
 
     @cached_property
     def evaluator(self) -> "MapEvaluator":
@@ -356,7 +369,8 @@ class MapEvaluator:
     def __init__(self, skin: SkinMap) -> None:
         self._hypotheses = skin.hypotheses
         self.lattice = Lattice(skin.hypotheses.place_mm, skin.hypotheses.log_N)
-        parameters = skin.mean.astype(np.float32), np.linalg.cholesky(skin.cov).astype(np.float32)
+        mean, cov = skin.current
+        parameters = mean.astype(np.float32), np.linalg.cholesky(cov).astype(np.float32)
         error_cov = skin.error_cov.astype(np.float32)
         noise_cov = skin.hypotheses.noise_cov.astype(np.float32)
         self._gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
@@ -374,7 +388,7 @@ class MapEvaluator:
         if labelled is None:
             return expected, np.ones(len(expected), np.float32)
         place_mm, log_N = skin.hypotheses.at
-        k = kernel(place_mm, labelled.place_mm, log_N, labelled.log_N)
+        k = kernel(place_mm, labelled.place_mm, log_N, labelled.log_N) * labelled.by_day
         explained = ((k @ labelled.inverse) * k).sum(axis=1)
         share = np.maximum(1 + skin.residual.noise - explained, SHARE_MIN)
         return (expected + k @ labelled.solved).astype(np.float32), share.astype(np.float32)
@@ -428,8 +442,9 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
         total = weight.sum(axis=0)  # sum over presses for each hypothesis
         kept = np.flatnonzero(total > WEIGHT_MIN * total.max())
         off_uT = weight[:, kept].T @ db_uT.astype(np.float32) - total[kept][:, None] * expected_uT[kept]
-        matrix = (total[kept] @ information.matrix[kept]).reshape(skin.cov.shape)
-        vector = off_uT.ravel() @ information.per_uT[kept].reshape(-1, len(skin.mean))
+        t = len(skin.tables.names)
+        matrix = (total[kept] @ information.matrix[kept]).reshape(t, t)
+        vector = off_uT.ravel() @ information.per_uT[kept].reshape(-1, t)
         posterior = _add_information(skin, matrix, vector)
     return posterior
 
@@ -438,7 +453,7 @@ def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -
     """Condition the map on evenly spread presses; their mean place is assumed to be the centre of the labels' frame."""
     label_i = [skin.tables.names.index(name) for name in LABEL_OFFSETS]
     spread_mm = skin.tables.spreads[label_i]
-    row = np.zeros((2, len(skin.mean)))
+    row = np.zeros((2, len(skin.tables.names)))
     row[[0, 1], label_i] = 1.0
     posterior = skin
     for _ in range(2):
@@ -480,16 +495,22 @@ def condition_on_labels(
     place_mm: Float[np.ndarray, "m 2"],
     force_N: Float[np.ndarray, " m"],
     db_uT: Float[np.ndarray, "m ch"],
+    days_ago: Int64[np.ndarray, " m"] | None = None,
 ) -> SkinMap:
-    """Condition on labelled presses: first the skin's parameters, then the law's errors near these presses."""
+    """Condition on labelled presses: first the skin's parameters, then the law's errors near these presses.
+
+    days_ago: for each press, how often `begin_day` was called since; by default, all presses are of the current day.
+    """
     if not len(place_mm):
         return skin
     mean_uT, slope_uT, expected = interpolate(skin, place_mm, force_N)
     magnitude_uT, log_N = np.linalg.norm(mean_uT, axis=1), np.log(force_N)
-    k = kernel(place_mm, place_mm, log_N, log_N) + skin.residual.noise * np.eye(len(place_mm))
+    days_ago = np.zeros(len(place_mm), int) if days_ago is None else days_ago
+    by_day = ERROR_CORRELATION ** np.abs(days_ago[:, None] - days_ago)
+    k = kernel(place_mm, place_mm, log_N, log_N) * by_day + skin.residual.noise * np.eye(len(place_mm))
     root = np.linalg.cholesky(k)
     deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
-    slope = slope_uT / magnitude_uT[:, None, None]
+    slope = _slopes_by_day(skin, slope_uT / magnitude_uT[:, None, None], days_ago)
     # The law's errors are correlated between presses (k) and between channels (error_cov): whiten over both.
     white = solve_triangular(
         root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
@@ -499,7 +520,46 @@ def condition_on_labels(
         skin, white[..., 1:].reshape(-1, len(skin.mean)), white[..., 0].ravel(), np.ones(deviation.size)
     )
     solved = np.linalg.solve(k, deviation - slope @ posterior.mean)
-    return replace(posterior, labelled=LabelledErrors(place_mm, log_N, solved, np.linalg.inv(k)))
+    errors = LabelledErrors(place_mm, log_N, solved, np.linalg.inv(k), ERROR_CORRELATION**days_ago)
+    return replace(posterior, labelled=errors)
+
+
+def begin_day(skin: SkinMap) -> SkinMap:
+    """Return the map for a day on which the skin slides in another way; it must not be conditioned on labels yet.
+
+    The parameters of the slide get new values, which have a correlation of `SLIDE_CORRELATION` with those of the day
+    before; their prior is the same on all days. Their values on earlier days are appended to the parameters, because
+    labelled presses of these days depend on them.
+    """
+    slide_i, t, p = _slide_indices(skin), len(skin.tables.names), len(skin.mean)
+    transition = np.zeros((p + len(slide_i), p))
+    transition[:t, :t] = np.eye(t)
+    transition[slide_i, slide_i] = SLIDE_CORRELATION
+    transition[range(t, t + len(slide_i)), slide_i] = 1.0
+    transition[t + len(slide_i) :, t:] = np.eye(p - t)
+    cov = transition @ skin.cov @ transition.T
+    cov[slide_i, slide_i] += 1 - SLIDE_CORRELATION**2
+    return replace(skin, mean=transition @ skin.mean, cov=cov)
+
+
+def _slide_indices(skin: SkinMap) -> list[int]:
+    return [i for i, name in enumerate(skin.tables.names) if name in SLIDE]
+
+
+def _slopes_by_day(
+    skin: SkinMap, slope: Float[np.ndarray, "m ch t"], days_ago: Int64[np.ndarray, " m"]
+) -> Float[np.ndarray, "m ch p"]:
+    """Return slopes with respect to all parameters of a map; each press depends on the slide of its own day."""
+    t, slide_i = slope.shape[2], _slide_indices(skin)
+    if len(skin.mean) == t:
+        return slope
+    by_day = np.zeros((*slope.shape[:2], len(skin.mean)))
+    by_day[..., :t] = slope
+    for press in np.flatnonzero(days_ago):
+        first = t + len(slide_i) * (days_ago[press] - 1)
+        by_day[press, :, first : first + len(slide_i)] = slope[press][:, slide_i]
+        by_day[press][:, slide_i] = 0.0
+    return by_day
 
 
 def _condition(
@@ -510,7 +570,12 @@ def _condition(
 
 
 def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
-    """Condition the Gaussian of the parameters on observations, given as information matrix and information vector."""
+    """Condition the Gaussian of the parameters on observations, given as information matrix and information vector.
+
+    Both may be those of the first parameters only.
+    """
+    if more_n := len(skin.mean) - len(vector):
+        matrix, vector = np.pad(matrix, (0, more_n)), np.pad(vector, (0, more_n))
     prior = np.linalg.inv(skin.cov)
     cov = np.linalg.inv(prior + matrix)
     return replace(skin, mean=cov @ (prior @ skin.mean + vector), cov=(cov + cov.T) / 2)
@@ -549,7 +614,7 @@ def expected_gain(
     hypotheses, error_cov, gains = skin.hypotheses, skin.error_cov, []
     median_force = slice(len(hypotheses.log_N) // 2, None, len(hypotheses.log_N))
     mean_uT, slope_uT = (part[median_force].astype(float) for part in (hypotheses.mean_uT, hypotheses.slope_uT))
-    all_slopes = slope_uT / np.linalg.norm(mean_uT, axis=1)[:, None, None] @ skin.cov
+    all_slopes = slope_uT / np.linalg.norm(mean_uT, axis=1)[:, None, None] @ skin.current[1]
     all_mm, all_log_N = (part[median_force] for part in hypotheses.at)
     press_uT, press_slope_uT, _ = interpolate(skin, place_mm, force_N)
     log_N = np.log(force_N)
@@ -557,7 +622,7 @@ def expected_gain(
     for i, magnitude_uT in enumerate(np.linalg.norm(press_uT, axis=1)):
         slope, press = press_slope_uT[i] / magnitude_uT, slice(i, i + 1)
         own = _remaining_errors(skin, place_mm[press], log_N[press], place_mm[press], log_N[press])[0, 0]
-        cov = slope @ skin.cov @ slope.T + (own + skin.residual.noise) * error_cov
+        cov = slope @ skin.current[1] @ slope.T + (own + skin.residual.noise) * error_cov
         cov += (NOISE_uT / magnitude_uT) ** 2 * np.eye(len(cov))
         with_all = (all_slopes @ slope.T + shared[:, i, None, None] * error_cov).reshape(-1, len(cov))
         gains.append(float(((with_all @ np.linalg.inv(cov)) * with_all).sum() / len(all_mm)))
@@ -572,6 +637,6 @@ def _remaining_errors(
     prior, labelled = kernel(a_mm, b_mm, a_log_N, b_log_N), skin.labelled
     if labelled is None:
         return prior
-    to_a = kernel(a_mm, labelled.place_mm, a_log_N, labelled.log_N)
-    to_b = kernel(b_mm, labelled.place_mm, b_log_N, labelled.log_N)
+    to_a = kernel(a_mm, labelled.place_mm, a_log_N, labelled.log_N) * labelled.by_day
+    to_b = kernel(b_mm, labelled.place_mm, b_log_N, labelled.log_N) * labelled.by_day
     return prior - to_a @ labelled.inverse @ to_b.T

@@ -12,13 +12,14 @@ the board's centre is at the layout's `centre_mm`.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
+from scipy.special import logsumexp
 
 from reskin import io
 from reskin.display import one_line
@@ -31,6 +32,7 @@ from reskin.universal.calibration import (
     LabelledPresses,
     LikelihoodPowers,
     check_labels,
+    check_number,
     check_presses,
     check_range,
     check_readings,
@@ -54,6 +56,7 @@ from reskin.universal.map import (
     MapEvaluator,
     SkinMap,
     Tables,
+    begin_day,
     concatenate,
     condition_on_even_presses,
     condition_on_labels,
@@ -87,6 +90,9 @@ EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, sing
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
 OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
+# Log odds from which presses of a new day are taken to be of a skin that slides as on the last day. Otherwise, a change
+# is assumed, because an unnoticed change costs more accuracy than a wrongly assumed one. Chosen on simulated skins.
+SAME_SLIDE_LOG_ODDS_MIN = 2.0
 UNSTORED = ("names", "area")  # fields of `Tables` that follow from the card
 CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
@@ -232,11 +238,16 @@ def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
 
 @dataclass(frozen=True)
 class PressCalibration:
-    """Map and networks, conditioned on a skin's no-load field and its presses at unknown places."""
+    """Map and networks, conditioned on a skin's no-load field and its presses at unknown places.
+
+    earlier: the calibration to the last day on which the skin slid in another way, if any. `skin` is then conditioned
+    also on the unlabelled presses of that day and the days before, but the networks only on presses of `data`.
+    """
 
     skin: SkinMap
     networks: Sequence[Weights]
     data: CalibrationData
+    earlier: "PressCalibration | None" = None
 
     __repr__ = one_line
 
@@ -253,6 +264,8 @@ class PressCalibration:
     @cached_property
     def centre_mm(self) -> Float[np.ndarray, "2"]:
         """Shift of the networks' places that follows from unlabelled presses."""
+        if self.spread is not self:
+            return self.spread.centre_mm
         if len(self.data.area_uT):
             estimate = CalibratedModel(self.skin, self.layers, ()).estimate(self.data.area_uT, [MAP_POWER])[0]
             pairs = zip(self.skin.tables.names, self.skin.tables.spreads, strict=True)
@@ -263,30 +276,109 @@ class PressCalibration:
     @cached_property
     def moved(self) -> SkinMap:
         """The map, with its places moved onto the area of the grid if the presses are spread over it."""
-        return move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
+        return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
+
+    @property
+    def spread(self) -> "PressCalibration":
+        """This or the last earlier calibration whose presses are known to be spread evenly or over the area."""
+        known = len(self.data.even_uT) or len(self.data.area_uT)
+        return self if known or self.earlier is None else self.earlier.spread
 
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        few: whether the line is for forces of another map, which is not conditioned on presses with known forces. By
-        default, this is so for 1 to `FEW_N` - 1 known forces, which the map and the line would otherwise use twice.
+        labels: of the days since the slide changed; those of the days before are added. few: whether the line is for
+        forces of another map, which is not conditioned on presses with known forces. By default, this is so for 1 to
+        `FEW_N` - 1 known forces, which the map and the line would otherwise use twice.
         """
+        by_day = self.labels_by_day(labels)
+        days_ago = np.repeat(np.arange(len(by_day)), [len(day) for day, _ in by_day])
+        estimated_mm = np.concatenate([network.evaluate(layers, day.db_uT).place_mm for day, layers in by_day])
+        labels = reduce(join_labels, (day for day, _ in by_day))
         few = has_few(labels) if few is None else few
         few_forces = None
         if few:
-            known, rest = labels[np.flatnonzero(labels.known)], labels[np.flatnonzero(~labels.known)]
-            without = condition_on_labels(self.moved, rest.place_mm, rest.force_N, rest.db_uT)
+            known_i, rest_i = np.flatnonzero(labels.known), np.flatnonzero(~labels.known)
+            known, rest = labels[known_i], labels[rest_i]
+            without = condition_on_labels(self.moved, rest.place_mm, rest.force_N, rest.db_uT, days_ago[rest_i])
             few_forces = FewForces(without, known.place_mm, np.log(known.force_N)) if len(known) else None
-        skin = condition_on_labels(self.moved, labels.place_mm, labels.force_N, labels.db_uT)
-        estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
+        skin = condition_on_labels(self.moved, labels.place_mm, labels.force_N, labels.db_uT, days_ago)
         offsets_mm = network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm)
         return CalibratedModel(skin, self.layers, offsets_mm, few=few_forces)
 
-    def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
+    def labels_by_day(self, labels: LabelledPresses) -> list[tuple[LabelledPresses, Sequence[Layers]]]:
+        """Return labels since the last change of the slide, then before it, and so on, each with their networks."""
+        earlier = self.earlier
+        return [(labels, self.layers), *([] if earlier is None else earlier.labels_by_day(earlier.data.labels))]
+
+    def held_out(self, labels: LabelledPresses, *, few: bool | None = None) -> Iterator[HeldOutLabels]:
         """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
+        few = has_few(reduce(join_labels, (day for day, _ in self.labels_by_day(labels)))) if few is None else few
         for kept, held_out in folds_of_labels(len(labels)):
-            model = self.with_labels(labels[kept], few=has_few(labels)).with_offsets_in_biases()
+            model = self.with_labels(labels[kept], few=few).with_offsets_in_biases()
             yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
+
+    def held_out_earlier(self, few: bool) -> list[HeldOutLabels]:
+        """Evaluate the labelled presses before the last change of the slide, each group with its own calibration."""
+        if (day := self.earlier) is None:
+            return []
+        return [*day.held_out(day.data.labels, few=few), *day.held_out_earlier(few)]
+
+    def same_slide_log_odds(self, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
+        """Return, for each press of a later day, log odds that the skin slides in the same way as on this day.
+
+        These are the press's log likelihoods (summed over places and forces) under the map of this day, minus those
+        under the map for another slide. Both maps are conditioned on the labels of this day.
+        """
+        same, changed = (
+            logsumexp(-0.5 * skin.evaluator.evaluate(db_uT).deviance.astype(float), axis=1)
+            for skin in self._next_day_maps
+        )
+        return same - changed
+
+    @cached_property
+    def _next_day_maps(self) -> tuple[SkinMap, SkinMap]:
+        unpressed = CalibrationData.at_rest(self.data.rest_uT)
+        changed = PressCalibration(begin_day(self.skin), self.networks, unpressed, self)
+        return self.with_labels(self.data.labels).skin, changed.with_labels(unpressed.labels).skin
+
+
+def calibrate_day(
+    noload_map: SkinMap, networks: Sequence[Weights], data: CalibrationData, last: PressCalibration | None
+) -> PressCalibration:
+    """Calibrate to one day's presses at unknown places, given the calibration to the days before, if any.
+
+    If the skin slides as on the last day, the presses of both days are treated as presses of one day. Otherwise, the
+    days before only tell about the skin's constant properties.
+    """
+    if last is not None:
+        pressed_uT = np.concatenate([data.presses_uT, data.labels.db_uT])
+        data, last = join_day(data, last, same=is_same_slide(last.same_slide_log_odds(pressed_uT)))
+    return PressCalibration(condition_on_unlabelled(start_day(noload_map, last), data), networks, data, last)
+
+
+def join_day(
+    data: CalibrationData, last: PressCalibration | None, *, same: bool
+) -> tuple[CalibrationData, PressCalibration | None]:
+    """Return the data since the last change of the slide, and the calibration to the days before this change."""
+    return (data.same_slide(last.data), last.earlier) if same and last is not None else (data, last)
+
+
+def start_day(noload_map: SkinMap, earlier: PressCalibration | None) -> SkinMap:
+    """Return the map before it is conditioned on presses after a change of the slide."""
+    return noload_map if earlier is None else begin_day(earlier.skin)
+
+
+def is_same_slide(log_odds: Float[np.ndarray, " n"]) -> bool:
+    """Return whether presses show that the skin slides as on the last day, from the log odds of each press."""
+    return float(log_odds.sum()) >= SAME_SLIDE_LOG_ODDS_MIN
+
+
+class Slide(NamedTuple):
+    """Whether the skin slides under presses as on the last day of the calibration, and the log odds that it does."""
+
+    same: bool
+    log_odds: float
 
 
 def has_few(labels: LabelledPresses) -> bool:
@@ -368,6 +460,12 @@ class Universal:
         self._turned_given = False  # whether the user stated the orientation of the skin
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
+        self._data: CalibrationData
+        # Calibration to the earlier days, log odds of the same slide for each press of the current day, and decision
+        self._last: PressCalibration | None
+        self._press_odds: np.ndarray
+        self._label_odds: np.ndarray
+        self._same_slide: bool
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
@@ -379,6 +477,7 @@ class Universal:
     def __repr__(self) -> str:
         noload = "no no-load reading" if self._noload_uT is None else "no-load reading taken"
         noload += ", skin turned by a quarter" if self._data.turned else ""
+        noload += f", earlier days: {len(self._data.earlier)}" if self._data.earlier else ""
         presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
         board = f"board {self.layout.name}, {len(self.layout.chips)} chips"
         return (
@@ -442,10 +541,11 @@ class Universal:
     @property
     def label_frame(self) -> LabelFrame | None:
         """Most probable orientation of the labels' axes other than the given one; None if there are few labels."""
-        labels = self._data.labels
+        data = self._calibration.data
+        labels = data.labels
         if len(labels) < LABELS_MIN_N:
             return None
-        power = self.powers.power_for(len(self._data.presses_uT), 0, even=len(self._data.even_uT) > 0)
+        power = self.powers.power_for(len(data.presses_uT), 0, even=len(data.even_uT) > 0)
         unlabelled = self._calibration.with_labels(labels[:0])
         return find_label_frame(unlabelled.estimate(labels.db_uT, [power])[0], labels.place_mm)
 
@@ -460,8 +560,20 @@ class Universal:
 
     @property
     def presses_n(self) -> int:
-        """Number of presses that the model is calibrated to, labelled or not."""
-        return len(self._data.presses_uT) + len(self._data.labels)
+        """Number of presses that the model is calibrated to, labelled or not, on all days."""
+        return self._data.presses_n
+
+    @property
+    def slide(self) -> Slide | None:
+        """Whether the skin slides as on the last day, from presses of the current day; None without earlier days."""
+        if self._last is None:
+            return None
+        return Slide(self._same_slide, float(self._press_odds.sum() + self._label_odds.sum()))
+
+    @property
+    def labels_n(self) -> int:
+        """Number of labelled presses that the model is calibrated to."""
+        return len(self._data.labels)
 
     @property
     def misfit(self) -> float:
@@ -478,7 +590,7 @@ class Universal:
         With a power of 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
         """
         if self._power is None:
-            data = self._data
+            data = self._calibration.data
             tabulated = self.powers.power_for(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
             if len(data.labels):
@@ -492,7 +604,9 @@ class Universal:
     def line(self) -> ForceLine:
         """Calibration of forces, from the labelled presses whose force is known."""
         if self._line is None:
-            self._line = line_of_labels(self._held_out())
+            labels = [day for day, _ in self._calibration.labels_by_day(self._calibration.data.labels)]
+            earlier = self._calibration.held_out_earlier(has_few(reduce(join_labels, labels)))
+            self._line = line_of_labels([*self._held_out(), *earlier])
         return self._line
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False, turned: bool | None = None) -> "Universal":
@@ -547,13 +661,16 @@ class Universal:
         presses_uT, none = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:], no_presses(self.channels_n)
         if even or area:
             even_uT, area_uT = (presses_uT, none) if even else (none, presses_uT)
-            data = replace(data, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT)
-            return self._restart(self._noload_map, data)
-        data = replace(data, area_uT=none)
-        rounds_n = 1 if len(data.presses_uT) else ROUNDS_N
+            return self._begin(replace(data, presses_uT=presses_uT, even_uT=even_uT, area_uT=area_uT))
+        data = replace(data, presses_uT=presses_uT, area_uT=none)
+        press_odds = np.concatenate([self._press_odds, self._log_odds(db_uT)])[-FULL_SET_N:]
+        if self._decide(press_odds, self._label_odds) != self._same_slide:
+            return self._begin(data)
+        self._press_odds = press_odds
+        rounds_n = 1 if len(self._calibration.data.presses_uT) else ROUNDS_N
         press_map = condition_on_presses(self._calibration.skin, db_uT, rounds_n)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
-        return self._set(press_map, replace(data, presses_uT=presses_uT))
+        return self._set(press_map, data)
 
     def label(
         self,
@@ -565,8 +682,9 @@ class Universal:
     ) -> "Universal":
         """Calibrate to one or several presses at known places with known forces.
 
-        Earlier labels are discarded, unless `keep` is set. If only places are known, pass `None` as forces. A single
-        press of known force, such as a weight on the middle of the skin, calibrates the forces of the whole skin.
+        Earlier labels of the same day are discarded, unless `keep` is set. If only places are known, pass `None` as
+        forces. A single press of known force, such as a weight on the middle of the skin, calibrates the forces of the
+        whole skin.
 
         Raises
         ------
@@ -589,12 +707,14 @@ class Universal:
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
-            check_labels(
-                labels.place_mm, labels.force_N, len(labels), self.layout.reach_mm
-            )  # all labels together may be too many
-        data, press_map = replace(self._data, labels=labels), self._calibration.skin
+        check_number(len(labels) + sum(len(day.labels) for day in self._data.earlier))
+        data, label_odds = replace(self._data, labels=labels), self._log_odds(labels.db_uT)
+        if self._decide(self._press_odds, label_odds) != self._same_slide:
+            return self._begin(data)
+        self._label_odds, press_map = label_odds, self._calibration.skin
         if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
-            press_map = condition_on_unlabelled(self._noload_map, data)
+            joined, earlier = join_day(data, self._last, same=self._same_slide)
+            press_map = condition_on_unlabelled(start_day(self._noload_map, earlier), joined)
         return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
@@ -636,7 +756,7 @@ class Universal:
 
     def _held_out(self) -> list[HeldOutLabels]:
         if self._folds is None:  # cross-validation is slow, so it runs only when needed, and once per set of labels
-            self._folds = list(self._calibration.held_out(self._data.labels))
+            self._folds = list(self._calibration.held_out(self._calibration.data.labels))
         return self._folds
 
     def save(self, file: Path | str) -> None:
@@ -645,14 +765,17 @@ class Universal:
             raise SchemaError("save: the model has no no-load reading. First call zero.")
         write_calibration(self._data, Path(file), self.layout.name)
 
-    def remember(self, file: Path | str) -> "Universal":
-        """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`."""
+    def remember(self, file: Path | str, *, new_day: bool = False) -> "Universal":
+        """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`.
+
+        new_day: see `load_universal`.
+        """
         data = read_calibration(Path(file), self.layout.reach_mm, self.channels_n, self.layout.name)
         if data.turned and not self.turnable:
             rule = f"false, because a quarter turn does not reverse the fields of skin {self.layout.name}"
             raise SchemaError(file, "turned", rule, "true", "Calibrate the skin again.")
         self._noload_uT = (-1 if data.turned else 1) * self.layout.to_chips(data.rest_uT[None])[0]
-        return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
+        return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data.next_day() if new_day else data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
         """Predict x_mm, y_mm and force_N from field changes, with the interface of a trained network."""
@@ -661,10 +784,6 @@ class Universal:
     @property
     def _centre_mm(self) -> Float[np.ndarray, "2"]:
         return np.array(self.layout.centre_mm)
-
-    @property
-    def _data(self) -> CalibrationData:
-        return self._calibration.data
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return field changes along the board's axes; raise SchemaError before `zero`."""
@@ -675,27 +794,54 @@ class Universal:
         return -1 if self._data.turned else 1
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate to `data` from scratch, starting with a map that is conditioned on the no-load field only."""
-        self._noload_map = noload_map
-        self._misfits = np.full(len(data.presses_uT), np.nan)
-        return self._set(condition_on_unlabelled(noload_map, data), data)
+        """Calibrate to all days from scratch, starting with a map that is conditioned on the no-load field only."""
+        self._noload_map, self._last = noload_map, None
+        for day in data.earlier:
+            self._last = calibrate_day(noload_map, self.networks, day, self._last)
+        return self._begin(data)
+
+    def _begin(self, data: CalibrationData) -> "Universal":
+        """Calibrate to the current day from scratch, starting with the calibration to the earlier days."""
+        self._press_odds, self._label_odds = self._log_odds(data.presses_uT), self._log_odds(data.labels.db_uT)
+        self._same_slide = self._decide(self._press_odds, self._label_odds)
+        joined, earlier = join_day(data, self._last, same=self._same_slide)
+        self._misfits = np.full(len(joined.presses_uT), np.nan)
+        return self._set(condition_on_unlabelled(start_day(self._noload_map, earlier), joined), data)
+
+    def _log_odds(self, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
+        return np.zeros(len(db_uT)) if self._last is None else self._last.same_slide_log_odds(db_uT)
+
+    def _decide(self, press_odds: Float[np.ndarray, " n"], label_odds: Float[np.ndarray, " m"]) -> bool:
+        """Return whether the skin slides as on the last day."""
+        return self._last is not None and is_same_slide(np.concatenate([press_odds, label_odds]))
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
         """Replace the calibration: `press_map` is conditioned on the unlabelled presses, and now on the labels."""
+        joined, earlier = join_day(data, self._last, same=self._same_slide)
         missing = np.isnan(self._misfits)
         if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
-            self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()
-        self._calibration = PressCalibration(press_map, self.networks, data)
-        self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
+            self._misfits[missing] = press_map.evaluator.evaluate(joined.presses_uT[missing]).misfit()
+        self._data = data
+        self._calibration = PressCalibration(press_map, self.networks, joined, earlier)
+        self._model = self._calibration.with_labels(joined.labels).with_offsets_in_biases()
         self._folds = self._power = self._line = None
         return self
 
 
 def load_universal(
-    calibration: Path | str | None = None, *, file: Path | str = FILE, external_uT: float = 0.0
+    calibration: Path | str | None = None,
+    *,
+    file: Path | str = FILE,
+    external_uT: float = 0.0,
+    new_day: bool = False,
 ) -> Universal:
     """Load a universal model, calibrated to a skin if `calibration` is a file from `save`.
 
+    new_day: set it if the skin may slide under presses in another way than when the file was saved, for example a day
+    later. The presses in the file are then those of an earlier day, with which further presses are compared (see
+    `Universal.slide`). Either the skin slides in the same way, and all presses are used together; or it does not, and
+    those of the earlier day only tell about the skin's constant properties. Until there are presses, a change is
+    assumed.
     file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
     external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change
     since the no-load reading: about 30 for the earth's field, 100 or more if other skins or magnets move nearby. Each
@@ -707,7 +853,13 @@ def load_universal(
     SchemaError : a file is damaged, or `external_uT` is not from 0 to `EXTERNAL_MAX_uT`
     """
     model = Universal(*_read_parts(Path(file)), external_uT=external_uT)
-    return model if calibration is None else model.remember(calibration)
+    if calibration is not None:
+        return model.remember(calibration, new_day=new_day)
+    if new_day:
+        raise SchemaError(
+            "new_day: there is no calibration of an earlier day. Pass a saved calibration, or omit new_day."
+        )
+    return model
 
 
 def is_model(file: Path) -> bool:

@@ -1,7 +1,5 @@
 """Tests of experiment mounting: changes of the mounting, rates of warnings, accuracy on turned skins, tables."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -28,7 +26,7 @@ from reskin.universal.population import grid
 from tests.universal.skins import SETUP
 
 SECTION = Mounting(skins_n=3, labels_n=(4,), draws_n=1)
-SKINS = simulated_skins(SimpleNamespace(setup=SETUP), SECTION.skins_n, seed=5)
+SKINS = simulated_skins(SETUP, SECTION.skins_n, 5, "mounting")
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ from pipeline.experiments.random_presses import (
     BoardPresses,
     RandomPresses,
     draw_presses,
-    interval_score,
     label_sets,
     score_draw,
     score_nearest,
@@ -91,13 +90,6 @@ def test_nearest_label_is_exact_for_its_own_reading(board):
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1
     assert scores["r2_line_f"] == pytest.approx(0)  # score of a constant estimate, the mean force
-
-
-def test_interval_score_is_smallest_for_the_quantiles_of_the_errors():
-    errors = rng_for(0, "interval score").standard_normal(200_000)
-    scores = {width: interval_score(errors, np.full(len(errors), width)) for width in (1.2, 1.645, 2.2)}
-    assert min(scores, key=scores.__getitem__) == 1.645
-    assert interval_score(np.array([3.0]), np.array([1.0])) == pytest.approx(2 + 20 * 2)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Tests of the live page in Chromium: contacts are drawn at the right place; buttons and keys zero, record and adapt.
+"""Tests of the live page in Chromium: what is drawn, and what buttons, keys and forms do.
 
 The environment variable RESKIN_BROWSER is the path of the browser; by default, Chromium is searched on PATH. Without a
 browser, the tests are skipped. The tests use the browser's debugging protocol and need no additional package. If
@@ -20,12 +20,20 @@ import aiohttp
 import numpy as np
 import pytest
 
+from reskin.live.emulator import playing
 from reskin.live.session import PRESSES_N
+from reskin.live.skins import SkinFolder
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model, zero_requests
-from tests.live.test_estimators import guided_pokes, make_poke_script, random_pokes  # noqa: F401 - fixtures
+from tests.live.test_estimators import (  # noqa: F401 - fixtures
+    POKED_N,
+    QUIET_N,
+    guided_pokes,
+    make_poke_script,
+    random_pokes,
+)
 from tests.live.test_server import LONG_S, serve
 from tests.live.test_several import RATES_HZ, UNPLUGGED_I, plug_in_all
 
@@ -33,16 +41,15 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
-# JavaScript: the colour of the pixel at a place in mm, converted with the scale of the page.
-DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = MARGIN_PX,
-  [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
-  scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
-  return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
-    ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
+# JavaScript: the colour of the pixel at a place in mm, and the colour of the contact's force in the legend.
+DOT = """((x, y) => { const {last, frame, parts: {board}} = boards[0], [px, py] = frame.at(x, y),
+  ratio = devicePixelRatio;
+  return last.contact ? [...board.getContext("2d").getImageData(ratio * px, ratio * py, 1, 1).data].slice(0, 3).concat(
+    strengthColour(last.force).match(/[0-9]+/g).map(Number)) : []; })"""
 # JavaScript: the number of pixels in which a trace differs from the same trace redrawn at once, and of drawn pixels.
 COMPARE_TRACES = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
-  const anew = new Trace(shown.canvas, shown.first, shown.least);
+  const anew = new Trace(shown.canvas, shown.first, shown.least, shown.below);
   while (shown.draw(board.rows, board.changed, count)) {}
   board.changed = Infinity; anew.columns = 1e6;
   while (anew.draw(board.rows, Infinity, count)) {}
@@ -144,9 +151,8 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
                 "(({state, last, dirty}) => !state.silent && last && last.contact && !dirty && "
                 f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
             )
-            blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
-            # the colour `--link` in the page's style sheet
-            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3
+            colours = np.array(await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []"))
+            assert np.abs(colours[:3] - colours[3:]).max() < 3  # the dot has the colour of its force
             await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         await tab.until(
@@ -165,12 +171,69 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
         while not zeroed:
             await asyncio.sleep(0.02)
         await tab.until("boards[0].state.zeroed")
+        await tab.until("boards[0].parts.zeroed.innerText.startsWith('2 times')")
         assert await tab.value("boards[0].parts.adapt.disabled")  # only the universal model can adapt
+        # The true place of a real board is unknown: there is no switch, and nothing is drawn even if it were on.
+        await tab.value("boards[0].parts.truth.checked = true")
+        assert await tab.value("boards[0].parts.emulated.offsetHeight") == 0
+        assert not await tab.value("boards[0].truthShown()")
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
     (folder,) = (tmp_path / "captures").iterdir()
     assert (folder / HEADER_FILE).is_file()
+
+
+# JavaScript: click on a place in mm.
+CLICK = """((x, y) => { const {frame, parts: {board}} = boards[0], [px, py] = frame.at(x, y),
+  at = board.getBoundingClientRect();
+  board.dispatchEvent(new MouseEvent("click", {clientX: at.left + px, clientY: at.top + py, bubbles: true})); })"""
+
+
+def test_page_saves_loads_and_undoes_what_it_learnt_and_shows_true_places(tmp_path, random_pokes):  # noqa: F811
+    quiet = make_poke_script(random_pokes)
+    place_mm, force_N = random_pokes[2:]
+    poke_i = np.minimum(np.maximum(np.arange(len(quiet)) - QUIET_N, 0) // (2 * POKED_N), len(place_mm) - 1)
+    true = np.column_stack([place_mm, force_N])[poke_i]
+    true[np.linalg.norm(quiet.frames.b_uT - quiet.frames.b_uT[0], axis=1) < 100] = np.nan
+
+    async def act(tab: Tab) -> None:
+        assert not await tab.value("boards[0].truthShown()")  # only on demand
+        await tab.value("boards[0].parts.truth.click()")
+        await tab.until("boards[0].parts.off.innerText.includes('the estimate is off by')")
+        await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
+        await tab.look("true", "boards[0].last.contact && !isNaN(boards[0].last.trueX)")
+
+        await tab.value(f"{CLICK}(3.5, 12)")
+        typed = "[boards[0].parts.x.value, boards[0].parts.y.value].map(Number)"
+        found_mm = await tab.until(typed, lambda values: values != [0, 0])
+        assert (
+            np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
+        )  # mm; a pixel is 0.05 mm, and values have one decimal
+        await tab.value("boards[0].parts.label.click()")
+        await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
+        assert await tab.text("learnt") == "1 press labelled by you"
+
+        await tab.value("boards[0].parts.skinbox.open = true; boards[0].parts.name.focus()")
+        for key in "zap1":  # typed text must not press the buttons Zero, Adapt and Places
+            await tab.press_key(key)
+        assert await tab.value("boards[0].parts.name.value") == "zap1"
+        assert await tab.value("boards[0].state.adapting === '' && boards[0].state.zeroings_n === 1")
+        await tab.value("boards[0].parts.save_form.requestSubmit()")
+        await tab.until("boards[0].state.adapted.startsWith('saved ')")
+        await tab.value("boards[0].parts.save_form.requestSubmit()")
+        await tab.until("boards[0].parts.adapting.innerText.includes('exists already. Choose another name.')")
+        await tab.value("boards[0].parts.undo.click()")
+        await tab.until("boards[0].parts.learnt.innerText === 'nothing yet'")
+        await tab.until("!boards[0].parts.load.disabled")
+        await tab.value("boards[0].parts.load_form.requestSubmit()")
+        await tab.until("boards[0].parts.model.innerText.includes('with the saved skin zap1')")
+        await tab.look("skins")
+
+    with playing(replace(quiet, true_contacts=true)) as board:
+        skins = SkinFolder(tmp_path / "skins")
+        serve(board.port, load_universal(), in_browser(tmp_path, act), emulated=board, skins=skins)
+    assert [file.name for file in (tmp_path / "skins").iterdir()] == ["zap1.safetensors"]
 
 
 def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  # noqa: F811

@@ -5,6 +5,7 @@ import threading
 import time
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,16 @@ import pytest
 from reskin.board.port import open_port, read_waiting
 from reskin.board.stream import decode_all
 from reskin.errors import CaptureError, ParamsError, ReskinError
-from reskin.live.emulator import LATE_MAX_S, inject, make_port, parse_fault, play, read_script
+from reskin.live.emulator import (
+    LATE_MAX_S,
+    EmulatedBoard,
+    TouchPrinter,
+    inject,
+    make_port,
+    parse_fault,
+    play,
+    read_script,
+)
 from reskin.recordings.header import LOG_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import render
 from tests.live.boards import RATE_HZ, make_script, write_script
@@ -242,6 +252,52 @@ def test_script_of_a_simulation_has_contacts(source):
     assert script.frames.b_uT.shape == (len(script), 15)
     assert np.all(np.diff(script.t_s) >= 0)
     assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # contacts change the field by more than 100 uT
+    true = script.true_contacts
+    contact = np.isfinite(true[:, 0])
+    np.testing.assert_array_equal(np.isfinite(true), np.repeat(contact[:, None], 3, axis=1))
+    change_uT = np.linalg.norm(script.frames.b_uT - script.frames.b_uT[~contact].mean(axis=0), axis=1)
+    assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])  # uT; the noise of 15 channels is about 15 uT
+    # True forces and field changes are simultaneous: shifted by a frame or more, they are less correlated.
+    force_N = np.nan_to_num(true[:, 2])
+    correlation = [np.corrcoef(np.roll(force_N, lag), change_uT)[0, 1] for lag in range(-5, 6)]
+    assert np.argmax(correlation) == 5
+
+
+def test_true_contacts_of_a_capture_are_unknown(tmp_path):
+    assert read_script(str(write_script(POKE_SCRIPT, tmp_path / "c0"))).true_contacts is None
+
+
+def test_true_contact_is_that_of_the_frame_sent_last(times):
+    true = np.arange(3.0 * len(SCRIPT)).reshape(-1, 3)
+    script, found = replace(SCRIPT, true_contacts=true), []
+    board = EmulatedBoard(script, SimpleNamespace(name="port"))
+    reader = FakeReader(times)
+
+    def note_sent(piece_i):
+        board.note_sent(piece_i)
+        found.append((len(reader.arrival_s), board.true_contact()))
+
+    play(script, reader, times, on_sent=note_sent)
+    assert [contact for _, contact in found] == [tuple(true[sent_n - 1]) for sent_n, _ in found]
+    assert found[-1][0] == len(script)
+
+
+def test_true_places_are_printed_when_a_touch_begins(times):
+    true, printed = np.full((len(SCRIPT), 3), np.nan), []
+    true[100:150], true[300:400] = (4.0, 12.0, 0.5), (12.0, 4.0, 1.5)
+    true[320, 2] = 1.75
+    script, reader = replace(SCRIPT, true_contacts=true), FakeReader(times)
+    printer = TouchPrinter(script, "nominal", lambda text: printed.append((len(reader.arrival_s), text)))
+    for _ in range(2):
+        play(script, reader, times, on_sent=printer)
+    sent_n, texts = zip(*printed, strict=True)
+    assert texts == 2 * (
+        "true place: x 4.0 mm, y 12.0 mm, up to 0.50 N", "true place: x 12.0 mm, y 4.0 mm, up to 1.75 N",
+    )  # fmt: skip
+    first_n = np.array([101, 301, len(script) + 101, len(script) + 301])
+    assert np.all((np.array(sent_n) >= first_n) & (np.array(sent_n) < first_n + 256))
+    with pytest.raises(ParamsError, match="--true-places: the true places of captures/run1 are unknown"):
+        TouchPrinter(SCRIPT, "captures/run1", print)
 
 
 def test_invalid_sources_raise(tmp_path):

@@ -1,14 +1,17 @@
 """Tests that boards are recognised by the bytes that they send, and that other devices are not."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reskin import cli as commands
 from reskin.board import find
-from reskin.errors import CaptureError
+from reskin.errors import CaptureError, ReskinError
 from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
@@ -67,6 +70,44 @@ def test_chips_without_noise_have_no_lsb():
     script = make_script(pokes_n=0)
     without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
     assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        lambda port: commands.live([port]),
+        lambda port: commands.record(port, seconds=0.1),
+        lambda port: commands.record("/dev/none", gauge=port, seconds=0.1),
+        lambda port: commands.emulate("nominal", port),
+        lambda port: commands.emulate(port),
+        lambda port: commands.live(emulate=port),
+        lambda port: commands.live(skins=Path(port), port=["/dev/none"]),
+    ],
+    ids=["live", "record", "gauge", "emulated port", "emulated source", "live --emulate", "skins"],
+)
+def test_file_in_place_of_a_port_is_one_sentence(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "notes.txt"
+    file.write_text("not a port")
+    with pytest.raises(ReskinError, match=r"notes\.txt") as error:
+        command(str(file))
+    assert "\n" not in str(error.value)
+    assert file.read_text() == "not a port"
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_busy_port_is_one_sentence():
+    with plugged_in(make_script(pokes_n=0), loop=True) as name, find.open_port(name, find.BAUD):
+        busy = f"{name}: cannot open the port: another program uses it"
+        with pytest.raises(CaptureError, match=busy) as error:
+            find.open_port(name, find.BAUD)
+        assert "\n" not in str(error.value)
+        assert str(find.detect_board(name, 0.1)).startswith(busy)
+
+
+def test_other_device_is_not_a_serial_port():
+    with pytest.raises(CaptureError, match=f"{os.devnull}: cannot open the port: it is not a serial port"):
+        find.open_port(os.devnull, find.BAUD)
 
 
 def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):

@@ -98,6 +98,7 @@ def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_
         http_port = free.getsockname()[1]
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
     assert "open http://localhost" in page.stdout.readline()  # the page waits for the board
+    assert f"skins are saved in {tmp_path / 'skins'}" in page.stdout.readline()
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
     asyncio.run(watch_page(f"http://localhost:{http_port}/live"))
     page.send_signal(signal.SIGINT)

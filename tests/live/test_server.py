@@ -2,11 +2,13 @@
 
 import asyncio
 import json
+import math
 import re
 import socket as socketlib
 import struct
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 
 import aiohttp
@@ -16,24 +18,29 @@ from aiohttp import web
 
 from reskin.errors import CaptureError, ParamsError
 from reskin.live import server
+from reskin.live.emulator import playing
 from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
 from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
 from reskin.live.tracker import Models
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE, parse
-from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zero_requests
+from tests.live.boards import PLACES, POKE_S, QUIET_S, RATE_HZ, make_script, plugged_in, write_model, zero_requests
 
 LONG_S = 120.0
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # warnings about unclosed sockets of refused clients
 
 
 def serve(
-    ports: str | list[str], models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token=""
+    ports: str | list[str],
+    models: Models,
+    act: Callable[[str, aiohttp.ClientSession], Awaitable[None]],
+    token="",
+    **options: object,
 ):
     """Serve a page of one or several boards, run `act` with a client, and stop the server."""
 
     async def run() -> None:
-        boards = open_sessions([ports] if isinstance(ports, str) else ports, models, "a board")
+        boards = open_sessions([ports] if isinstance(ports, str) else ports, models, "a board", **options)
         for board in boards:
             board.start()
         runner = web.AppRunner(Server(boards, token).application())
@@ -60,6 +67,7 @@ def unpack(data: bytes) -> dict:
     assert len(values) == first + bins_n * (1 + 2 * (1 + chips_n))
     names = ("x_mm", "y_mm", "F_N", "sd_x", "sd_y", "contact", "rate_hz", "lost")
     message = dict(zip(names, values[:8].tolist(), strict=True))
+    message |= dict(zip(("dropped", "true_x_mm", "true_y_mm", "true_F_N"), values[12:16].tolist(), strict=True))
     return message | {"number": number, "t_s": t_s, "bins_n": bins_n, "change_uT": values[NUMBERS_N:first]}
 
 
@@ -89,6 +97,16 @@ def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monke
             )
             assert np.abs(np.array([poke["x_mm"], poke["y_mm"], poke["F_N"]]) - PLACES).max(axis=1).min() < 0.5
             assert poke["bins_n"] <= BINS_N
+            assert poke["dropped"] == 0
+            # The true place of a real board is unknown, and the page offers no switch to show it.
+            assert not state["true_places"]
+            assert math.isnan(poke["true_x_mm"])
+            assert (state["zeroings_n"], len(state["zero_bins"])) == (1, 1)
+            assert state["model"] == "trained network"
+            assert (state["expected"], state["least_force"]) == ("not measured for this network", "not measured")
+            await socket.send_json({"save": "s1"})
+            refused = await until(socket, lambda message: bool(message.get("adapted")))
+            assert "only the universal model can learn a skin" in refused["adapted"]
             await socket.send_json({"seen": poke["number"]})
             await socket.send_json({"press": "record"})
             recording = await until(socket, lambda message: bool(message.get("recording")))
@@ -106,11 +124,33 @@ def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monke
             await socket.send_json({"press": "zero"})
             while not zeroed:
                 await asyncio.sleep(0.02)
-            while not zeroed[0].zeroed:
-                await asyncio.sleep(0.02)
+            await until(socket, lambda message: message.get("zeroings_n") == 2)
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, models, act)
+
+
+def test_page_of_an_emulated_board_receives_the_true_contact(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    script = make_script(pokes_n=1, rate_hz=100.0)
+    poked = (script.t_s >= QUIET_S) & (script.t_s < QUIET_S + POKE_S)
+    true = np.where(poked[:, None], PLACES[0], np.nan)
+
+    async def act(address: str, client: aiohttp.ClientSession) -> None:
+        async with client.ws_connect(f"{address}/live") as socket:
+            state = await until(socket, lambda message: "true_places" in message and not message["waiting"])
+            assert state["true_places"]
+            before = await until(socket, lambda message: "true_x_mm" in message)
+            poke = await until(socket, lambda message: message.get("contact") == 1)
+            assert math.isnan(before["true_x_mm"])
+            np.testing.assert_allclose([poke[f"true_{name}"] for name in ("x_mm", "y_mm", "F_N")], PLACES[0])
+            await socket.send_json({"press": "record"})
+            recording = await until(socket, lambda message: bool(message.get("recording")))
+            header = parse(Path(f"{recording['recording']}.part", HEADER_FILE).read_text(), "header")
+            assert header.source == "simulated"  # so that it is not added to a recorded scene
+
+    with playing(replace(script, source="simulated", true_contacts=true)) as board:
+        serve(board.port, [], act, emulated=board)
 
 
 def test_unusable_address_is_an_error_and_is_not_printed():
@@ -153,6 +193,7 @@ def test_page_waits_for_a_missing_board(tmp_path):
         for path, kind in (
             ("/", "text/html"),
             ("/live.js", "javascript"),
+            ("/skin.js", "javascript"),
             ("/trace.js", "javascript"),
             ("/live.css", "text/css"),
         ):

@@ -4,7 +4,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from sklearn.metrics import r2_score
 
-from reskin.metrics import METRICS, register, score, score_groups
+from reskin.metrics import METRICS, coverage_pct, interval_score, median_error_mm, register, score, score_groups
 
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
@@ -85,3 +85,17 @@ def test_registration_uses_one_offset_per_board():
     scores = score_groups(TRUE, TRUE + offset, BOARD, SKIN)
     assert scores["all"]["accuracy_pct"] == 0.0
     assert scores["registered"]["accuracy_pct"] == 100.0
+
+
+def test_interval_score_is_smallest_for_the_quantiles_of_the_errors():
+    errors = np.random.default_rng(2).standard_normal(200_000)
+    ends = np.ones(len(errors))
+    scores = {width: interval_score(errors, -width * ends, width * ends) for width in (1.2, 1.645, 2.2)}
+    assert min(scores, key=scores.__getitem__) == 1.645
+    assert interval_score(np.array([3.0]), np.array([-1.0]), np.array([1.0])) == pytest.approx(2 + 20 * 2)
+    # tolerance: four standard errors of a proportion of 0.9 with 200,000 values
+    assert coverage_pct(errors, -1.645 * ends, 1.645 * ends) == pytest.approx(90, abs=0.27)
+
+
+def test_median_error_is_a_distance():
+    assert median_error_mm(TRUE[:3, :2], TRUE[:3, :2] + [[3.0, 4.0], [0.0, 1.0], [9.0, 9.0]]) == 5.0

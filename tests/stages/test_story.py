@@ -45,6 +45,7 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "mounting",
     "recorded_limits",
     "touches",
+    "moving_hand",
     "population",
     "worlds",
 }

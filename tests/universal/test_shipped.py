@@ -341,7 +341,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
     with pytest.raises(SchemaError, match="the file is not safetensors"):
         load_universal(file)
     io.write_tensors(file, sound, {"format": "reskin-skin-0"})
-    with pytest.raises(SchemaError, match="format must be reskin-skin-3; got reskin-skin-0"):
+    with pytest.raises(SchemaError, match="format must be reskin-skin-4; got reskin-skin-0"):
         load_universal(file)
 
 

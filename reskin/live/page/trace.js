@@ -2,21 +2,23 @@
 // or the size changes, the picture is first stretched, and then redrawn in several frames, starting with the newest values.
 "use strict";
 // WINDOW_S and BIN_S must equal the constants of the same names in reskin/live/session.py.
-const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, TRACE_PX = 170, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
+const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, AXIS_PX = 20, UNLABELLED_PX = 6, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
 const NARROW_PX = 400; // below this width, the time axis has fewer labels
 const REDRAW_MS = 3, LINE_PX = 1.5; // REDRAW_MS: time per frame for redrawing old values
 const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // upper ends of the scale, times a power of ten; few values, so that the scale seldom changes
 
 class Trace {
-  constructor(canvas, first, least) {
-    this.canvas = canvas; this.first = first; this.least = least;
+  constructor(canvas, first, least, below) { // below: whether the time axis is labelled below this trace
+    this.canvas = canvas; this.first = first; this.least = least; this.below = below;
+    this.high_px = ABOVE_PX + HIGH_PX + (below ? AXIS_PX : UNLABELLED_PX);
     this.layer = {width: 0}; this.top = least;
     this.columns = 64; // number of pixel columns to redraw per frame, adjusted so that redrawing takes REDRAW_MS
   }
 
   // Draws the minimum and the maximum of each bin; bins from `changed` on are new. Returns whether older bins must still be redrawn.
-  draw(rows, changed, count) {
-    const [pen, wide, ratio] = penOn(this.canvas, TRACE_PX), newest = rows[rows.length - 1].n, begun_ms = performance.now();
+  // marks: numbers of bins at which dashed lines are drawn.
+  draw(rows, changed, count, marks = []) {
+    const [pen, wide, ratio] = penOn(this.canvas, this.high_px), newest = rows[rows.length - 1].n, begun_ms = performance.now();
     let greatest = this.least;
     for (const {high} of rows) for (let j = this.first; j < this.first + count; j++) if (high[j] > greatest) greatest = high[j];
     const unit = 10 ** Math.floor(Math.log10(greatest)), top = unit * NICE.find((n) => n * unit >= greatest || n === 10);
@@ -27,7 +29,7 @@ class Trace {
     const redrawn = Math.max(Math.min(this.columns, this.drawn - left), 0);
     this.drawLines(rows, this.drawn - redrawn, this.drawn);
     this.drawn -= redrawn;
-    this.drawScale(pen, wide, top);
+    this.drawScale(pen, wide, top, marks.map((n) => (newest + 1 - n) * BIN_S));
     pen.setTransform(1, 0, 0, 1, 0, 0);
     pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // before the measurement of time below, to include the time for this call
     if (redrawn) this.columns = Math.min(Math.max(Math.round(this.columns * Math.min(REDRAW_MS / (performance.now() - begun_ms), 2)), 8), layer.width);
@@ -39,7 +41,7 @@ class Trace {
     if (kind !== this.kind) {
       const before = this.layer;
       this.layer = document.createElement("canvas"); this.pen = this.layer.getContext("2d");
-      this.layer.width = wide; this.layer.height = TRACE_PX * ratio;
+      this.layer.width = wide; this.layer.height = Math.floor(this.high_px * ratio);
       if (before.width) this.pen.drawImage(before, 0, 0, wide, this.layer.height);
       this.edge = this.drawn = edge;
     }
@@ -83,10 +85,17 @@ class Trace {
     pen.restore();
   }
 
-  drawScale(pen, wide, top) {
+  drawScale(pen, wide, top, marks_s) { // the vertical lines of both traces are at the same times
     const step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(top / 3))).find((n) => top / n <= 5);
-    pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right";
+    const x = (s) => wide - s / WINDOW_S * (wide - LEFT_PX), bottom = ABOVE_PX + HIGH_PX, every_s = wide < NARROW_PX ? 5 : 2;
+    pen.strokeStyle = colour("--line"); pen.fillStyle = colour("--soft"); pen.textAlign = "right"; pen.lineWidth = 1;
     for (let i = 0; i * step <= top * 1.001; i++) { pen.strokeRect(LEFT_PX, this.y(i * step), wide, 0); pen.fillText(+(i * step).toPrecision(3), LEFT_PX - 6, this.y(i * step) + 4); }
-    for (let s = 0; s <= WINDOW_S; s += wide < NARROW_PX ? 5 : 2) pen.fillText(s ? `−${s} s` : "now", Math.max(wide - s / WINDOW_S * (wide - LEFT_PX), LEFT_PX + 20), TRACE_PX - 4);
+    for (let s = 0; s <= WINDOW_S; s += every_s) {
+      pen.beginPath(); pen.moveTo(x(s), ABOVE_PX); pen.lineTo(x(s), bottom + (this.below ? 4 : 1)); pen.stroke();
+      if (this.below) pen.fillText(s ? `−${s} s` : "now", Math.max(x(s), LEFT_PX + 20), bottom + AXIS_PX - 4);
+    }
+    pen.strokeStyle = colour("--alarm"); pen.setLineDash([5, 4]);
+    for (const s of marks_s) if (s > 0 && s < WINDOW_S) { pen.beginPath(); pen.moveTo(x(s), 0); pen.lineTo(x(s), bottom); pen.stroke(); pen.fillStyle = colour("--alarm"); pen.fillText("zeroed", x(s) - 3, ABOVE_PX + 10); }
+    pen.setLineDash([]);
   }
 }

@@ -1,0 +1,16 @@
+"""A benchmark that other people can enter: frozen folds, a file format for predictions, scores, a table of entries.
+
+docs/benchmark.md says what is asked, how to enter, and which rules hold.
+
+    >>> from pipeline import benchmark
+    >>> task = benchmark.tasks("simulated")[0]
+    >>> task.fold, task.labels_n, task.tests_uT.shape
+    ('v1.simulated.test0.draw0.labels0', 0, (90, 15))
+    >>> rows = task.predictions(place_mm=[[8.0, 8.0]] * 90, force_N=[1.0] * 90)
+    >>> benchmark.write([rows], "predictions.csv")  # doctest: +SKIP
+"""
+
+from pipeline.benchmark.folds import Presses, Task, tasks
+from pipeline.benchmark.predictions import write
+
+__all__ = ["Presses", "Task", "tasks", "write"]

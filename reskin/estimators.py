@@ -1,0 +1,362 @@
+"""Estimators with the interface of scikit-learn, and the paper's metrics as scorers. Requires `pip install '.[learn]'`.
+
+`ContactRegressor` is the paper's network; `UniversalRegressor` is the universal model, calibrated to one skin. Both
+have the same inputs and outputs, so that they can be compared by `cross_val_score`:
+
+- X [n ch]: changes of the field since the no-load reading in uT; the channels are Bx, By, Bz of chip 0, then of chip 1,
+  and so on. These are the columns `dbx0_uT`, ... of `reskin.load_recording`.
+- y [n 3]: x_mm, y_mm and the normal force in N. Unknown values are NaN.
+"""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.metrics import make_scorer
+from sklearn.utils.validation import check_consistent_length, check_is_fitted, validate_data
+
+from reskin import io, metrics
+from reskin.config import parse
+from reskin.data.rows import TARGETS
+from reskin.errors import ParamsError, SchemaError, TrainingError, require
+from reskin.models.job import TrainingData, TrainingJob, TrainingResult
+from reskin.models.recipe import Recipe
+from reskin.models.runner import MAX_ATTEMPTS_N
+from reskin.models.trained import FORMAT, SUFFIX, Network
+
+# How scikit-learn validates y: one or several targets, which may be unknown (NaN).
+TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "allow-nan"}
+
+
+class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """The paper's network, trained by the code of the stages: equal rows and settings give equal weights, bit for bit.
+
+    Parameters
+    ----------
+    architecture, inputs, scaling, triplet_weight, batch_n, rate_max, gradient_norm_max, weight_decay
+        The recipe (see `reskin.models.recipe.Recipe`). The defaults are recipe `paper` of `params.yaml`.
+    steps_n : int
+        Number of training steps. The default is that of scene `lab`.
+    random_state : int
+        Seed of initial weights and batches.
+
+    Attributes
+    ----------
+    network_ : Network
+        The trained network, with its scaler.
+    loss_curve_ : list of float
+        Mean squared error in each block of training steps, for scaled targets.
+    n_features_in_, feature_names_in_
+        Number of channels, and their names if X was a DataFrame.
+
+    Examples
+    --------
+    Accuracy on boards that are not in the training data, here on simulated boards:
+
+    >>> import numpy as np
+    >>> from sklearn.model_selection import GroupKFold, cross_val_score
+    >>> rng = np.random.default_rng(0)
+    >>> pokes = np.column_stack([rng.uniform(2, 14, (20, 2)), rng.uniform(0.4, 1.2, 20)])  # x_mm, y_mm, depth_mm
+    >>> X, y, board = [], [], []
+    >>> for name in ("b0", "b1", "b2"):
+    ...     skin, circuit = reskin.draw_skin(f"{name}_s0"), reskin.draw_board(name)
+    ...     noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, pokes, board=circuit)
+    ...     X.append(b_uT - noload_uT)
+    ...     y.append(np.column_stack([pokes[:, :2], force_N]))
+    ...     board += len(pokes) * [name]
+    >>> X, y = np.concatenate(X), np.concatenate(y)
+    >>> model = reskin.ContactRegressor(steps_n=20)  # few steps, for a quick example
+    >>> within_1mm = reskin.SCORERS["accuracy_pct"]
+    >>> len(cross_val_score(model, X, y, groups=board, cv=GroupKFold(3), scoring=within_1mm))  # one score per board
+    3
+    """
+
+    def __init__(
+        self,
+        *,
+        architecture: Literal["paper", "released"] = "paper",
+        inputs: Literal["raw", "shape"] = "raw",
+        scaling: Literal["standard", "released"] = "standard",
+        triplet_weight: float = 0.0,
+        steps_n: int = 3000,
+        batch_n: int = 128,
+        rate_max: float = 1.2e-2,
+        gradient_norm_max: float = 0.3,
+        weight_decay: float = 0.0,
+        random_state: int = 0,
+    ) -> None:
+        self.architecture = architecture
+        self.inputs = inputs
+        self.scaling = scaling
+        self.triplet_weight = triplet_weight
+        self.steps_n = steps_n
+        self.batch_n = batch_n
+        self.rate_max = rate_max
+        self.gradient_norm_max = gradient_norm_max
+        self.weight_decay = weight_decay
+        self.random_state = random_state
+
+    def fit(self, X: ArrayLike, y: ArrayLike, *, skin: ArrayLike | None = None) -> "ContactRegressor":
+        """Train the network.
+
+        Parameters
+        ----------
+        X : array [n ch]
+            Changes of the field in uT.
+        y : array [n 3]
+            x_mm, y_mm and the normal force in N; NaN if unknown. Other numbers of targets are accepted as well.
+        skin : array [n], optional
+            Name of each row's skin, for the triplet loss (`triplet_weight` above 0), which compares places on the same
+            skin. Default: all rows are from one skin.
+
+        Raises
+        ------
+        ParamsError
+            If a setting is invalid.
+        TrainingError
+            If training diverges, or a target is unknown in all rows.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If the network predicts nearly the same for all rows, in all of `MAX_ATTEMPTS_N` training runs.
+        """
+        require("torch", "ContactRegressor")
+        recipe, seed = self._recipe(), _as_seed(self.random_state)
+        checks = ({"dtype": np.float32, "ensure_min_samples": 2}, TARGET_CHECKS)
+        db_uT, targets = validate_data(self, X, y, validate_separately=checks)
+        check_consistent_length(db_uT, targets, skin)
+        target = targets.reshape(len(targets), -1)
+        if np.isnan(target).all(axis=0).any():
+            raise TrainingError("ContactRegressor: a target is unknown (NaN) in all rows. Remove this column of y.")
+        data = TrainingData(db_uT, target, np.zeros(len(db_uT), int) if skin is None else np.asarray(skin))
+        job = TrainingJob("fit", "own", recipe, "all", seed, 0, np.arange(len(db_uT)), np.zeros(0, np.int64))
+        result, collapsed_before_n = _train(job, data)
+        self._targets_shape = targets.shape[1:]
+        self.loss_curve_ = result.curve
+        self.network_ = Network(
+            _card(recipe, seed, db_uT.shape[1], result, collapsed_before_n),
+            dict(result.weights) | result.scaler.arrays(),
+        )
+        return self
+
+    def predict(self, X: ArrayLike) -> np.ndarray:
+        """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT."""
+        check_is_fitted(self)
+        db_uT = validate_data(self, X, dtype=np.float32, reset=False)
+        return self.network_(db_uT).reshape(-1, *self._targets_shape).astype(np.float64)
+
+    def save(self, file: Path | str) -> None:
+        """Write the network (.safetensors) and its card (.json), for `reskin.load_model` and `reskin live --model`.
+
+        Raises
+        ------
+        ParamsError
+            If the file's name does not end in .safetensors.
+        SchemaError
+            If the network was not trained on Bx, By, Bz of each chip and the three targets x_mm, y_mm and force.
+        """
+        check_is_fitted(self)
+        path = Path(file)
+        if path.suffix != SUFFIX:
+            raise ParamsError(file, "the name", f"one that ends in {SUFFIX}", path.name, f"Try: {path.name}{SUFFIX}")
+        if self.n_features_in_ % 3 or self._targets_shape != (len(TARGETS),):
+            got = f"{self.n_features_in_} channels and targets of shape {self._targets_shape}"
+            rule = f"3 channels per chip and the targets {', '.join(TARGETS)}"
+            raise SchemaError(file, "a saved network", f"for {rule}", got, "Use joblib for other networks.")
+        io.write_tensors(path, self.network_.tensors, {"format": FORMAT})
+        io.write_json(path.with_suffix(".json"), dict(self.network_.card))
+
+    def _recipe(self) -> Recipe:
+        settings = {name: getattr(self, name) for name in Recipe.model_fields}
+        values = {name: value.item() if isinstance(value, np.generic) else value for name, value in settings.items()}
+        return parse(Recipe, values, "ContactRegressor")
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+
+def _as_seed(random_state: Any) -> int:
+    if not isinstance(random_state, int | np.integer):
+        remedy = "A run without a seed could not be repeated."
+        raise ParamsError("ContactRegressor", "random_state", "a whole number", repr(random_state), remedy)
+    return int(random_state)
+
+
+def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
+    """Train as `reskin.models.runner.run_jobs`; return the result, and the number of runs before that collapsed."""
+    from reskin.models.train import train_stack  # imported late, because it imports torch
+
+    for attempt_i in range(MAX_ATTEMPTS_N):
+        (result,) = train_stack([replace(job, attempt_i=attempt_i)], data)
+        if result.stopped_step is not None:
+            remedy = "Lower rate_max or gradient_norm_max."
+            raise TrainingError(f"ContactRegressor: training diverged by step {result.stopped_step}. {remedy}")
+        if not result.collapsed:
+            return result, attempt_i
+    warnings.warn(
+        f"the network collapsed in all of {MAX_ATTEMPTS_N} runs: it predicts nearly the same for all rows. Are X and y "
+        "in the same order? Otherwise, try another rate_max or more steps.",
+        ConvergenceWarning,
+        stacklevel=3,
+    )
+    return result, MAX_ATTEMPTS_N - 1
+
+
+def _card(
+    recipe: Recipe, seed: int, channels_n: int, result: TrainingResult, collapsed_before_n: int
+) -> dict[str, Any]:
+    """Describe a trained network, with the entries of a card on which predictions depend."""
+    return {
+        "format": FORMAT,
+        "recipe": recipe.model_dump(mode="json"),
+        "seed": seed,
+        "input": {"quantity": "change of field", "unit": "uT", "channels_n": channels_n, "view": recipe.inputs},
+        "output": {name: name.rsplit("_", 1)[1] for name in TARGETS},
+        "collapsed": result.collapsed,
+        "collapsed_before_n": collapsed_before_n,
+        "curve": [round(value, 9) for value in result.curve],
+    }
+
+
+class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
+    """The universal model, calibrated to one skin by a few labelled presses and any number of unlabelled ones.
+
+    Parameters
+    ----------
+    noload_uT : array [f ch] or [ch]
+        Fields of the untouched skin; needed by `fit`.
+    spread : {"anywhere", "even", "area"}
+        How the unlabelled presses are spread: at any places; evenly over the skin, as on a grid; or at random places
+        all over the area of presses (see `reskin.universal.model.Universal.see`).
+    external_uT : float
+        Size of external fields on a moving board (see `reskin.load_universal`).
+    file : path, optional
+        A model for another board. Default: the model for the paper's board.
+
+    Attributes
+    ----------
+    model_ : Universal
+        The calibrated model. `model_.save(FILE)` writes the calibration, for `reskin.load_universal(FILE)` and `reskin
+        live --model FILE`.
+    n_features_in_, feature_names_in_
+        Number of channels, and their names if X was a DataFrame.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> pokes = np.column_stack([rng.uniform(2, 14, (50, 2)), rng.uniform(0.4, 1.2, 50)])  # x_mm, y_mm, depth_mm
+    >>> noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=1), pokes)
+    >>> X, y = b_uT - noload_uT, np.column_stack([pokes[:, :2], force_N])
+    >>> y[10:40] = np.nan  # 10 labelled presses, 30 unlabelled ones; the last 10 are for testing
+    >>> model = reskin.UniversalRegressor(noload_uT).fit(X[:40], y[:40])
+    >>> mean, std = model.predict(X[40:], return_std=True)
+    >>> mean.shape, std.shape
+    ((10, 3), (10, 3))
+    >>> bool(model.score(X[40:], y[40:]) > 0.5)  # R^2, averaged over x, y and force
+    True
+    """
+
+    def __init__(
+        self,
+        noload_uT: ArrayLike | None = None,
+        *,
+        spread: Literal["anywhere", "even", "area"] = "anywhere",
+        external_uT: float = 0.0,
+        file: Path | str | None = None,
+    ) -> None:
+        self.noload_uT = noload_uT
+        self.spread = spread
+        self.external_uT = external_uT
+        self.file = file
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> "UniversalRegressor":
+        """Calibrate the model; an earlier calibration is discarded.
+
+        Parameters
+        ----------
+        X : array [n ch]
+            Changes of the field in uT, one row per press.
+        y : array [n 3]
+            x_mm, y_mm and the normal force in N. The force may be NaN (unknown). If the place is NaN, the press is
+            unlabelled, and its force is not used. All rows may be unlabelled.
+
+        Raises
+        ------
+        ParamsError
+            If `noload_uT` is missing, or `spread` is none of the three values.
+        SchemaError
+            If the number of channels is not that of the board, only one of x_mm and y_mm is known, or a label or a
+            field is out of range (see `reskin.universal.model.Universal.label`).
+
+        Warns
+        -----
+        UserWarning
+            If the orientation of the skin or of the labels' axes is uncertain or wrong (`model_.warnings`).
+        """
+        from reskin.universal.model import FILE, load_universal  # imported late, because it imports Numba
+
+        if self.noload_uT is None:
+            raise ParamsError("UniversalRegressor: noload_uT is missing. Pass fields of the untouched skin.")
+        if self.spread not in ("anywhere", "even", "area"):
+            rule = "anywhere, even or area"
+            raise ParamsError("UniversalRegressor", "spread", rule, repr(self.spread), "Try: anywhere")
+        db_uT, target = validate_data(self, X, y, validate_separately=({"dtype": np.float64}, TARGET_CHECKS))
+        check_consistent_length(db_uT, target)
+        if target.ndim != 2 or target.shape[1] != len(TARGETS):
+            raise SchemaError(f"UniversalRegressor: y has shape {target.shape}. Pass columns {', '.join(TARGETS)}.")
+        placed, weighed = ~np.isnan(target[:, 0]), ~np.isnan(target[:, 2])
+        if (half_known := placed == np.isnan(target[:, 1])).any():
+            row_i = int(half_known.argmax())
+            raise SchemaError(f"UniversalRegressor: row {row_i} of y has only one of x_mm and y_mm. Give both or none.")
+        model = load_universal(file=FILE if self.file is None else Path(self.file), external_uT=self.external_uT)
+        b_uT = db_uT + model.zero(np.asarray(self.noload_uT, float)).noload_uT
+        if not placed.all():
+            model.see(b_uT[~placed], even=self.spread == "even", area=self.spread == "area")
+        if (rows := placed & weighed).any():
+            model.label(target[rows, :2], target[rows, 2], b_uT[rows])
+        if (rows := placed & ~weighed).any():
+            model.label(target[rows, :2], None, b_uT[rows], keep=True)
+        for sentence in model.warnings:
+            warnings.warn(sentence, UserWarning, stacklevel=2)
+        self.model_ = model
+        return self
+
+    def predict(self, X: ArrayLike, *, return_std: bool = False) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT.
+
+        With `return_std`, also return their standard deviations [n 3]. That of the force is the force times the
+        standard deviation of its logarithm, and NaN if the forces are not calibrated by at least one known force.
+        """
+        check_is_fitted(self)
+        db_uT = validate_data(self, X, dtype=np.float64, reset=False)
+        estimate = self.model_.estimate(db_uT + self.model_.noload_uT)
+        mean = np.column_stack([estimate.place_mm, estimate.force_N])
+        if not return_std:
+            return mean
+        return mean, np.column_stack([estimate.sd_mm, estimate.force_N * estimate.sd_log_N])
+
+
+def _metric(y: ArrayLike, predicted: ArrayLike, *, name: str) -> float:
+    """Return one of the project's metrics for the rows whose place is known; NaN if no row has what it needs."""
+    true, estimated = np.asarray(y, float), np.asarray(predicted, float)
+    placed = ~np.isnan(true[:, :2]).any(axis=1)
+    return metrics.score(true[placed], estimated[placed]).get(name, np.nan) if placed.any() else np.nan
+
+
+# The metrics of the paper (see `reskin.metrics.score`) as scorers, for argument `scoring` of `cross_validate` and of
+# `GridSearchCV`. Larger is better, so errors are negative. Rows with an unknown place are not scored.
+SCORERS = {
+    "accuracy_pct": make_scorer(_metric, name="accuracy_pct"),  # percentage of rows within 1 mm in x and in y
+    "neg_mse_xy_mm2": make_scorer(_metric, greater_is_better=False, name="mse_xy_mm2"),
+    "neg_mse_f_N2": make_scorer(_metric, greater_is_better=False, name="mse_f_N2"),
+    "r2_f": make_scorer(_metric, name="r2_f"),
+}

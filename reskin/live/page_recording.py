@@ -1,0 +1,147 @@
+"""Recordings that are started, labelled and stopped from the page of `reskin live`.
+
+`LabelledPress` finds the press that the user has labelled, and `PageRecording` writes the byte stream and the labels.
+"""
+
+import re
+
+import numpy as np
+from jaxtyping import Float64
+
+from reskin import io
+from reskin.board.find import DetectedBoard
+from reskin.board.reader import Reader
+from reskin.errors import CaptureError
+from reskin.live.emulator import Source
+from reskin.live.tracker import Estimates
+from reskin.recordings.header import HEADER_FILE, Clock, render
+from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
+from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
+from reskin.recordings.stream_recorder import CaptureWriter
+
+# Assumed times of a labelled press. The no-load dwell ends before the contact, because the tip may approach slowly, and
+# begins some time after the contact before, because the skin recovers.
+REST_MAX_S, REST_MIN_S, RECOVERY_S, APPROACH_S = 1.0, 0.2, 0.3, 0.05
+PLATEAU = 0.8  # assumed: the press is held while |dB| is at least this fraction of its maximum
+PRESS_READINGS_MAX_N = 20_000  # readings of a press that are kept, to limit memory; 50 s at 400 Hz
+
+
+class LabelledPress:
+    """Finds the next press in a stream of estimates: the time in which it is held, and the rest before it.
+
+    Parameters
+    ----------
+    label : place and force of the press
+    learn : whether the model is calibrated to the press
+    """
+
+    def __init__(self, label: Label, *, learn: bool) -> None:
+        self.label, self.learn = label, learn
+        self.problem = ""  # why the latest press did not count
+        self.rest_s: tuple[float, float] | None = None  # start and end of the no-load dwell before the press
+        self.held_s: tuple[float, float] | None = None  # start and end of the time in which the press was held
+        self.db_uT: Float64[np.ndarray, " ch"] | None = None  # mean field change while the press was held
+        self._rest: tuple[float, float] | None = None  # first and last reading without contact before the press
+        self._press: list[tuple[float, Float64[np.ndarray, " ch"]]] = []
+
+    @property
+    def complete(self) -> bool:
+        return self.held_s is not None
+
+    def add(self, estimates: Estimates) -> None:
+        """Add the next readings. Faulty readings (NaN) are skipped and do not end a press."""
+        known = np.isfinite(estimates.db_uT).all(axis=1)
+        readings = zip(estimates.t_s[known].tolist(), estimates.db_uT[known], estimates.contact[known], strict=True)
+        for t_s, db_uT, contact in readings:
+            if self.complete:
+                return
+            if contact:
+                if len(self._press) < PRESS_READINGS_MAX_N:
+                    self._press.append((t_s, db_uT.astype(np.float64)))
+            elif self._press:
+                self._end_press()
+                self._rest, self._press = (t_s, t_s), []
+            else:
+                self._rest = (self._rest[0] if self._rest else t_s, t_s)
+
+    def _end_press(self) -> None:
+        t_s = np.array([time_s for time_s, _ in self._press])
+        db_uT = np.array([change_uT for _, change_uT in self._press])
+        size_uT = np.linalg.norm(db_uT, axis=1)
+        held = np.flatnonzero(size_uT >= PLATEAU * size_uT.max())
+        first_s, last_s = float(t_s[held[0]]), float(t_s[held[-1]])
+        if self._rest is None:
+            self.problem = "the press had already begun; press again"
+            return
+        rest_end_s = self._rest[1] - APPROACH_S
+        rest_start_s = max(self._rest[0] + RECOVERY_S, rest_end_s - REST_MAX_S)
+        if rest_end_s - rest_start_s < REST_MIN_S:
+            self.problem = "the skin had no rest before the press; lift for a second, then press again"
+        elif last_s - first_s < DWELL_MIN_s:
+            self.problem = "the press was too short; hold it for half a second"
+        else:
+            self.rest_s, self.held_s = (rest_start_s, rest_end_s), (first_s, last_s)
+            self.db_uT = db_uT[held[0] : held[-1] + 1].mean(axis=0)
+
+
+class PageRecording:
+    """A recording of a board that `reskin live` reads, with labels from the page.
+
+    `source` tells whether the board is emulated from a simulation. Raises `ReskinError` or `OSError` if the folder
+    cannot be created.
+    """
+
+    def __init__(
+        self, board: DetectedBoard, reader: Reader, *, port_in_name: bool, source: Source = "recorded"
+    ) -> None:
+        self.folder = new_folder()
+        if port_in_name:  # two boards may start recording in the same second
+            port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
+            self.folder = self.folder.with_name(f"{self.folder.name}-{port}")
+        self._part, self._header = begin_capture(
+            self.folder, NO_INFO, wire=board.wire, chips_n=board.chips_n, by="reskin live"
+        )
+        if source != self._header.source:
+            self._change_header(source=source)
+        self._reader = reader
+        self._labels: ProbeLogWriter | None = None
+        self._begun_s = reader.unix_s()
+        self._writer = CaptureWriter(self._part, board.wire, board.chips_n)
+        reader.write_to(self._writer)
+
+    @property
+    def touches_n(self) -> int:
+        """Number of labelled presses."""
+        return self._labels.touches_n if self._labels is not None else 0
+
+    def add(self, press: LabelledPress) -> None:
+        """Write the label of a press to the probe log.
+
+        Raises
+        ------
+        CaptureError
+            If the rest before the press is not in the recording.
+        OSError
+            If the log cannot be written.
+        """
+        if press.rest_s is None or press.held_s is None or press.rest_s[0] < self._begun_s:
+            raise CaptureError("not recorded: the recording began after the rest before this press. Press again.")
+        if self._labels is None:  # a capture without labels has no probe log
+            self._labels = ProbeLogWriter(self._part)
+            # Labels and arrivals are on the same clock, so one mark with equal times aligns them.
+            clock = Clock(kind="arrivals", rate_hz=None, marks=((self._begun_s, self._begun_s),))
+            options = self._header.options | {"labels": "page"}
+            self._change_header(clock=clock, options=options)
+        self._labels.write_all([Dwell(Label(False), *press.rest_s), Dwell(press.label, *press.held_s)])
+
+    def _change_header(self, **changes: object) -> None:
+        self._header = self._header.model_copy(update=changes)
+        io.write_text(self._part / HEADER_FILE, render(self._header))
+
+    def end(self) -> str:
+        """Finish the capture; return a text for the user. Raises `OSError` if the header cannot be written."""
+        self._reader.write_to(None)
+        if self._labels is not None:
+            self._labels.close()
+        end_capture(self.folder, self._header, self._writer.rate())
+        return f"recorded {self.folder}" + (f", labelled presses: {self.touches_n}" if self._labels else "")

@@ -1,0 +1,74 @@
+"""The folder in which `reskin live` saves what it has learnt about skins: one calibration file per skin."""
+
+import re
+import threading
+import time
+from pathlib import Path
+
+from reskin.errors import DISK_REMEDIES, ParamsError, SchemaError
+from reskin.models.trained import SUFFIX
+from reskin.recordings.header import NAME
+from reskin.universal.model import Universal
+
+SKINS = Path("skins")  # default folder, in the working directory
+LISTED_S = 1.0  # the folder is listed again after this time
+
+
+class SkinFolder:
+    """Saved calibrations in a folder. All boards of a page share one `SkinFolder`, so that no name is used twice."""
+
+    def __init__(self, folder: Path = SKINS) -> None:
+        if folder.exists() and not folder.is_dir():
+            raise ParamsError(f"--skins: {folder} is a file, not a folder. Choose another name.")
+        self.folder = folder
+        self._lock = threading.Lock()
+        self._names: list[str] = []
+        self._listed_s = float("-inf")
+
+    def names(self) -> list[str]:
+        """Return the names of all saved skins, in alphabetical order."""
+        with self._lock:
+            if time.monotonic() - self._listed_s > LISTED_S:
+                files = self.folder.glob(f"*{SUFFIX}") if self.folder.is_dir() else ()
+                self._names = sorted(file.stem for file in files if re.fullmatch(NAME, file.stem))
+                self._listed_s = time.monotonic()
+            return self._names
+
+    def file(self, name: object) -> Path:
+        """Return the file of a name.
+
+        Raises
+        ------
+        ParamsError
+            If the name contains anything but letters, digits, - and _.
+        """
+        if not isinstance(name, str) or not re.fullmatch(NAME, name):
+            got = repr(name)[:40] if name else "nothing"
+            raise ParamsError(
+                f"skin name: {got} is not a name. Use 1 to 64 letters, digits, - and _; begin with a letter or a digit."
+            )
+        return self.folder / f"{name}{SUFFIX}"
+
+    def save(self, name: object, model: Universal) -> str:
+        """Save a calibrated model under a new name; return a text for the user.
+
+        Raises
+        ------
+        ParamsError
+            If the name is invalid, or a skin of this name exists.
+        SchemaError
+            If the model has no presses to save, or the file cannot be written.
+        """
+        file = self.file(name)
+        if not model.presses_n:
+            raise SchemaError("not saved: the model has learnt nothing about this skin. First use Adapt or Places.")
+        with self._lock:
+            if file.exists():
+                raise ParamsError(f"not saved: {file} exists already. Choose another name.")
+            try:
+                model.save(file)
+            except OSError as error:
+                remedy = DISK_REMEDIES.get(error.errno or 0, "Try another folder with --skins.")
+                raise SchemaError(f"not saved: cannot write {file}: {error.strerror}. {remedy}") from None
+            self._listed_s = float("-inf")
+        return f"saved {file} (presses: {model.presses_n}, of which labelled: {model.labels_n})"

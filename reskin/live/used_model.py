@@ -1,0 +1,143 @@
+"""What the page says about the model in use: its name, what it has learnt, its expected accuracy and its least force.
+
+Expected accuracies are results of the pipeline: for networks, those in the card; for the shipped universal model, those
+in `reskin/universal/measured.json`. That file is not part of the card, because the results depend on the card. Other
+universal models were not measured.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from reskin import io
+from reskin.config import Strict, parse
+from reskin.live.tracker import LearningState, Models, NetworkEstimator, UniversalEstimator
+from reskin.models.trained import Network
+from reskin.universal.model import FILE, Universal
+
+MEASURED_FILE = FILE.with_name("measured.json")
+NOT_MEASURED = "not measured"
+ByBoard = Annotated[tuple[float, ...], Field(min_length=1)]  # one value per recorded board
+
+
+class MeasuredAccuracy(Strict):
+    """Scores on held-out recorded boards after a calibration with some unlabelled presses and labels."""
+
+    presses_n: int
+    labels_n: int
+    accuracy_pct: ByBoard  # readings within 1 mm along x and along y
+    median_mm: ByBoard  # median error of the place
+    mse_xy_mm2: ByBoard
+
+
+class MeasuredDetection(Strict):
+    """The lightest recorded force, how many of all presses were detected, and false alarms without contact."""
+
+    lightest_N: ByBoard
+    detected_pct: ByBoard
+    false_alarm_pct: ByBoard
+
+
+class Measured(Strict):
+    """Results of the shipped universal model, from the numbers of a recorded scene."""
+
+    scene: str
+    source: Literal["recorded"]
+    places: tuple[MeasuredAccuracy, ...]  # in the order of presses_n, then of labels_n
+    detection: MeasuredDetection
+
+
+def describe(
+    estimator: NetworkEstimator | UniversalEstimator | None, models: Models, model_name: str
+) -> dict[str, str | bool]:
+    """Return the texts `model`, `learnt`, `expected` and `least_force` of the page, and whether `undo` is possible.
+
+    `models` are the models that the user chose, and `model_name` the names of their files (empty: the shipped model).
+    """
+    if isinstance(estimator, UniversalEstimator):
+        state, model = estimator.learnt, estimator.model
+        name = f"universal model, {f'file {model_name}' if model_name else 'shipped with reskin'}"
+        return {
+            "model": name + (f", with the saved skin {state.origin_name}" if state.origin_name else ""),
+            "learnt": _learnt(state), "undoable": estimator.undoable,
+            "expected": _expected_of_universal(model), "least_force": _least_force_of_universal(model),
+        }  # fmt: skip
+    if isinstance(estimator, NetworkEstimator) and not isinstance(models, Universal):
+        kind = "trained network" if len(models) == 1 else f"mean of {len(models)} trained networks"
+        return {
+            "model": f"{kind}, file {model_name}" if model_name else kind, "learnt": "", "undoable": False,
+            "expected": _expected_of_networks(models), "least_force": NOT_MEASURED,
+        }  # fmt: skip
+    return {"model": "", "learnt": "", "undoable": False, "expected": "", "least_force": ""}
+
+
+def _learnt(state: LearningState) -> str:
+    counts = {
+        f"in {state.origin_name or 'the file'}": state.origin.presses_n,
+        "anywhere": len(state.presses_uT),
+        "at crosses": len(state.guided.db_uT),
+        "labelled by you": len(state.typed.db_uT),
+    }
+    return ", ".join(f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count)
+
+
+def _expected_of_universal(model: Universal) -> str:
+    measured = _measured_of(model)
+    if measured is None:
+        return f"{NOT_MEASURED} for this model"
+    own_n = model.presses_n - model.labels_n, model.labels_n
+    fitting = [each for each in measured.places if each.presses_n <= own_n[0] and each.labels_n <= own_n[1]]
+    if not fitting:
+        return f"{NOT_MEASURED} for so few presses"
+    best = fitting[-1]
+    calibration = f"{best.presses_n} presses and {best.labels_n} labels" if best.presses_n else "no calibration"
+    accuracy, error = _join(best.accuracy_pct, ".0f"), _join(best.median_mm, ".1f")
+    boards = f"{len(best.accuracy_pct)} {measured.source} boards of scene {measured.scene}"
+    text = f"median error {error} mm, {accuracy} % within 1 mm ({boards}, after {calibration})"
+    return text if not model.external_uT else f"{text}; {NOT_MEASURED} with external fields"
+
+
+def _least_force_of_universal(model: Universal) -> str:
+    measured, least_N = _measured_of(model), float(model.tables.force_N[0])
+    trained = f"trained with simulated forces from {least_N:.2g} N"
+    if measured is None:
+        return f"{NOT_MEASURED}; {trained}"
+    found = measured.detection
+    return (
+        f"lightest recorded presses {_join(found.lightest_N, '.2g')} N, of which {_join(found.detected_pct, '.0f')} % "
+        f"were detected; lighter ones {NOT_MEASURED}; {trained}"
+    )
+
+
+def _expected_of_networks(networks: Sequence[Network]) -> str:
+    scores = networks[0].card.get("scores", {}).get("all", {})
+    if len(networks) > 1 or not {"accuracy_pct", "mse_xy_mm2"} <= scores.keys():
+        return f"{NOT_MEASURED} for {'their mean' if len(networks) > 1 else 'this network'}"
+    card = networks[0].card
+    boards = ", ".join(map(str, card.get("test_boards", ()))) or "unknown"
+    return (
+        f"{scores['accuracy_pct']:.0f} % within 1 mm, MSE_xy {scores['mse_xy_mm2']:.2f} mm² "
+        f"(scene {card.get('scene', 'unknown')}, tested on boards {boards})"
+    )
+
+
+def _join(values: Sequence[float], digits: str) -> str:
+    return " and ".join(format(value, digits) for value in values)
+
+
+def _measured_of(model: Universal) -> Measured | None:
+    """Return the results of a model; None if it is not the shipped one."""
+    return _shipped()[1] if model.card == _shipped()[0] else None
+
+
+@cache
+def _shipped() -> tuple[dict[str, Any], Measured]:
+    return io.read_json(FILE.with_suffix(".json")), read_measured(MEASURED_FILE)
+
+
+def read_measured(file: Path) -> Measured:
+    """Read the results of the shipped universal model."""
+    return parse(Measured, io.read_json(file), str(file))

@@ -1,0 +1,169 @@
+"""Load recordings: logs as arrays, and recordings of any kind as a pandas DataFrame with units."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from reskin import io
+from reskin.board.stream import decode_all
+from reskin.errors import CaptureError, ParamsError, ReskinError, missing_package
+from reskin.recordings.decode import frame_columns, read_frames
+from reskin.recordings.fault_policy import STANDARD_POLICY
+from reskin.recordings.header import LOG_FILE, PROBE_FILE, RATE_MAX_HZ, STREAM_FILE, write_capture
+from reskin.recordings.ingest import open_capture, read_header, timer
+from reskin.recordings.preparing import UNNAMED, CaptureNames, foreign, layouts_of
+from reskin.recordings.readers import READERS, sd_card
+from reskin.schema import LABELS, UNITS, Readings, unit_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PARQUET_MAGIC = b"PAR1"
+EXTRA = "learn"  # the extra of pyproject.toml that installs pandas
+
+
+def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
+    """Read the frames of a capture's folder, of a table that `reskin decode` wrote, or of an SD card's log."""
+    if log.is_dir():
+        return _read_capture(log)
+    if not 0 < rate_hz <= RATE_MAX_HZ:
+        raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
+    if log.is_file():
+        with log.open("rb") as stream:
+            is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
+        if is_parquet:
+            return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
+    return sd_card.read_log(log)
+
+
+def _read_capture(folder: Path) -> sd_card.Log:
+    """Read the frames of a capture; drop frames after the last recorded arrival time, because they have no time."""
+    header = read_header(folder)
+    if header.layout == "sd-card":
+        return sd_card.read_log(folder / LOG_FILE)
+    if header.wire is None:
+        raise CaptureError(
+            f"{folder}: cannot predict from a capture of layout {header.layout}. Use a capture that `reskin record` "
+            "wrote, or the log of an SD card."
+        )
+    stream = folder / STREAM_FILE
+    frames, decoded = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
+    t_s = timer(folder, header)(frames, 0)
+    timed = np.isfinite(t_s)
+    kept = frames.where(timed)
+    *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
+    return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+
+
+def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
+    """Load a recording as a DataFrame (see `reskin.load_recording`)."""
+    try:
+        import pandas as pd
+    except ImportError:
+        raise missing_package("pandas", "load_recording", extra=EXTRA) from None
+    try:
+        return _load(pd, path, frames=frames, rate_hz=rate_hz)
+    except ReskinError as error:
+        if hint := _hint(path, frames=frames):
+            raise type(error)(f"{error} {hint}") from None
+        raise
+
+
+def _hint(path: Path, *, frames: bool) -> str:
+    """Return what else the user can do if a recording cannot be loaded; "" if nothing."""
+    layouts = [layout for layout in layouts_of(path) if layout != "table"]
+    if layouts == ["capture"]:
+        return "" if frames else "To load the frames without labels, try: frames=True"
+    if set(layouts) <= READERS.keys():
+        return f"This is layout {' or '.join(layouts)}: run `reskin add`, and load the capture." if layouts else ""
+    return "This is a dump of a serial port: run `reskin decode`, and load its output."
+
+
+def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
+    names_of: Mapping[str, str] = {}  # column -> the name that all rows have
+    if path.is_dir():
+        header = read_header(path)
+        is_log = header.layout == "sd-card" or (header.layout == "native" and not (path / PROBE_FILE).is_file())
+        kind = "log" if is_log or (frames and header.layout == "native") else "labelled"
+        names_of = {name: getattr(header, name) for name in LABELS}
+    else:
+        kind = _kind_of(path)
+    if kind != "log":
+        if frames:
+            raise ParamsError(f"{path}: only a capture of `reskin record` has frames. Load it without frames=True.")
+        readings, counts = READ[kind](path)
+        return _readings_frame(pd, readings, counts)
+    t_s, b_uT, temperature_degC, counts = read_any_log(path, rate_hz)
+    channels = [name for name, unit in frame_columns(temperature_degC.shape[1]).items() if unit in ("uT", "degC")]
+    measured = dict(zip(channels, [*b_uT.T, *temperature_degC.T], strict=True))
+    return _frame(pd, {**names_of, "t_s": t_s, **measured}, counts)
+
+
+def _kind_of(file: Path) -> str:
+    """Return the kind of a file by its column names: `table`, `ingested`, or `log` for all others."""
+    if not file.is_file():
+        raise CaptureError(f"{file}: file not found. Check the path.")
+    with file.open("rb") as stream:
+        head = stream.read(sd_card.HEADER_CHARACTERS_MAX)
+    if head.startswith(PARQUET_MAGIC):
+        names = io.read_column_names(file)
+    else:
+        names = [name.strip() for name in head.decode("utf-8-sig", errors="replace").partition("\n")[0].split(",")]
+    return "table" if "phase" in names else "ingested" if set(UNITS) <= set(names) else "log"
+
+
+def _read_labelled(folder: Path) -> tuple[Readings, Mapping[str, int]]:
+    """Read the readings in contact of a capture."""
+    _, blocks, account = open_capture(folder, STANDARD_POLICY)
+    parts = list(blocks)
+    if not parts:
+        raise CaptureError(f"{folder}: no reading can be used: {dict(account)}. Check its labels and its faults.")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in UNITS}
+    return replace(parts[0], **joined), account
+
+
+def _read_ingested(file: Path) -> tuple[Readings, Mapping[str, int]]:
+    return io.read_readings(file), io.read_ingest_counts(file)
+
+
+def _read_table(file: Path) -> tuple[Readings, Mapping[str, int]]:
+    """Read the readings in contact of a file of layout `table`."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", file.stem).lstrip("_-")[:64]
+    header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / header.capture
+        return READERS["table"].read(copy, write_capture(copy, header, files), STANDARD_POLICY)
+
+
+READ = {"labelled": _read_labelled, "ingested": _read_ingested, "table": _read_table}
+
+
+def _readings_frame(pd: Any, readings: Readings, counts: Mapping[str, int]) -> "pd.DataFrame":
+    """Convert readings to a DataFrame with one column per channel, and with the field changes."""
+    columns: dict[str, Any] = {name: getattr(readings, name) for name in LABELS}
+    channels = [name for name, unit in frame_columns(readings.chips_n).items() if unit == "uT"]
+    for name in UNITS:
+        values = getattr(readings, name)
+        if name == "temperature_degC":
+            columns |= {f"temperature{chip}_degC": column for chip, column in enumerate(values.T)}
+        elif name == "b_uT":
+            columns |= dict(zip(channels, values.T, strict=True))
+        elif name == "noload_uT":
+            columns |= {f"noload_{channel}": column for channel, column in zip(channels, values.T, strict=True)}
+            change_uT = readings.b_uT - readings.noload_uT
+            columns |= {f"d{channel}": column for channel, column in zip(channels, change_uT.T, strict=True)}
+        else:
+            columns[name] = values
+    return _frame(pd, columns, counts)
+
+
+def _frame(pd: Any, columns: Mapping[str, Any], counts: Mapping[str, int]) -> "pd.DataFrame":
+    units = {name: "" if name in LABELS else unit_of(name) for name in columns}
+    frame = pd.DataFrame(columns)
+    frame.attrs = {"units": units, "counts": dict(counts)}
+    return frame

@@ -1,0 +1,175 @@
+"""Read layout `leaphand`: magnetic pads on the fingers of a robot hand that moves without touching anything.
+
+The text file has one row per pose of the hand: the fields of all pads, then the positions of all joints. A capture is
+one pad, a board of five chips; option `pad` selects it. The file contains neither times, temperatures nor labels. By
+choosing this layout, the user states that nothing touches the pads, so places are NaN and the normal force is 0. The
+recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
+
+The no-load field is the mean over the first rows between which the hand hardly moves. Joint positions are not part of
+`Readings`; `read_motion` returns them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from reskin.errors import CaptureError
+from reskin.recordings.fault_policy import CheckedRows, FaultPolicy, check_rows
+from reskin.recordings.header import Header
+from reskin.recordings.tables import make_readings, read_cells, to_numbers
+from reskin.recordings.units import check_changes
+from reskin.schema import AXES_PER_CHIP_N, Readings
+
+READINGS = "readings.txt"
+FILES = (READINGS,)
+CHIPS_N = 5  # chips of a pad
+CHANNELS_N = AXES_PER_CHIP_N * CHIPS_N
+JOINTS_N = 4  # joints of a finger; each finger has one pad
+PADS_MAX_N = 4
+COUNTS_PER_TURN = 4096  # joint positions of the hand's servos are whole numbers from 0 to 4095
+NOLOAD_ROWS_N = 5
+# During the no-load rows, each joint moves by at most this much, 4.4 degrees. In recordings of four pads, the hand
+# rests in the first five rows. In recordings of two pads, the first row is in another pose, and the next five rows span
+# 39 counts. Turning by 4.4 degrees changes the earth's field along an axis by at most 5 uT, which is about the noise.
+STILL_COUNTS = 50
+
+Account = dict[str, int]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Positions of all joints in the rows of `read`, and the single rows of which the no-load field is the mean."""
+
+    joint_counts: Int64[np.ndarray, "f j"]
+    noload_uT: Float64[np.ndarray, "n ch"]
+
+
+@dataclass(frozen=True)
+class _Pad:
+    """All rows of one pad. The no-load rows are the `NOLOAD_ROWS_N` rows from index `first_i` on."""
+
+    b_uT: Float64[np.ndarray, "f ch"]
+    joint_counts: Int64[np.ndarray, "f j"]
+    first_i: int
+    rows: CheckedRows
+    pads_n: int
+
+    @property
+    def is_noload(self) -> Bool[np.ndarray, " f"]:
+        row_i = np.arange(len(self.b_uT)) - self.first_i
+        return (row_i >= 0) & (row_i < NOLOAD_ROWS_N) & self.rows.keep
+
+    @property
+    def is_reading(self) -> Bool[np.ndarray, " f"]:
+        return (np.arange(len(self.b_uT)) >= self.first_i + NOLOAD_ROWS_N) & self.rows.keep
+
+
+def collect(recording: Path) -> dict[str, Path]:
+    """Find the file of a recording: the text file itself."""
+    if not recording.is_file():
+        raise CaptureError(
+            f"{recording}: not a file. A recording of layout leaphand is one text file: add each file separately."
+        )
+    return {READINGS: recording}
+
+
+def count_chips(files: Mapping[str, Path]) -> int:
+    """Check the number of columns; a capture is one pad, whose number of chips is fixed."""
+    where = str(files[READINGS])
+    _count_pads(read_cells(files[READINGS], where, separator=None), where)
+    return CHIPS_N
+
+
+def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
+    """Return the rows after the no-load rows as readings without contact."""
+    pad = _read_pad(folder, header, policy)
+    noload, keep = pad.is_noload, pad.is_reading
+    zeros = np.zeros(len(keep))
+    readings = make_readings(
+        header,
+        keep,
+        indentation=zeros,
+        pass_i=zeros,
+        reading_i=np.cumsum(keep) - 1,
+        Fz_N=zeros,
+        b_uT=pad.b_uT,
+        noload_uT=np.broadcast_to(pad.b_uT[noload].mean(axis=0), pad.b_uT.shape),
+        n_contacts=zeros + header.contacts_before_n,
+    )
+    return readings, {
+        "rows_n": len(readings),
+        "rows_read_n": len(keep),
+        "noload_rows_n": int(noload.sum()),
+        "dropped_before_noload_rows_n": int(pad.rows.keep[: pad.first_i].sum()),
+        **pad.rows.account(),
+        "baseline_subtracted_rows_n": len(readings),
+        "ignored_pads_n": pad.pads_n - 1,
+    }
+
+
+def read_motion(folder: Path, header: Header, policy: FaultPolicy) -> Motion:
+    """Return the joint positions of the readings that `read` returns, and the fields of the single no-load rows."""
+    pad = _read_pad(folder, header, policy)
+    return Motion(pad.joint_counts[pad.is_reading], pad.b_uT[pad.is_noload])
+
+
+def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
+    """Read the file of a capture, select the pad, and find the faulty rows and the no-load rows."""
+    where = f"{header.capture}/{READINGS}"
+    cells = read_cells(folder / READINGS, where, separator=None)
+    pads_n = _count_pads(cells, where)
+    if header.chips_n != CHIPS_N:
+        raise CaptureError(f"{where}: the header says {header.chips_n} chips, but a pad has {CHIPS_N}. Correct it.")
+    first = CHANNELS_N * (_pad_number(header, pads_n) - 1)
+    fields = [f"B{axis}{chip} of pad {pad + 1}" for pad in range(pads_n) for chip in range(CHIPS_N) for axis in "xyz"]
+    joints = [f"joint {joint + 1}" for joint in range(JOINTS_N * pads_n)]
+    numbers = to_numbers(cells, where, names=[*fields, *joints])
+    b_uT, joint_counts = numbers[:, first : first + CHANNELS_N], numbers[:, len(fields) :]
+    check_changes(b_uT, where, first_line_n=1)
+    wrong = (joint_counts != np.rint(joint_counts)) | (joint_counts < 0) | (joint_counts >= COUNTS_PER_TURN)
+    if wrong.any():
+        row_i, joint_i = np.argwhere(wrong)[0]
+        rule, got = f"whole numbers from 0 to {COUNTS_PER_TURN - 1}", f"{joint_counts[row_i, joint_i]:.6g}"
+        place = f"{joints[joint_i]} in line {row_i + 1}, in counts of its servo,"
+        raise CaptureError(where, place, rule, got, "Are the joint positions in the last columns? Convert angles.")
+    unknown_degC = np.full((len(b_uT), CHIPS_N), np.nan)
+    rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy)
+    pad = _Pad(b_uT, joint_counts.astype(np.int64), _find_rest(joint_counts, where), rows, pads_n)
+    if not pad.is_noload.any() or not pad.is_reading.any():
+        what = "all no-load rows" if not pad.is_noload.any() else "all rows after the no-load rows"
+        raise CaptureError(f"{where}: {what} are faulty. Check the pad, and record again.")
+    return pad
+
+
+def _count_pads(cells: list[list[str]], where: str) -> int:
+    """Return the number of pads, from the number of columns."""
+    columns_n, per_pad_n = len(cells[0]), CHANNELS_N + JOINTS_N
+    if columns_n % per_pad_n or not 1 <= columns_n // per_pad_n <= PADS_MAX_N:
+        rule = f"{CHANNELS_N} fields and {JOINTS_N} joint positions for each of 1 to {PADS_MAX_N} pads"
+        raise CaptureError(where, "the number of columns", rule, columns_n, "Is this layout leaphand?")
+    return columns_n // per_pad_n
+
+
+def _pad_number(header: Header, pads_n: int) -> int:
+    got = header.options.get("pad", "none")
+    if got not in {str(pad) for pad in range(1, pads_n + 1)}:
+        rule = f"1 to {pads_n}, the number of pads in the file"
+        raise CaptureError(header.capture, "option pad", rule, got, "Add each pad separately, with --pad.")
+    return int(got)
+
+
+def _find_rest(joint_counts: Float64[np.ndarray, "f j"], where: str) -> int:
+    """Return the index of the first of `NOLOAD_ROWS_N` rows between which no joint moves by more than `STILL_COUNTS`.
+
+    Raises CaptureError if there are no such rows, or no row after them.
+    """
+    for first_i in range(len(joint_counts) - NOLOAD_ROWS_N):
+        if np.ptp(joint_counts[first_i : first_i + NOLOAD_ROWS_N], axis=0).max() <= STILL_COUNTS:
+            return first_i
+    raise CaptureError(
+        f"{where}: no {NOLOAD_ROWS_N} successive rows, followed by others, in which every joint stays within "
+        f"{STILL_COUNTS} counts. Begin the recording with the hand at rest."
+    )

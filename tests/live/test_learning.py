@@ -1,0 +1,327 @@
+"""Tests of what the page teaches a model and records: save, load and undo of calibrations, and labelled presses."""
+
+import json
+import math
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reskin.board import find
+from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.live.emulator import encode_pieces
+from reskin.live.page_recording import LabelledPress, PageRecording
+from reskin.live.server import receive
+from reskin.live.session import PRESSES_N, GuidedPresses, Session
+from reskin.live.skins import SkinFolder
+from reskin.live.tracker import Estimates, NetworkEstimator, UniversalEstimator
+from reskin.live.used_model import MEASURED_FILE, describe, read_measured
+from reskin.models.trained import read_network
+from reskin.recordings import probe
+from reskin.recordings.header import HEADER_FILE, PROBE_FILE, parse
+from reskin.recordings.labels import Label
+from reskin.universal.model import load_universal
+from tests.live.boards import POKE_S, QUIET_S, ScriptReader, make_script, write_model
+from tests.live.test_estimators import QUIET_N, guided_pokes, make_poke_script, random_pokes  # noqa: F401 - fixtures
+from tests.live.test_record import places_of, read
+
+LONG_S = 20.0
+
+
+class PausingReader(ScriptReader):
+    """A reader that waits at some times of the script until `resume` is called, and writes to a recording.
+
+    Its clock is the script's time plus the unix time at the start, like that of a real reader.
+    """
+
+    def __init__(self, script, pauses_s=()):
+        super().__init__(script)
+        self._begun_s, self._pauses_s, self._writer = time.time() + 1.0, list(pauses_s), None
+        self.writer_problem, self.waiting = "", threading.Event()
+
+    def unix_s(self):
+        return self._begun_s + super().unix_s()
+
+    def resume(self):
+        self._pauses_s.pop(0)
+        self.waiting.clear()  # `take` sets it again at the next pause
+
+    def write_to(self, writer):
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = writer
+
+    def take(self, wait_s):
+        if super().unix_s() >= next(iter(self._pauses_s), math.inf):
+            self.waiting.set()
+            return []
+        chunks = super().take(wait_s)
+        for chunk, t_s in chunks:
+            if self._writer is not None:
+                self._writer.write(chunk, t_s)
+        return chunks
+
+
+def until(condition, session=None):
+    """Wait until a condition is true; a session must go on estimating."""
+    end_s = time.monotonic() + LONG_S
+    while not condition():
+        assert session is None or session._thread.is_alive(), session.state()["alarms"]
+        assert time.monotonic() < end_s, session.state() if session else "the condition never became true"
+        time.sleep(0.002)
+
+
+def running(script, models, *, pauses_s=(), **options):
+    """Start a session that plays a script; return the session and its reader."""
+    session = Session("played", models, "a board", **options)
+    session.skin.reader = reader = PausingReader(script, pauses_s)
+    session.start()
+    return session, reader
+
+
+def said(session, message, key="adapted"):
+    """Send a message as the page does; return the new text under `key` of the state."""
+    setattr(session, f"_{key}", "")
+    receive(session, json.dumps(message))
+    until(lambda: session.state()[key], session)
+    return session.state()[key]
+
+
+def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa: F811
+    db_uT = (random_pokes[1] - random_pokes[0].mean(axis=0)).astype(np.float32)
+    folder = tmp_path / "skins"
+    session, reader = running(
+        make_poke_script(random_pokes), load_universal(), pauses_s=[QUIET_N / 400 - 0.05], skins=SkinFolder(folder)
+    )
+    try:
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        assert "learnt nothing about this skin" in said(session, {"save": "s1"})
+        assert "nothing to undo" in said(session, {"press": "undo"})
+        assert not folder.exists()
+        before = session.skin.estimator(db_uT).target
+        assert session.state()["expected"].endswith("after no calibration)")
+        receive(session, '{"press": "adapt"}')
+        reader.resume()
+        until(lambda: session.state()["adapted"].startswith(f"adapted to {PRESSES_N} presses"), session)
+        until(lambda: reader.at_end, session)
+        adapted = session.skin.estimator(db_uT).target
+        assert np.abs(adapted - before).max() > 0.1
+        state = session.state()
+        assert state["learnt"] == f"{PRESSES_N} presses anywhere"
+        assert state["expected"].endswith(f"after {PRESSES_N} presses and 0 labels)")
+
+        for name in ("", "../s1", "a b", "x" * 65, ".s1", 3, None, ["s1"], "s1.safetensors"):
+            assert "is not a name. Use 1 to 64 letters" in said(session, {"save": name})
+        assert said(session, {"save": "s1"}) == f"saved {folder / 's1.safetensors'} (presses: 12, of which labelled: 0)"
+        content = (folder / "s1.safetensors").read_bytes()
+        assert "s1.safetensors exists already. Choose another name." in said(session, {"save": "s1"})
+        assert (folder / "s1.safetensors").read_bytes() == content
+        assert session.state()["skins"] == ["s1"]
+
+        assert said(session, {"press": "undo"}) == f"undone: the {PRESSES_N} presses"
+        np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
+        assert "the file does not exist" in said(session, {"load": "s2"})
+        (folder / "s3.safetensors").write_text("no calibration")
+        assert "s3.safetensors" in said(session, {"load": "s3"})
+        np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
+        assert "loaded" in said(session, {"load": "s1"})
+        # 0.02 mm and N: the file holds the presses of the same readings in single precision
+        np.testing.assert_allclose(session.skin.estimator(db_uT).target, adapted, atol=0.02)
+        state = session.state()
+        assert state["model"] == "universal model, shipped with reskin, with the saved skin s1"
+        assert state["learnt"] == f"{PRESSES_N} presses in s1"
+        assert said(session, {"press": "undo"}) == "undone: the loading of s1"
+        np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
+    finally:
+        session.stop()
+    assert sorted(file.name for file in folder.iterdir()) == ["s1.safetensors", "s3.safetensors"]
+
+
+def test_skin_folder_must_not_be_a_file(tmp_path):
+    (tmp_path / "skins").touch()
+    with pytest.raises(ParamsError, match="--skins: .*skins is a file, not a folder"):
+        SkinFolder(tmp_path / "skins")
+
+
+def test_labelled_presses_are_learnt(random_pokes):  # noqa: F811
+    noload_uT, b_uT, place_mm, force_N = random_pokes
+    db_uT = b_uT - noload_uT.mean(axis=0)
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(noload_uT)
+    for i in range(3):
+        unknown = i == 1
+        text = estimator.add_label(tuple(place_mm[i].tolist()), math.nan if unknown else force_N[i], db_uT[i])
+        assert text.startswith("calibrated to a labelled press; before it, the place was wrong by ")
+        assert ("force" in text) != unknown
+    labelled = [0, 2]
+    model = load_universal().zero(noload_uT).label(place_mm[labelled], force_N[labelled], b_uT[labelled])
+    expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
+    found = estimator(db_uT.astype(np.float32)).target
+    np.testing.assert_allclose(found, expected, atol=0.02)  # mm and N; single precision
+    for wrong_mm, wrong_N, message in (((99.0, 8.0), 1.0, "on the skin"), ((8.0, 8.0), 900.0, "the model's range")):
+        with pytest.raises(SchemaError, match=message):
+            estimator.add_label(wrong_mm, wrong_N, db_uT[3])
+    np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, found)
+    assert estimator.undo() == "undone: the last labelled press"
+    assert len(estimator.learnt.labels.force_N) == 2
+
+
+def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    second_s = QUIET_S + POKE_S + 1.0  # in the pause before the second of the script's presses
+    script = make_script(pokes_n=3)
+    session, reader = running(script, [], pauses_s=[QUIET_S - 0.2, second_s])
+    try:
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        place = {"x_mm": 4.0, "y_mm": 12, "force_N": 0.8, "learn": True}
+        assert "nothing would use it" in said(session, {"label": place}, "labelled")
+        receive(session, '{"press": "record"}')
+        for wrong, message in (
+            ({"x_mm": None}, "x must be a number"), ({"y_mm": "8"}, "y must be a number"),
+            ({"force_N": -1}, "the force must be a number above 0"), ({"x_mm": 1e9}, "below 1000 mm; got 10000"),
+            ({"y_mm": True}, "y must be a number"),
+        ):  # fmt: skip
+            assert message in said(session, {"label": place | wrong}, "labelled")
+        assert "Enter x and y" in said(session, {"label": "here"}, "labelled")
+        receive(session, json.dumps({"label": place}))
+        assert session.state()["labelling"] == "press at x 4 mm, y 12 mm with 0.8 N."
+        assert session.state()["label_mm"] == [4.0, 12.0]
+        reader.resume()
+        # The skin had too short a rest before the first press, so the label still waits.
+        until(reader.waiting.is_set, session)
+        assert session.state()["labelling"].endswith("lift for a second, then press again")
+        receive(session, json.dumps({"label": place | {"force_N": None, "x_mm": 12, "y_mm": 4}}))
+        reader.resume()
+        until(lambda: session.state()["recording_n"] == 1, session)
+        assert session.state()["labelled"] == "press at x 12 mm, y 4 mm: recorded as labelled press 1"
+        until(lambda: reader.at_end, session)
+        receive(session, '{"press": "record"}')
+        assert session.state()["recorded"].endswith(", labelled presses: 1")
+    finally:
+        session.stop()
+    (folder,) = (tmp_path / "captures").iterdir()
+    assert parse((folder / HEADER_FILE).read_text(), "header").options["labels"] == "page"
+    blocks, account = read(folder)
+    assert places_of(blocks) == {(12.0, 4.0)}
+    assert account["clock_residual_us"] == 0
+    # The second press of the script lasts one second: nearly all of its frames, and no frame without contact.
+    assert 0.9 * 400 * POKE_S < account["frames_contact_n"] <= 400 * POKE_S
+    log = probe.parse(folder / PROBE_FILE, "log")
+    assert np.isnan(log.Fz_N).all()
+    changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
+    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # uT; the field changes of the presses are above 600 uT
+
+
+def test_presses_at_crosses_are_labels_of_the_recording(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    script = make_poke_script(guided_pokes)
+    step_uT = np.tile([0.15, 0.15, 0.242], 5)  # `reskin add` checks the steps of the chips
+    script.frames.b_uT[:] = np.rint(script.frames.b_uT / step_uT) * step_uT
+    # with pauses of 1.25 s between the presses
+    slow = replace(script, pieces=encode_pieces(script.frames, "binary"), t_s=5 * script.t_s)
+    session, reader = running(slow, load_universal(), pauses_s=[5 * (QUIET_N - 80) / 400])
+    try:
+        until(reader.waiting.is_set, session)
+        until(lambda: session.skin.zeroed, session)
+        receive(session, '{"press": "record"}')
+        receive(session, '{"press": "places"}')
+        reader.resume()
+        until(lambda: session.state()["adapted"].startswith("adapted to 8 known places"), session)
+        until(lambda: reader.at_end, session)
+        assert session.state()["recording_n"] == GuidedPresses().presses_n
+        assert session.state()["labelled"] == ""
+    finally:
+        session.stop()
+    (folder,) = (tmp_path / "captures").iterdir()
+    log = probe.parse(folder / PROBE_FILE, "log")
+    np.testing.assert_allclose(np.column_stack([log.x_mm, log.y_mm])[log.contact], guided_pokes[2])
+    blocks, account = read(folder)
+    assert account["indentations_n"] == GuidedPresses().presses_n
+    poked_uT = guided_pokes[1] - guided_pokes[0].mean(axis=0)
+    changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
+    place_mm = np.concatenate([np.column_stack([block.x_mm, block.y_mm]) for block in blocks])
+    press_i = np.linalg.norm(place_mm[:, None] - guided_pokes[2], axis=2).argmin(axis=1)
+    # tolerance in uT: the noise is 3 uT, and each reading must be of the press at its label
+    np.testing.assert_allclose(changes_uT, poked_uT[press_i], atol=30)
+
+
+def test_press_whose_rest_is_not_recorded_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    press, reader = LabelledPress(Label(True, 1.0, 2.0), learn=False), PausingReader(make_script(pokes_n=0))
+    recording = PageRecording(find.DetectedBoard("/dev/board", None, "binary", 5), reader, port_in_name=True)
+    press.rest_s, press.held_s = (
+        (reader.unix_s() - 1.0, reader.unix_s()),
+        (reader.unix_s() + 1.0, reader.unix_s() + 2.0),
+    )
+    with pytest.raises(CaptureError, match="recording began after the rest before this press. Press again"):
+        recording.add(press)
+    assert recording.end() == f"recorded {recording.folder}"
+    assert recording.folder.name.endswith("-dev-board")
+    assert not (recording.folder / PROBE_FILE).exists()
+
+
+def feed(press, contact, seconds, rate_hz=100.0):
+    """Add readings to a press: contact yes or no for some time, with a field change of 100 uT in contact."""
+    start_s = feed.t_s
+    t_s = start_s + np.arange(round(seconds * rate_hz)) / rate_hz
+    feed.t_s = start_s + seconds
+    db_uT = np.full((len(t_s), 15), 100.0 * contact, np.float32)
+    none = np.zeros((len(t_s), 3))
+    press.add(Estimates(t_s, db_uT, db_uT, none, none[:, :2], np.full(len(t_s), contact)))
+
+
+@pytest.mark.parametrize(
+    ("parts", "problem"),
+    [([(True, 1.0)], "had already begun"), ([(False, 0.3), (True, 1.0)], "no rest before"),
+     ([(False, 1.0), (True, 0.03)], "too short")],
+)  # fmt: skip
+def test_unusable_presses_are_explained_and_the_next_one_counts(parts, problem):
+    press, feed.t_s = LabelledPress(Label(True, 1.0, 2.0), learn=False), 0.0
+    for contact, seconds in [*parts, (False, 0.1)]:
+        feed(press, contact, seconds)
+    assert problem in press.problem
+    assert not press.complete
+    for contact, seconds in [(False, 1.0), (True, 0.5), (False, 0.1)]:
+        feed(press, contact, seconds)
+    assert press.complete
+    assert press.rest_s[1] < press.held_s[0] < press.held_s[1]
+    np.testing.assert_allclose(press.db_uT, 100.0)
+
+
+def test_described_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
+    measured = read_measured(MEASURED_FILE)
+    noload_uT, b_uT, place_mm, force_N = random_pokes
+    shipped = UniversalEstimator(load_universal())
+    texts = describe(shipped, load_universal(), "")
+    assert texts["model"] == "universal model, shipped with reskin"
+    for each in measured.places[0].median_mm:  # one value per recorded board
+        assert f"{each:.1f}" in texts["expected"]
+    assert all(f"{each:.2g}" in texts["least_force"] for each in measured.detection.lightest_N)
+    assert f"{shipped.model.tables.force_N[0]:.2g} N" in texts["least_force"]
+    # A number of presses or labels that was not measured has the result of the next smaller number.
+    many = load_universal().zero(noload_uT).see(np.tile(b_uT, (6, 1))[:65]).label(place_mm, force_N, b_uT)
+    texts = describe(UniversalEstimator(many), many, "s1.safetensors")
+    assert texts["model"] == "universal model, file s1.safetensors"
+    assert texts["learnt"] == "77 presses in the file"
+    assert texts["expected"].endswith("after 65 presses and 10 labels)")
+    outside = load_universal(external_uT=30.0)
+    assert describe(UniversalEstimator(outside), outside, "")["expected"].endswith("not measured with external fields")
+    other = replace(load_universal(), card={"name": "a model of another board"})
+    texts = describe(UniversalEstimator(other), other, "other.safetensors")
+    assert texts["expected"] == "not measured for this model"
+    assert texts["least_force"].startswith("not measured; trained with simulated forces from ")
+
+
+def test_described_networks_have_the_scores_of_their_cards(tmp_path):
+    network = read_network(write_model(tmp_path))
+    scores = {"all": {"accuracy_pct": 71.4, "mse_xy_mm2": 0.512}}
+    scored = replace(network, card=network.card | {"scores": scores, "test_boards": ["b0", "b1"]})
+    texts = describe(NetworkEstimator([scored]), [scored], "model.safetensors")
+    assert texts["model"] == "trained network, file model.safetensors"
+    assert texts["expected"] == "71 % within 1 mm, MSE_xy 0.51 mm² (scene quick, tested on boards b0, b1)"
+    assert describe(NetworkEstimator([scored] * 2), [scored] * 2, "")["expected"] == "not measured for their mean"
+    assert describe(None, [], "")["model"] == ""

@@ -1,0 +1,172 @@
+"""Tests of `reskin.load_recording`: each kind of recording gives the readings that the project's readers return."""
+
+import sys
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+
+import reskin
+from reskin import io
+from reskin.board.wire import Frames, encode, record_type
+from reskin.errors import CaptureError, ParamsError, ReskinError
+from reskin.recordings import clocks, probe
+from reskin.recordings.clocks import Arrivals
+from reskin.recordings.decode import decode_dump
+from reskin.recordings.fault_policy import STANDARD_POLICY
+from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, write_capture
+from reskin.recordings.ingest import open_capture
+from reskin.recordings.readers import sd_card
+from reskin.recordings.tables import render_csv
+from reskin.schema import LABELS, UNITS
+from reskin.seeds import rng_for
+from tests.recordings.headers import DEFAULT_POLICY, make_header
+from tests.test_io import readings
+
+RATE_HZ, FRAMES_N, CHIPS_N = 100.0, 120, 2
+CHANNELS = ["bx0_uT", "by0_uT", "bz0_uT", "bx1_uT", "by1_uT", "bz1_uT"]
+PLACES_MM = (2.0, 6.0, 10.0)  # places in x of the contacts, of 0.2 s each, after 0.2 s without contact each
+
+
+def frames_of_board() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, fields (two decimals) and temperatures of frames with three contacts."""
+    t_s = (1 + np.arange(FRAMES_N)) / RATE_HZ
+    in_contact = (t_s % 0.4 > 0.2)[:, None]
+    b_uT = 900 + 300 * in_contact + 3 * rng_for(0, "frames").standard_normal((FRAMES_N, 3 * CHIPS_N))
+    return t_s, np.round(b_uT, 2).astype(np.float32), np.full((FRAMES_N, CHIPS_N), 25, np.float32)
+
+
+def labels() -> str:
+    """Return the labels of the contacts, on the clock of the stream."""
+    rows = [",".join(probe.TYPES)]
+    for i, x_mm in enumerate(PLACES_MM):
+        start_s = 0.4 * i
+        rows.append(f"{i},0,noload,{start_s + 0.02},{start_s + 0.18},,,,,,")
+        rows.append(f"{i},0,contact,{start_s + 0.22},{start_s + 0.38},{x_mm},3,0.5,,,{1 + i}")
+    return "\n".join(rows) + "\n"
+
+
+def write_stream(folder, files=None):
+    """Write the frames to a capture's folder, as `reskin record` does, with further files such as labels."""
+    t_s, b_uT, temperature_degC = frames_of_board()
+    stream = encode(Frames(b_uT, temperature_degC, t_s, np.zeros(FRAMES_N, np.int64)), "binary")
+    ends = record_type("binary", CHIPS_N).itemsize * np.arange(FRAMES_N + 1)
+    arrivals = clocks.render(Arrivals(ends, np.append(0.0, t_s)))
+    clock = Clock(kind="arrivals", rate_hz=None, marks=((0.0, 0.0), (1.2, 1.2)))
+    header = make_header(capture=folder.name, layout="native", wire="binary", chips_n=CHIPS_N, clock=clock)
+    write_capture(folder, header, {STREAM_FILE: stream, ARRIVALS_FILE: arrivals.encode(), **(files or {})})
+    return folder
+
+
+def check_units(frame):
+    assert list(frame.attrs["units"]) == list(frame.columns)
+    numeric = {name: unit for name, unit in frame.attrs["units"].items() if name not in LABELS}
+    assert {unit for name, unit in numeric.items() if name.endswith(f"_{unit}")} == set(numeric.values()) - {"1"}
+    assert all(unit == "1" for name, unit in numeric.items() if not name.endswith(f"_{unit}"))
+
+
+def test_logs_of_all_kinds_have_the_same_frames(tmp_path):
+    t_s, b_uT, temperature_degC = frames_of_board()
+    folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
+    (tmp_path / "log.csv").write_text(sd_card.render(t_s, b_uT, temperature_degC))
+    table, _ = decode_dump((folder / STREAM_FILE).read_bytes(), "binary", CHIPS_N, "stream")
+    io.write_table(tmp_path / "decoded.parquet", table)
+
+    card = reskin.load_recording(tmp_path / "log.csv")
+    decoded = reskin.load_recording(str(tmp_path / "decoded.parquet"), rate_hz=RATE_HZ)
+    stream = reskin.load_recording(folder, frames=True)
+    unlabelled = reskin.load_recording(write_stream(tmp_path / "run2"))
+
+    names = ["t_s", *CHANNELS, "temperature0_degC", "temperature1_degC"]
+    assert list(card) == list(decoded) == names
+    assert list(stream) == list(unlabelled) == [*LABELS, *names]
+    for frame in (card, decoded, stream, unlabelled):
+        check_units(frame)
+        np.testing.assert_array_equal(frame[CHANNELS], b_uT)
+        np.testing.assert_allclose(frame["t_s"], t_s)
+        assert frame.attrs["counts"]["rows_n"] == FRAMES_N
+    assert set(stream["board"]) == {"board1"}
+
+
+def test_labelled_capture_has_the_rows_of_the_ingested_capture(tmp_path):
+    folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
+    _, blocks, counts = open_capture(folder, DEFAULT_POLICY)
+    io.write_readings(tmp_path / "run1.parquet", blocks, counts)
+    expected = io.read_readings(tmp_path / "run1.parquet")
+
+    frame, ingested = reskin.load_recording(folder), reskin.load_recording(tmp_path / "run1.parquet")
+
+    check_units(frame)
+    assert frame.equals(ingested)
+    assert frame.attrs["units"] == ingested.attrs["units"]
+    assert frame.attrs["counts"] == ingested.attrs["counts"]
+    per_row = {name for name in UNITS if name not in ("b_uT", "noload_uT", "temperature_degC")}
+    assert per_row < set(frame)
+    for name in per_row:
+        np.testing.assert_array_equal(frame[name], getattr(expected, name))
+    np.testing.assert_array_equal(frame[CHANNELS], expected.b_uT)
+    np.testing.assert_array_equal(frame.filter(like="noload_"), expected.noload_uT)
+    np.testing.assert_array_equal(frame.filter(like="db"), expected.b_uT - expected.noload_uT)
+    assert frame["dbx0_uT"].between(290, 310).all()  # contacts add 300 uT; three sd of the noise are 9 uT
+    assert sorted(frame["x_mm"].unique()) == list(PLACES_MM)
+
+
+def test_faults_are_handled_as_in_ingestion():
+    assert STANDARD_POLICY == DEFAULT_POLICY
+
+
+def test_table_is_read_as_a_capture_of_this_layout(tmp_path):
+    t_s, b_uT, _ = frames_of_board()
+    contact = t_s % 0.4 > 0.2
+    columns = {"phase": np.where(contact, "contact", "noload"), "t_s": t_s, "Fz_N": np.where(contact, 1.5, np.nan)}
+    columns |= {"x_mm": np.where(contact, np.repeat(PLACES_MM, FRAMES_N // 3), np.nan), "y_mm": 3.0 * contact}
+    columns |= {f"B{axis}{chip}": b_uT[:, 3 * chip + i] for chip in range(CHIPS_N) for i, axis in enumerate("xyz")}
+    io.write_table(tmp_path / "my table.parquet", pa.table(columns))
+    (tmp_path / "my table.csv").write_text(render_csv(pa.table(columns)))
+
+    frame = reskin.load_recording(tmp_path / "my table.csv")
+
+    check_units(frame)
+    # tolerance: the CSV has the fewest digits of float32, so the means of no-load fields differ by rounding
+    pd.testing.assert_frame_equal(frame, reskin.load_recording(tmp_path / "my table.parquet"), rtol=1e-6, atol=1e-4)
+    np.testing.assert_array_equal(frame[CHANNELS], b_uT[contact])
+    assert (set(frame["capture"]), set(frame["board"])) == ({"my_table"}, {"unnamed"})
+    counts = frame.attrs["counts"]
+    assert counts["rows_n"] + counts["noload_rows_n"] == counts["rows_read_n"] == FRAMES_N
+    with pytest.raises(ParamsError, match="only a capture of `reskin record` has frames"):
+        reskin.load_recording(tmp_path / "my table.csv", frames=True)
+
+
+def test_other_files_are_errors_that_name_the_file(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
+    io.write_table(tmp_path / "other.parquet", pa.table({"x": [1.0]}))
+    io.write_readings(tmp_path / "cut.parquet", [readings()], {})
+    (tmp_path / "cut.parquet").write_bytes((tmp_path / "cut.parquet").read_bytes()[:-20])
+    for name, message in (
+        ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "column 1 is 'a'"),
+        ("other.parquet", "not the columns of reskin decode"), ("cut.parquet", "not readable as Parquet"),
+    ):  # fmt: skip
+        with pytest.raises(ReskinError, match=rf"{name}.*{message}"):
+            reskin.load_recording(tmp_path / name)
+    stream = write_stream(tmp_path / "late", {PROBE_FILE: labels().replace(",0,contact", ",0,noload").encode()})
+    with pytest.raises(CaptureError, match="late.*try: frames=True"):
+        reskin.load_recording(stream)
+    assert len(reskin.load_recording(stream, frames=True)) == FRAMES_N
+    with pytest.raises(CaptureError, match="stream.bin.*run `reskin decode`"):
+        reskin.load_recording(stream / STREAM_FILE)
+
+
+def test_recorded_layout_is_named(shared_data):
+    for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
+        with pytest.raises(ReskinError, match=f"This is layout {layout}: run `reskin add`"):
+            reskin.load_recording(shared_data / name)
+
+
+def test_missing_pandas_is_an_error_that_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(
+        ParamsError, match=r"load_recording: the Python package `pandas` is not installed.*'\.\[learn\]'"
+    ):
+        reskin.load_recording(tmp_path)

@@ -1,0 +1,225 @@
+"""Tests of the estimators: scikit-learn's conventions, and equality with the project's training and calibration."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.model_selection import GroupKFold, cross_validate
+from sklearn.utils.estimator_checks import check_estimator
+
+import reskin
+from reskin import metrics
+from reskin.config import parse, read_yaml
+from reskin.errors import ParamsError, ReskinError, SchemaError, TrainingError
+from reskin.models.job import TrainingData, TrainingJob
+from reskin.models.recipe import Recipe
+from reskin.models.train import train_stack
+from reskin.seeds import rng_for
+from tests.models.example_jobs import some_rows
+from tests.test_api import ROOT
+
+ROUNDING = "single precision: the rounding of a row depends on the other rows of its block"
+CONTACT_FAILS = dict.fromkeys(["check_methods_sample_order_invariance", "check_methods_subset_invariance"], ROUNDING)
+OTHER_DATA = "fits data with another number of channels than the board, or other targets than x_mm, y_mm and force"
+UNIVERSAL_FAILS = dict.fromkeys(
+    [
+        "check_dict_unchanged", "check_dont_overwrite_parameters", "check_dtype_object", "check_estimators_dtypes",
+        "check_estimators_fit_returns_self", "check_estimators_nan_inf", "check_estimators_overwrite_params",
+        "check_estimators_pickle", "check_f_contiguous_array_estimator", "check_fit2d_1feature", "check_fit2d_1sample",
+        "check_fit2d_predict1d", "check_fit_check_is_fitted", "check_fit_idempotent", "check_fit_score_takes_y",
+        "check_methods_sample_order_invariance", "check_methods_subset_invariance", "check_n_features_in",
+        "check_n_features_in_after_fitting", "check_pipeline_consistency", "check_positive_only_tag_during_fit",
+        "check_readonly_memmap_input", "check_regressor_data_not_an_array", "check_regressors_int",
+        "check_regressors_no_decision_function", "check_regressors_train", "check_supervised_y_2d",
+    ],
+    OTHER_DATA,
+)  # fmt: skip
+SHORT = {"steps_n": 4, "batch_n": 16}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "fails"),
+    [(reskin.ContactRegressor(steps_n=15), CONTACT_FAILS), (reskin.UniversalRegressor(np.zeros(15)), UNIVERSAL_FAILS)],
+    ids=["contact", "universal"],
+)
+def test_estimators_pass_the_checks_of_scikit_learn(estimator, fails):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # scikit-learn warns of the checks that it skips
+        checks = check_estimator(estimator, expected_failed_checks=fails, on_skip=None)
+    assert {check["check_name"] for check in checks if check["status"] == "xfail"} == set(fails)
+    assert sum(check["status"] == "passed" for check in checks) > 15
+
+
+def poke_rows(n: int = 48, board: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return field changes [n 15] and smooth targets [n 3]."""
+    return some_rows(n, board)
+
+
+def network_of(regressor: reskin.ContactRegressor) -> dict[str, np.ndarray]:
+    return dict(regressor.network_.tensors)
+
+
+def test_defaults_are_the_recipe_of_the_paper():
+    settings = read_yaml(ROOT / "params.yaml")["recipes"]["paper"]
+    settings["steps_n"] = read_yaml(ROOT / "pipeline/scenes/lab.yaml")["train_multi"]["steps_n"]
+    defaults = reskin.ContactRegressor().get_params()
+    assert {name: defaults[name] for name in settings} == settings
+    assert defaults.keys() - settings.keys() == {"random_state"}
+
+
+@pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
+def test_network_equals_that_of_the_training_loop_bit_for_bit(triplet_weight):
+    X, y = poke_rows()
+    skin = np.repeat(["s0", "s1"], len(X) // 2)
+    regressor = reskin.ContactRegressor(**SHORT, triplet_weight=triplet_weight, random_state=3)
+    recipe = parse(Recipe, {name: getattr(regressor, name) for name in Recipe.model_fields}, "test")
+    job = TrainingJob("lobo", "paper", recipe, "all", 3, 0, np.arange(len(X)), np.arange(len(X)))
+    (expected,) = train_stack([job], TrainingData(X, y, skin))
+
+    regressor.fit(X, y, skin=skin)
+
+    tensors = dict(expected.weights) | expected.scaler.arrays()
+    assert tensors.keys() == network_of(regressor).keys()
+    assert all((tensors[name] == values).all() for name, values in network_of(regressor).items())
+    assert regressor.loss_curve_ == expected.curve
+    np.testing.assert_array_equal(regressor.predict(X), expected.predicted)
+    from_grid = clone(regressor).set_params(steps_n=np.int64(4), rate_max=np.float64(regressor.rate_max))
+    np.testing.assert_array_equal(from_grid.fit(X, y, skin=skin).predict(X), expected.predicted)
+    other_seed = clone(regressor).set_params(random_state=4).fit(X, y, skin=skin)
+    assert (other_seed.predict(X) != expected.predicted).all()
+
+
+def test_cross_validation_over_boards_gives_the_metrics_of_the_project():
+    X, y = (np.concatenate(parts) for parts in zip(*[poke_rows(board=i) for i in range(3)], strict=True))
+    board, regressor = np.repeat(["b0", "b1", "b2"], 48), reskin.ContactRegressor(**SHORT)
+    y[::7, 2] = np.nan  # some forces are unknown
+
+    results = cross_validate(regressor, X, y, groups=board, cv=GroupKFold(3), scoring=reskin.SCORERS)
+
+    for i, (train, test) in enumerate(GroupKFold(3).split(X, y, board)):
+        assert set(board[train]).isdisjoint(board[test])
+        scores = metrics.score(y[test], clone(regressor).fit(X[train], y[train]).predict(X[test]))
+        for name, sign in (("accuracy_pct", 1), ("neg_mse_xy_mm2", -1), ("neg_mse_f_N2", -1), ("r2_f", 1)):
+            assert results[f"test_{name}"][i] == sign * scores[name.removeprefix("neg_")]
+
+
+def test_scorers_skip_rows_with_unknown_places():
+    X, y = poke_rows()
+    regressor = reskin.ContactRegressor(**SHORT).fit(X, y)
+    half = np.where(np.arange(len(y))[:, None] < 24, y, np.nan)
+    for scorer in reskin.SCORERS.values():
+        assert scorer(regressor, X, half) == scorer(regressor, X[:24], y[:24])
+        assert np.isnan(scorer(regressor, X, np.full_like(y, np.nan)))
+
+
+def test_saved_network_is_loaded_as_a_model(tmp_path):
+    X, y = poke_rows()
+    regressor = reskin.ContactRegressor(**SHORT, inputs="shape").fit(X, y)
+    regressor.save(tmp_path / "mine.safetensors")
+    model = reskin.load_model(tmp_path / "mine.safetensors").zero(np.zeros(15))
+    np.testing.assert_array_equal(model.predict(X), regressor.predict(X))
+    with pytest.raises(SchemaError, match="a saved network must be for 3 channels per chip"):
+        reskin.ContactRegressor(**SHORT).fit(X[:, :14], y).save(tmp_path / "other.safetensors")
+    with pytest.raises(ParamsError, match=r"ends in .safetensors; got mine. Try: mine.safetensors"):
+        regressor.save(tmp_path / "mine")
+    assert {file.name for file in tmp_path.iterdir()} == {"mine.safetensors", "mine.json"}
+
+
+def test_failed_training_is_not_silent(monkeypatch):
+    X, y = poke_rows()
+    with pytest.raises(TrainingError, match="diverged by step 4. Lower rate_max"):
+        reskin.ContactRegressor(**SHORT | {"rate_max": 1e30, "gradient_norm_max": 1e30}).fit(X, y)
+    with pytest.raises(TrainingError, match="unknown .NaN. in all rows"):
+        reskin.ContactRegressor(**SHORT).fit(X, y * [1, 1, np.nan])
+    with pytest.raises(ParamsError, match="steps_n"):
+        reskin.ContactRegressor(steps_n=0).fit(X, y)
+    with pytest.raises(ParamsError, match="random_state must be a whole number; got None"):
+        reskin.ContactRegressor(random_state=None).fit(X, y)
+    monkeypatch.setattr("reskin.models.train.CHECKED_STEPS_N", SHORT["steps_n"])
+    with pytest.warns(ConvergenceWarning, match="collapsed in all of 3 runs"):
+        constant = reskin.ContactRegressor(**SHORT).fit(np.zeros_like(X), y)
+    assert constant.network_.card["collapsed"]
+
+
+@pytest.fixture(scope="module")
+def pressed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return no-load readings, field changes and targets of presses of a simulated skin."""
+    rng = rng_for(0, "presses")
+    pokes = np.column_stack([rng.uniform(2, 14, (24, 2)), rng.uniform(0.4, 1.2, 24)])
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=1), pokes)
+    return noload_uT, (b_uT - noload_uT).astype(np.float64), np.column_stack([pokes[:, :2], force_N])
+
+
+def with_unknown(y: np.ndarray) -> np.ndarray:
+    """Return targets with places and forces for six presses, places for three, and nothing for the other ones."""
+    known = y.copy()
+    known[6:9, 2] = np.nan
+    known[9:] = np.nan
+    return known
+
+
+def test_universal_regressor_is_the_universal_model(pressed):
+    noload_uT, X, y = pressed
+    known = with_unknown(y).astype(np.float32)
+    model = reskin.load_universal().zero(noload_uT)
+    b_uT = X + model.noload_uT
+    model.see(b_uT[9:], area=True).label(known[:6, :2], known[:6, 2], b_uT[:6])
+    model.label(known[6:9, :2], None, b_uT[6:9], keep=True)
+    expected = model.estimate(b_uT)
+
+    regressor = reskin.UniversalRegressor(noload_uT, spread="area").fit(X, with_unknown(y))
+    mean, std = regressor.predict(X, return_std=True)
+
+    np.testing.assert_array_equal(mean, np.column_stack([expected.place_mm, expected.force_N]))
+    np.testing.assert_array_equal(std[:, :2], expected.sd_mm)
+    np.testing.assert_array_equal(std[:, 2], expected.force_N * expected.sd_log_N)
+    assert (std > 0).all()
+    np.testing.assert_array_equal(regressor.predict(X), mean)
+
+
+def test_universal_regressor_follows_conventions(pressed, tmp_path):
+    noload_uT, X, y = pressed
+    frame = pd.DataFrame(X, columns=[f"db{axis}{chip}_uT" for chip in range(5) for axis in "xyz"])
+    regressor = reskin.UniversalRegressor(noload_uT)
+    with pytest.raises(NotFittedError):
+        regressor.predict(frame)
+    before = [array.copy() for array in (noload_uT, X, y)]
+
+    assert regressor.fit(frame, y) is regressor
+    first = regressor.predict(frame)
+
+    assert all((array == copy).all() for array, copy in zip(pressed, before, strict=True))
+    assert regressor.noload_uT is noload_uT
+    assert list(regressor.feature_names_in_) == list(frame)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
+    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)  # a second fit starts from the prior
+    np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
+    assert metrics.score(y, first)["accuracy_pct"] > 90  # on the labelled presses themselves
+    regressor.model_.save(tmp_path / "skin.safetensors")
+    saved = reskin.load_universal(tmp_path / "skin.safetensors")
+    np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)  # rounding of the sum
+
+
+def test_universal_regressor_warns_of_mirrored_labels(pressed):
+    noload_uT, X, y = pressed
+    mirrored = y * [1, -1, 1] + [0, 16, 0]
+    with pytest.warns(UserWarning, match="mirrored"):
+        reskin.UniversalRegressor(noload_uT).fit(X, mirrored)
+
+
+def test_universal_regressor_refuses_wrong_data(pressed):
+    noload_uT, X, y = pressed
+    for regressor, changed, message in (
+        (reskin.UniversalRegressor(), y, "noload_uT is missing"),
+        (reskin.UniversalRegressor(noload_uT, spread="grid"), y, "spread must be anywhere, even or area; got 'grid'"),
+        (reskin.UniversalRegressor(noload_uT[:, :12]), y, "needs 15 numbers per reading"),
+        (reskin.UniversalRegressor(noload_uT), y[:, :2], r"y has shape \(24, 2\)"),
+        (reskin.UniversalRegressor(noload_uT), y * [np.nan, 1, 1], "row 0 of y has only one of x_mm and y_mm"),
+        (reskin.UniversalRegressor(noload_uT), y * [10, 10, 1], "on the skin"),
+    ):  # fmt: skip
+        with pytest.raises(ReskinError, match=message):
+            regressor.fit(X, changed)

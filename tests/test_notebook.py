@@ -1,0 +1,58 @@
+"""Tests of docs/notebook.ipynb and docs/python.md: their code runs, and the notebook prints its committed outputs."""
+
+import io
+import json
+import re
+import tempfile
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+FILE = Path(__file__).resolve().parents[1] / "docs/notebook.ipynb"
+BYTES_MAX_N = 500_000
+
+
+@pytest.fixture
+def cells() -> list[dict]:
+    content = json.loads(FILE.read_text(encoding="utf-8"))
+    return [cell for cell in content["cells"] if cell["cell_type"] == "code"]
+
+
+def test_cells_print_the_committed_outputs(cells, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    plt.switch_backend("Agg")
+    variables: dict[str, object] = {}
+    try:
+        for i, cell in enumerate(cells, 1):
+            printed, figures_n = io.StringIO(), len(plt.get_fignums())
+            with redirect_stdout(printed):
+                exec(compile("".join(cell["source"]), f"{FILE.name}, code cell {i}", "exec"), variables)
+            assert printed.getvalue() == "".join("".join(output.get("text", "")) for output in cell["outputs"])
+            shown = [output for output in cell["outputs"] if "image/png" in output.get("data", {})]
+            assert len(plt.get_fignums()) - figures_n == len(shown)
+    finally:
+        plt.close("all")
+
+
+def test_notebook_was_run_once_in_order(cells):
+    assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
+    names = {output.get("name", "figure") for cell in cells for output in cell["outputs"]}
+    assert names == {"stdout", "figure"}  # neither warnings nor errors
+    assert FILE.stat().st_size < BYTES_MAX_N
+
+
+def test_examples_of_the_page_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plt.switch_backend("Agg")
+    blocks = re.findall(r"```python\n(.*?)```", FILE.with_name("python.md").read_text(encoding="utf-8"), re.DOTALL)
+    variables: dict[str, object] = {}
+    try:
+        for block in blocks:
+            exec(block.replace("steps_n=800", "steps_n=4"), variables)
+    finally:
+        plt.close("all")
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "captures", "network.safetensors", "network.json", "b0_s0.safetensors",
+    }  # fmt: skip

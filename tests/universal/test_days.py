@@ -1,0 +1,250 @@
+"""Tests of calibrations over several days: the algebra, the decision whether the slide has changed, and saved files."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reskin import io
+from reskin.errors import ParamsError, SchemaError
+from reskin.predicting import read_models
+from reskin.seeds import rng_for
+from reskin.universal import calibration, map
+from reskin.universal.law import to_chips
+from reskin.universal.map import (
+    OFFSET_uT,
+    begin_day,
+    condition_on_labels,
+    condition_on_noload,
+    interpolate,
+    kernel,
+    new_map,
+)
+from reskin.universal.model import Slide, Universal, load_universal
+from reskin.universal.population import grid
+from tests.universal.skins import REST_SLOPE_uT, make_tables, poked_uT
+
+NAMES = ("label_x_mm", "label_y_mm", "away_um_mm")  # of the parameters in tests of the algebra; the third is the slide
+
+
+@pytest.fixture(scope="module")
+def skin_map() -> map.SkinMap:
+    return new_map(replace(make_tables(), names=NAMES))
+
+
+@pytest.fixture
+def skin() -> Universal:
+    return load_universal()
+
+
+def labelled_presses(presses_n=9):
+    """Return places, forces, field changes and days of labelled presses on three days."""
+    rng = rng_for(0, "days")
+    place_mm, force_N = rng.permutation(grid())[:presses_n], np.exp(rng.uniform(np.log(0.7), np.log(8), presses_n))
+    db_uT = poked_uT(place_mm, force_N, np.array([0.5, -0.5, 1.0])) + rng.normal(0, 20, (presses_n, 15))
+    return place_mm, force_N, db_uT, np.arange(presses_n) % 3
+
+
+def test_labels_of_three_days_equal_a_dense_gaussian(skin_map, monkeypatch):
+    monkeypatch.setattr(map, "SLIDE_CORRELATION", 0.4)
+    place_mm, force_N, db_uT, days_ago = labelled_presses()
+    rest_uT = rng_for(1, "rest").normal(0, 300, 15)
+    found = condition_on_labels(
+        begin_day(begin_day(condition_on_noload(skin_map, rest_uT))), place_mm, force_N, db_uT, days_ago
+    )
+
+    # Reference in covariance form: two constant parameters, then the slide today, one day ago and two days ago. The
+    # no-load field was read two days ago.
+    prior = np.eye(5)
+    prior[2:, 2:] = [[1, 0.4, 0.16], [0.4, 1, 0.4], [0.16, 0.4, 1]]
+    mean_uT, slope_uT, _ = interpolate(skin_map, place_mm, force_N)
+    magnitude_uT = np.linalg.norm(mean_uT, axis=1)
+    row, value = [], []
+    for press in range(len(place_mm)):
+        own = np.zeros((15, 5))
+        own[:, [0, 1, 2 + days_ago[press]]] = slope_uT[press] / magnitude_uT[press]
+        row.append(own)
+        value.append((db_uT[press] - mean_uT[press]) / magnitude_uT[press])
+    rest_row = np.zeros((15, 5))
+    rest_row[:, [0, 1, 4]] = REST_SLOPE_uT
+    k = kernel(place_mm, place_mm, np.log(force_N), np.log(force_N))
+    k = k * map.ERROR_CORRELATION ** np.abs(np.subtract.outer(days_ago, days_ago))
+    noise = np.zeros((15 * 10, 15 * 10))
+    noise[:135, :135] = np.kron(k + skin_map.residual.noise * np.eye(9), skin_map.error_cov)
+    noise[135:, 135:] = OFFSET_uT**2 * np.eye(15)
+    rows, values = np.concatenate([*row, rest_row]), np.concatenate([*value, rest_uT])
+    gain = prior @ rows.T @ np.linalg.inv(rows @ prior @ rows.T + noise)
+    np.testing.assert_allclose(found.mean, gain @ values, atol=1e-9)
+    np.testing.assert_allclose(found.cov, prior - gain @ rows @ prior, atol=1e-9)
+    np.testing.assert_array_equal(found.current[0], found.mean[:3])
+
+
+def test_days_without_change_equal_one_day(skin_map, monkeypatch):
+    place_mm, force_N, db_uT, days_ago = labelled_presses()
+    at_once = condition_on_labels(skin_map, place_mm, force_N, db_uT)
+    monkeypatch.setattr(map, "SLIDE_CORRELATION", 1 - 1e-8)  # with 1, the covariance cannot be inverted
+    monkeypatch.setattr(map, "ERROR_CORRELATION", 1.0)
+    by_day = condition_on_labels(begin_day(begin_day(skin_map)), place_mm, force_N, db_uT, days_ago)
+    np.testing.assert_allclose(by_day.current[0], at_once.mean, atol=1e-5)
+    np.testing.assert_allclose(by_day.current[1], at_once.cov, atol=1e-5)
+    one, other = (each.evaluator.estimate(db_uT) for each in (at_once, by_day))
+    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # deviances are in single precision
+
+
+def test_a_new_day_forgets_the_slide_alone(skin_map):
+    known = condition_on_labels(skin_map, *labelled_presses()[:3])
+    after, (mean, cov) = replace(known, labelled=None), begin_day(known).current
+    np.testing.assert_array_equal(mean[:2], after.mean[:2])
+    np.testing.assert_array_equal(cov[:2, :2], after.cov[:2, :2])
+    assert mean[2] == 0
+    assert cov[2].tolist() == [0, 0, 1]
+
+
+def pokes(skin, shift=None, force_i=3):
+    """Return field changes along the chips' axes at 16 places, with parameters shifted by `shift` (name: spreads)."""
+    at, tables = np.ix_([4, 9, 14, 19], [4, 9, 14, 19]), skin.tables
+    slope_uT = tables.slope_uT[at][:, :, force_i]
+    change = sum(by * slope_uT[..., tables.names.index(name)] for name, by in (shift or {}).items())
+    return to_chips((tables.mean_uT[at][:, :, force_i] + change).reshape(16, -1))
+
+
+OTHER_SLIDE = {"give_x_um": 2.5, "away_um_mm": -2.0}
+PLACES_MM = np.array([[4.0, 4.0], [4.0, 12.0], [12.0, 4.0], [12.0, 12.0], [8.0, 8.0]])
+
+
+@pytest.fixture
+def first_day(skin, tmp_path):
+    """Return a no-load reading, and a file with presses and labels of the first day."""
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
+    pressed_uT = pokes(skin) + rest_uT
+    skin.zero(rest_uT).see(pressed_uT)
+    axis_mm = skin.tables.axis_mm[[4, 9, 14, 19]] + 8
+    place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
+    skin.label(place_mm[::3], np.full(6, skin.tables.force_N[3]), pressed_uT[::3]).save(file)
+    return rest_uT, file
+
+
+def test_presses_tell_whether_the_slide_has_changed(skin, first_day):
+    rest_uT, file = first_day
+    same_uT, changed_uT = pokes(skin)[:5] + rest_uT, pokes(skin, OTHER_SLIDE)[:5] + rest_uT
+    assert load_universal(file).slide is None
+    later = load_universal(file, new_day=True).zero(rest_uT, keep=True)
+    assert later.slide == Slide(same=False, log_odds=0.0)
+    assert later.see(same_uT).slide.same
+    # presses of both days are then used together
+    together = load_universal(file).zero(rest_uT, keep=True)
+    data = replace(together._data, presses_uT=np.concatenate([together._data.presses_uT, together._change(same_uT)]))
+    expected = together._begin(data).estimate(changed_uT)
+    for found, value in zip(vars(later.estimate(changed_uT)).values(), vars(expected).values(), strict=True):
+        np.testing.assert_array_equal(found, value)
+    other = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(changed_uT)
+    assert not other.slide.same
+    assert other.slide.log_odds < -10
+    off_mm = [
+        np.abs(
+            each.predict(pokes(skin, OTHER_SLIDE) + rest_uT)[:, :2] - skin.predict(pokes(skin) + rest_uT)[:, :2]
+        ).mean()
+        for each in (other, together)
+    ]
+    assert off_mm[0] < off_mm[1]
+    # more presses can change the decision
+    assert not later.see(np.concatenate([changed_uT, changed_uT])).slide.same
+    assert "earlier days: 1, 15 presses at unknown places, 0 labelled" in repr(later)
+
+
+def test_order_of_presses_and_labels_of_a_new_day_does_not_matter(skin, first_day):
+    rest_uT, file = first_day
+    for shift in ({}, OTHER_SLIDE):
+        read_uT = pokes(skin, shift) + rest_uT
+        labels = PLACES_MM, np.full(5, 1.5), read_uT[[0, 3, 12, 15, 5]]
+        one, other = (load_universal(file, new_day=True).zero(rest_uT, keep=True) for _ in range(2))
+        one.see(read_uT).label(*labels)
+        if shift:
+            other.label(*labels).see(read_uT[::-1])
+        else:  # presses of an unchanged slide are added to those of the first day, so the first call matters
+            other.see(read_uT[::-1]).label(*labels)
+        assert one.slide.same == other.slide.same == (not shift)
+        assert one.slide.log_odds == pytest.approx(other.slide.log_odds, rel=1e-6)
+        for found, value in zip(
+            vars(one.estimate(read_uT)).values(), vars(other.estimate(read_uT)).values(), strict=True
+        ):
+            np.testing.assert_allclose(found, value, rtol=2e-3)  # sums in single precision
+
+
+def test_saved_days_are_loaded_again(skin, first_day, tmp_path):
+    rest_uT, file = first_day
+    changed_uT, later_file = pokes(skin, OTHER_SLIDE) + rest_uT, tmp_path / "later.safetensors"
+    later = load_universal(file, new_day=True).zero(rest_uT + 5, keep=True).see(changed_uT, even=True)
+    later.label(PLACES_MM[:2], None, changed_uT[[0, 3]]).save(later_file)
+    again = load_universal(later_file)
+    assert again.presses_n == later.presses_n == 16 + 6 + 16 + 2
+    assert again.slide == later.slide
+    for found, value in zip(
+        vars(again.estimate(changed_uT)).values(), vars(later.estimate(changed_uT)).values(), strict=True
+    ):
+        np.testing.assert_allclose(found, value, rtol=1e-5)
+    third = load_universal(later_file, new_day=True)
+    assert "earlier days: 2" in repr(third)
+    third.save(later_file)  # a day without presses is not kept
+    assert "earlier days: 2" in repr(load_universal(later_file, new_day=True))
+    assert third.zero(rest_uT).presses_n == 0
+    assert third.slide is None
+
+
+def test_files_of_the_third_format_hold_one_day(skin, first_day):
+    rest_uT, file = first_day
+    tensors, header = io.read_tensors(file)
+    assert header["format"] == "reskin-skin-4"
+    io.write_tensors(file, tensors, header | {"format": "reskin-skin-3"})
+    again = load_universal(file)
+    assert again.slide is None
+    for found, value in zip(
+        vars(again.estimate(pokes(skin) + rest_uT)).values(),
+        vars(skin.estimate(pokes(skin) + rest_uT)).values(),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, value, rtol=1e-5)
+
+
+def test_days_are_limited_and_checked(first_day, monkeypatch):
+    rest_uT, file = first_day
+    with pytest.raises(SchemaError, match="new_day: there is no calibration of an earlier day"):
+        load_universal(new_day=True)
+    tensors, header = io.read_tensors(file)
+    days = {f"earlier_{i}_{name}": values for i in range(4) for name, values in tensors.items()}
+    io.write_tensors(file, tensors | days, header)
+    assert "earlier days: 4" in repr(load_universal(file, new_day=True))  # the first of five days is omitted
+    more = {f"earlier_4_{name}": values for name, values in tensors.items()}
+    io.write_tensors(file, tensors | days | more, header)
+    with pytest.raises(SchemaError, match="days must be at most 5 days with 2000 labels; got 6 with 36"):
+        load_universal(file)
+    io.write_tensors(file, tensors | {"earlier_1_rest_uT": tensors["rest_uT"]}, header)
+    with pytest.raises(SchemaError, match="arrays must be rest_uT"):
+        load_universal(file)
+    io.write_tensors(file, tensors, header)
+    monkeypatch.setattr(calibration, "LABELS_MAX_N", 10)
+    later = load_universal(file, new_day=True)
+    with pytest.raises(SchemaError, match="labels: 11 are too many"):
+        later.label(PLACES_MM, np.ones(5), np.tile(rest_uT + 100, (5, 1)))
+    assert later.presses_n == 22
+
+
+def test_middle_of_the_skin_is_carried_over(skin, tmp_path):
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
+    inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
+    found_mm = []
+    for even in (False, True):  # presses on one side, whose mean place would be the middle
+        skin.zero(rest_uT).see(np.tile(pokes(skin)[[2, 3, 6, 7]] + rest_uT, (3, 1)), even=even).save(file)
+        later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(changed_uT)
+        assert not later.slide.same
+        found_mm.append([each.predict(inner_uT)[:, :2].mean(axis=0) for each in (skin, later)])
+    first_mm, later_mm = np.subtract(*found_mm)
+    assert np.linalg.norm(first_mm) > 0.1
+    np.testing.assert_allclose(later_mm, first_mm, atol=0.5 * np.linalg.norm(first_mm))
+
+
+def test_commands_begin_a_day(first_day):
+    _, file = first_day
+    assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
+    with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):
+        read_models([], new_day=True)
