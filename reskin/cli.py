@@ -54,7 +54,8 @@ SCAN = (
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
 FAULT = (
     "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. Names: failed-read, zeros, chip-reset, stuck, "
-    "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
+    "slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, "
+    "unplug."
 )
 MODEL = (
     "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or the last "
@@ -115,12 +116,19 @@ def common_options(
 def find_ports(
     names: Annotated[list[str] | None, Argument(help="Ports to search. Default: all ports of this machine.")] = None,
     hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
+    rate: Annotated[bool, Option("--rate", help="Measure frame rates, and explain what limits them.")] = False,
+    seconds: Annotated[float, Option(help="With --rate: duration of the measurement.", min=0.5)] = 5.0,
+    osr: Annotated[int, Option(help="With --rate: setting OSR of the chips.", min=0, max=3)] = 0,
+    dig_filt: Annotated[int, Option("--dig-filt", help="With --rate: their setting DIG_FILT.", min=0, max=7)] = 2,
 ) -> None:
     """Find connected boards, and print the port, wire format, number of chips, frame rate and scale of each."""
     from reskin.board import find
+    from reskin.physics.chip import conversion_s
 
-    for line in find.scan_ports([find.find_replugged_port(typer.echo)] if hunt else names):
-        typer.echo(line)
+    if hunt:
+        names = [find.find_replugged_port(typer.echo)]
+    for board in find.scan_ports(names, listening_s=seconds if rate else find.LISTENING_S):
+        typer.echo(board.describe_rate(conversion_s(osr, dig_filt)) if rate else board)
 
 
 @app.command(rich_help_panel=RECORDINGS)

@@ -25,7 +25,7 @@ from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
 from tests.board.signals import make_frames
 from tests.recordings.headers import DEFAULT_POLICY, make_header
-from tests.recordings.readers.test_lab import PRESSES, write
+from tests.recordings.readers.test_lab import PRESSES, row, write
 from tests.recordings.readers.test_leaphand import numbers
 from tests.recordings.readers.test_leaphand import write as write_leaphand
 from tests.scenes import recorded_scene
@@ -116,6 +116,13 @@ def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypat
     monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was called"))
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
+
+
+def test_repeated_readings_are_a_warning(root, tmp_path, capsys):
+    """A recorder that reads faster than the chips convert writes each reading twice."""
+    press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
+    add_lab(root, write(tmp_path, *press) / "readings.csv")
+    assert "board1_skin1_readings: 50% of readings repeat the one before." in capsys.readouterr().err
 
 
 def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):

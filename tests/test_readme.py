@@ -3,11 +3,15 @@ import shutil
 import subprocess
 
 import pytest
+from typer.testing import CliRunner
 
+from pipeline import plan
+from pipeline.cli import app
 from pipeline.report.numbers import join, split
 from pipeline.report.readme import blocks_of
 from reskin import io
 from reskin.config import read_yaml
+from reskin.errors import ReskinError
 from tests.report.synthetic import all_experiments
 from tests.stages.checkout import ROOT, copy_checkout, run
 
@@ -24,6 +28,11 @@ def test_readme_shows_the_committed_results():
     assert done.returncode == 0, done.stderr
 
 
+def reskin(*arguments):
+    """Run a command in this process, in the working directory; return its output."""
+    return CliRunner().invoke(app, arguments, catch_exceptions=False).stdout
+
+
 def copy_results(root, scenes):
     for name in scenes:
         (root / "reports" / name).mkdir(exist_ok=True)
@@ -31,34 +40,35 @@ def copy_results(root, scenes):
             shutil.copy(ROOT / "reports" / name / file, root / "reports" / name)
 
 
-def test_pages_do_not_depend_on_the_planned_scene(tmp_path):
+def test_pages_do_not_depend_on_the_planned_scene(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     copy_results(root, [file.parent.name for file in (ROOT / "reports").glob("*/numbers.json")])
-    run(root, "reskin", "readme")
+    monkeypatch.chdir(root)
+    reskin("readme")
     pages = [root / "README.md", *(root / "docs").glob("*.md")]
     before = [page.read_bytes() for page in pages]
 
-    run(root, "reskin", "scenes", "use", "ci")
+    plan.use(root, ["ci"])
     numbers = all_experiments()
     shared, run_provenance = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
     io.write_json(root / "reports/ci/numbers.json", shared)
     io.write_json(root / "reports/ci/provenance.json", run_provenance)
-    output = run(root, "reskin", "readme").stdout
+    output = reskin("readme")
     assert [page.read_bytes() for page in pages] == before
     assert output.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
 
     (root / "reports/paper/numbers.json").unlink()
-    failed = run(root, "reskin", "readme", check=False)
-    assert failed.returncode == 2
-    assert "reports/paper/numbers.json is missing" in failed.stderr
+    with pytest.raises(ReskinError, match="reports/paper/numbers.json is missing"):
+        reskin("readme")
 
 
-def test_rewritten_pages_and_scenes_are_printed(tmp_path):
+def test_rewritten_pages_and_scenes_are_printed(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     copy_results(root, ["quick", "paper"])
     readme = root / "README.md"
     readme.write_text(re.sub(r"(<!-- headline -->\n).*?(<!-- /headline)", r"\1\2", readme.read_text(), flags=re.DOTALL))
-    output = run(root, "reskin", "readme").stdout
+    monkeypatch.chdir(root)
+    output = reskin("readme")
     assert re.fullmatch(r"rewritten: README\.md, .*; results shown: scenes paper, quick\n", output)
 
 

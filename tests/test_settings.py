@@ -109,7 +109,8 @@ def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
     from dvc.dependency.param import read_param_file
 
     dependencies = [(stage.name, dep) for stage in stages for dep in stage.deps if hasattr(dep, "params")]
-    files = {dep.fs_path: read_param_file(dep.repo.fs, dep.fs_path) for _, dep in dependencies}  # reads each file once
+    file_systems = {dep.fs_path: dep.repo.fs for _, dep in dependencies}  # about a hundred dependencies on a few files
+    files = {path: read_param_file(fs, path) for path, fs in file_systems.items()}
     values: dict[str, list[Any]] = {stage.name: [] for stage in stages}
     for name, dep in dependencies:
         # as in `read_param_file` of DVC: without keys, a stage depends on the whole file

@@ -16,6 +16,7 @@ from pipeline.manage.running import require_idle
 from pipeline.scenes import EXPERIMENTS, Scene, read_plan, read_scene, read_shared
 from pipeline.stage import say
 from reskin import config, io
+from reskin.board.rates import REPEATED_MAX, RepeatCounter
 from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
@@ -95,17 +96,23 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
     another layout have a fingerprint in common. An unknown force (NaN) counts as a touch.
     """
     _, blocks, counts = open_capture(folder, policy)
-    rows_n, touched, readings = 0, False, hashlib.sha256()
+    rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
     for block in blocks:
         rows_n += len(block)
         touched |= bool((block.Fz_N != 0).any())
         readings.update(block.b_uT.tobytes())
+        repeats.feed(block.b_uT)
     check_losses(counts, limit, folder.name)
     if rows_n == 0:
         raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(counts)}. Check its files.")
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in counts.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
+    if repeats.readings > REPEATED_MAX:
+        say(
+            f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Was the board, "
+            "or the program that recorded it, faster than the chips? See reskin ports --rate. It was added anyway."
+        )
     stream = tuple(header.files[name] for name in (STREAM_FILE,) if name in header.files)
     return (readings.hexdigest(), *stream), touched
 

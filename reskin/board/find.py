@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from reskin.board import faults
+from reskin.board import faults, rates
 from reskin.board.port import open_port, port_names, read_waiting
+from reskin.board.rates import RateMeasurement
 from reskin.board.stream import decode_all, matching_formats
-from reskin.board.wire import Frames, Wire
+from reskin.board.wire import Wire
 from reskin.errors import CaptureError, ParamsError
-from reskin.physics.chip import GAINS, steps_uT
+from reskin.physics.chip import CONVERSION_S, GAINS, steps_uT
 
 BAUD = 115200  # USB ports ignore the baud rate
 LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the LSB of its chips
@@ -33,6 +34,8 @@ class DetectedBoard(NamedTuple):
     chips_n: int = 0
     rate_hz: float = np.nan
     lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and along z: medians over chips
+    rate: RateMeasurement | None = None  # None without a board
+    frame_bytes_n: float = np.nan  # mean length of a frame
 
     @property
     def gain_sel(self) -> int | None:
@@ -56,6 +59,23 @@ class DetectedBoard(NamedTuple):
             gain = "of no known gain" if self.gain_sel is None else f"GAIN_SEL {self.gain_sel}"
             return f"steps {self.lsb_uT[0]:.3f} uT in x, y and {self.lsb_uT[1]:.3f} uT in z, {gain}"
         return "steps not known yet: do the readings change?"
+
+    def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
+        """Describe the measured rate, what would explain it, and the computed limits, in several lines."""
+        if self.problem is not None or self.rate is None:
+            return str(self)
+        rate = self.rate
+        limits = rates.find_limits(self.chips_n, self.frame_bytes_n, baud=BAUD, conversion_time_s=conversion_time_s)
+        source = "by the board's clock" if rate.method == "clock" else "by arrival, as the format has no usable clock"
+        return "\n".join([
+            f"{self.port}: {self.format}, {rate.frames_n} frames of {self.frame_bytes_n:.0f} bytes",
+            f"  sent     {rate.sent_hz:.1f} Hz, {source}",
+            f"  arrived  {rate.arrived_hz:.1f} Hz",
+            f"  repeated {rate.repeated_frames:.1%} of frames; {rate.repeated_readings:.1%} of each chip's readings",
+            f"  {rates.explain(rate, limits)}.",
+            "  Computed limits:",
+            *(f"    {limit.hz:8.1f} Hz: {limit.cause.rstrip(',')}" for limit in limits),
+        ])  # fmt: skip
 
 
 def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
@@ -112,25 +132,22 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     formats = matching_formats(data)
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
-    decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in formats]
+    decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
     # Text frames have the temperature of a chip first or last. Temperatures vary less than fields, so choose the format
     # in which they vary least.
-    frames, wire, chips_n = min(decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64)))
+    frames, account, wire, chips_n = min(
+        decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64))
+    )
     with np.errstate(over="ignore"):  # a frame may contain any finite number
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
-    return DetectedBoard(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
+    rate = rates.measure(frames, chunks)
+    frame_bytes_n = account["frame_bytes_n"] / len(frames)
+    return DetectedBoard(port, None, wire, chips_n, rate.arrived_hz, (lsb_uT[0], lsb_uT[1]), rate, frame_bytes_n)
 
 
 def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
     finite_uT = steps_uT[np.isfinite(steps_uT)]
     return float(np.median(finite_uT)) if len(finite_uT) else np.nan
-
-
-def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Return the frame rate without the first chunk, because its bytes may have been waiting in the port."""
-    later_n = int((frames.end_byte > len(chunks[0][0])).sum())
-    elapsed_s = chunks[-1][1] - chunks[0][1]
-    return later_n / elapsed_s if elapsed_s > 0 else np.nan
 
 
 def find_replugged_port(

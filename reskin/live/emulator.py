@@ -46,8 +46,10 @@ WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolutio
 MAGNET_uT = 400.0
 HOT_degC = 150.0
 CLOCK_JUMP_S = 3600.0
+SLOW_FRAMES_N = 3  # fault `slow-chips`: each chip has a new reading in every third frame, not all in the same frame
 VALUE_FAULTS = (
-    "failed-read", "zeros", "chip-reset", "stuck", "saturated", "int16-wrap", "magnet", "too-hot", "crlf", "clock-jump",
+    "failed-read", "zeros", "chip-reset", "stuck", "slow-chips", "saturated", "int16-wrap", "magnet", "too-hot", "crlf",
+    "clock-jump",
 )  # fmt: skip
 BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
@@ -237,6 +239,10 @@ def _change_values(frames: Frames, fault: str) -> None:
             b_uT[:, chip_i] = np.rint(b_uT[:, chip_i] / step_uT) * step_uT
         case "stuck":
             b_uT[:, chip_i], temperature_degC[:, chip_i] = b_uT[0, chip_i], temperature_degC[0, chip_i]
+        case "slow-chips":
+            frame_i, all_i = np.indices(temperature_degC.shape)
+            read_i = np.maximum(frame_i - (frame_i - all_i) % SLOW_FRAMES_N, 0)
+            b_uT[:], temperature_degC[:] = b_uT[read_i, all_i], temperature_degC[read_i, all_i]
         case "saturated":
             b_uT[:, chip_i] = FULL_SCALE_uT * np.sign(b_uT[:, chip_i])
         case "int16-wrap":

@@ -7,10 +7,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading_faults
+from reskin.board.rates import REPEATED_MAX, RepeatCounter
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
 BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
+REPEATS_FRAMES_N = 400  # frames per check for single repeated readings; their share is small
 RATE_WINDOW_S = 1.0
 SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
 USUAL_GAIN = 1e-4  # weight of a new rate in the running mean, the usual rate; time constant 25 s at 400 Hz
@@ -19,6 +21,7 @@ ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrenc
 # presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
 COMMON_MIN_uT = 50.0  # smallest external field that raises an alarm; about the strength of the earth's field
+READINGS_REPEAT = f"over {100 * REPEATED_MAX:.0f} % of readings repeat: the board sends faster than its chips convert"
 EXTERNAL_SDS = 3.0  # if external fields are expected, larger ones than this multiple of their size raise an alarm
 
 # Default policy for live readings. Saturated readings are dropped, because a controller would use a wrong estimate.
@@ -52,6 +55,8 @@ class Health:
         # LSB is wrong, but an alarm has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
+        self._repeats = RepeatCounter(chips_n)
+        self._frames_repeat = False  # whether there was an alarm for whole frames since the last check of readings
         self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
@@ -85,7 +90,7 @@ class Health:
         self._batch.append(frames.where(~readings.faulty_rows))  # without failed reads, which would hide a stuck chip
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
-            self._note_batch(self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
+            self._note_batch(batch, self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
         return np.asarray(~faulty & (not self._stuck))
 
     def feed_change(
@@ -109,15 +114,27 @@ class Health:
         external = len(b_uT) > 1 and residual < RESIDUAL_FRACTION_MAX and np.linalg.norm(common_uT) > least_uT
         self.note("external field: a magnet or iron is near, or the board was rotated", int(external), now_s)
 
-    def _note_batch(self, faults: Faults, now_s: float) -> None:
+    def _note_batch(self, batch: Frames, faults: Faults, now_s: float) -> None:
         stuck = self._note_chips("stuck", faults.stuck, now_s, "stuck")
         self._stuck = bool(stuck[-1])
         self.note("frames repeat", int(faults.repeated.sum()), now_s, "repeated")
+        self._note_repeats(batch, faults, now_s)
         self._note_chips("int16 overflow", faults.int16_wrap, now_s, "int16_wrap")
         self.note("the board's clock jumps", int(faults.clock_jump.sum()), now_s, "clock_jump")
         for window in faults.scale:
             reset = np.repeat(window.unusual[None], len(window.t_s), axis=0)
             self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
+
+    def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
+        """Raise an alarm if a few readings repeat the one before; for many, alarm `frames repeat` is raised."""
+        self._repeats.feed(batch.b_uT)
+        self._frames_repeat |= bool(faults.repeated.any())
+        if self._repeats.frames_n >= REPEATS_FRAMES_N:
+            share = self._repeats.readings
+            if share > REPEATED_MAX and not self._frames_repeat:
+                self.note(READINGS_REPEAT, round(share * self._repeats.frames_n), now_s, "repeated")
+            self._repeats.restart()
+            self._frames_repeat = False
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
         """Add a fault to the alarm of each affected chip; return the mask of the frames that the policy drops."""

@@ -106,7 +106,8 @@ class PageRecording:
         self._reader = reader
         self._labels: ProbeLogWriter | None = None
         self._begun_s = reader.unix_s()
-        reader.write_to(CaptureWriter(self._part, board.wire))
+        self._writer = CaptureWriter(self._part, board.wire, board.chips_n)
+        reader.write_to(self._writer)
 
     @property
     def touches_n(self) -> int:
@@ -142,5 +143,5 @@ class PageRecording:
         self._reader.write_to(None)
         if self._labels is not None:
             self._labels.close()
-        end_capture(self.folder, self._header)
+        end_capture(self.folder, self._header, self._writer.rate())
         return f"recorded {self.folder}" + (f", labelled presses: {self.touches_n}" if self._labels else "")

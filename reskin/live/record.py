@@ -112,6 +112,8 @@ def record_board(
     if stream.ended == "not written":
         folder = folder.with_name(f"{folder.name}.part")
         where = f"{folder}, which is incomplete because writing failed"
-    counted = "; ".join([counts, *alarms, *([labels_summary] if labels_summary else [])])
+    rate = stream.rate
+    measured = [f"{rate.arrived_hz:.1f} Hz, {rate.repeated_readings:.1%} of readings repeat"] if rate.known else []
+    counted = "; ".join([counts, *measured, *alarms, *([labels_summary] if labels_summary else [])])
     summary = f"recorded {where} ({stream.ended} after {stream.duration_s:.1f} s): {counted}"
     return RecordingResult(folder, summary, error)

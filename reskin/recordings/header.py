@@ -60,8 +60,24 @@ class Firmware(_Frozen):
     lsb_z_uT: Annotated[float, Field(gt=0)]
 
 
+class Rate(_Frozen):
+    """Frame rate and repeated readings, as the recorder measured them; see `reskin.board.rates.RateMeasurement`.
+
+    `sent_hz` is the rate by the board's clock (`method` is `clock`) or, if it has none, the rate of arrival.
+    """
+
+    sent_hz: Annotated[float, Field(gt=0)]
+    method: Literal["arrivals", "clock"]
+    arrived_hz: Annotated[float, Field(gt=0)]
+    repeated_frames: Annotated[float, Field(ge=0, le=1)]
+    repeated_readings: Annotated[float, Field(ge=0, le=1)]
+
+
 class Header(_Frozen):
-    """The header of a capture. All fields must be present in the file; there are no defaults."""
+    """The header of a capture. All fields except `rate` must be present in the file.
+
+    Captures that were recorded before rates were measured, or in another program, have no `rate`.
+    """
 
     format: Literal["reskin-capture/1"]
     capture: Name
@@ -81,6 +97,7 @@ class Header(_Frozen):
     options: dict[str, str]
     files: dict[str, str]  # name -> sha256 of each file except this header
     note: str
+    rate: Rate | None = None
 
     @property
     def expected_lsb_uT(self) -> tuple[float, float] | None:
@@ -111,15 +128,16 @@ def make_header(where: str, **fields: Any) -> Header:
     defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
-        "contacts_before_n": 0, "options": {}, "files": {},
+        "contacts_before_n": 0, "options": {}, "files": {}, "rate": None,
     }  # fmt: skip
     values = defaults | fields
     return parse(render(Header.model_construct(**{name: values[name] for name in Header.model_fields})), where)
 
 
 def render(header: Header) -> str:
-    """Write a header as JSON, two-space indented, keys in the order of `Header`."""
-    return json.dumps(header.model_dump(mode="json"), indent=2) + "\n"
+    """Write a header as JSON, two-space indented, keys in the order of `Header`; a rate of None is left out."""
+    without = {"rate"} if header.rate is None else set()
+    return json.dumps(header.model_dump(mode="json", exclude=without), indent=2) + "\n"
 
 
 def check_same_capture(header: Header, folder: str) -> None:

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reskin import io
+from reskin.board.rates import RateMeasurement
 from reskin.board.wire import Wire
 from reskin.errors import CaptureError
-from reskin.recordings.header import HEADER_FILE, Clock, Header, make_header, render, seal
+from reskin.recordings.header import HEADER_FILE, Clock, Header, Rate, make_header, render, seal
 from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
 from reskin.recordings.labels import ProbeLogWriter
 from reskin.recordings.preparing import UNNAMED
@@ -72,7 +73,7 @@ def record_capture(
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         recording = replace(recording, ended="not written")
     if recording.ended != "not written":  # if the disk is full, the .part folder can be added as it is
-        end_capture(folder, headers[-1])
+        end_capture(folder, headers[-1], recording.rate)
     return CaptureResult(recording, summary, failed)
 
 
@@ -122,9 +123,12 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
     return part, header
 
 
-def end_capture(folder: Path, header: Header) -> None:
-    """Write the header of `<folder>.part` with the hashes of its files, and rename it to `folder`."""
-    seal(_part_of(folder), header)
+def end_capture(folder: Path, header: Header, rate: RateMeasurement) -> None:
+    """Write the header of `<folder>.part` with its rate and the hashes of its files, and rename it to `folder`."""
+    measured = None
+    if rate.known:
+        measured = Rate.model_validate({name: getattr(rate, name) for name in Rate.model_fields})
+    seal(_part_of(folder), header.model_copy(update={"rate": measured}))
     _part_of(folder).rename(folder)
 
 

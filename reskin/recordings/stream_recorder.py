@@ -12,8 +12,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
+import numpy as np
+
 from reskin import io
 from reskin.board.port import Device, found_ports, open_port, read_waiting
+from reskin.board.rates import RateMeasurement, RateMeter
 from reskin.board.stream import FrameStream, no_frame
 from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
@@ -47,6 +50,7 @@ class Recording:
     duration_s: float
     partial_line_bytes_n: int  # bytes before the first whole line, which are not written
     account: dict[str, int]  # counts of bytes and frames, see `FrameStream.account`
+    rate: RateMeasurement
 
 
 def record(
@@ -67,7 +71,7 @@ def record(
     with (
         open_port(port, settings.baud) as device,
         _stopping_on_signals(stop),
-        CaptureWriter(folder, settings.wire) as writer,
+        CaptureWriter(folder, settings.wire, settings.chips_n) as writer,
     ):
         recorder = _Recorder(port, settings, writer, watch)
         ended = recorder.listen(device, stop, report)
@@ -78,10 +82,14 @@ class CaptureWriter:
     """Write the files `stream.bin` and `arrivals.csv` of a recording: each chunk of bytes, then its time of arrival.
 
     In this order, no arrival refers to bytes that are missing. If the disk is full, a partly written chunk is removed.
+    The frames of the written bytes are decoded, to count them and to measure their rate.
     """
 
-    def __init__(self, folder: Path, wire: Wire) -> None:
+    def __init__(self, folder: Path, wire: Wire, chips_n: int) -> None:
         self.bytes_n = self.partial_line_bytes_n = 0
+        self.decoder = FrameStream(wire, chips_n)
+        self._chips_n = chips_n
+        self._meter: RateMeter | None = None  # None before the first bytes
         self._in_partial_line = wire in TEXT_WIRES
         # Unbuffered, so that no written data is lost if the process is killed, and closing the file cannot fail.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
@@ -99,11 +107,17 @@ class CaptureWriter:
         self._stream.close()
         self._arrivals.close()
 
-    def write(self, chunk: bytes, unix_s: float) -> bytes:
-        """Write a chunk; return the bytes that were written.
+    def rate(self) -> RateMeasurement:
+        """Return the rate of the frames that were written so far."""
+        return (self._meter or RateMeter(self._chips_n, 0.0)).measure()
+
+    def write(self, chunk: bytes, unix_s: float) -> Frames:
+        """Write a chunk; return the frames that are now complete.
 
         In text formats, the first line is left out, because the recording may have begun inside a number.
         """
+        if self._meter is None:
+            self._meter = RateMeter(self._chips_n, unix_s)
         if self._in_partial_line:
             partial, newline, rest = chunk.partition(b"\n")
             self.partial_line_bytes_n += len(partial + newline)
@@ -112,7 +126,9 @@ class CaptureWriter:
             io.append(self._stream, chunk)
             self.bytes_n += len(chunk)
             self._note_arrival(unix_s)
-        return chunk
+        frames = self.decoder.feed(chunk)
+        self._meter.feed(frames, np.full(len(frames), unix_s))
+        return frames
 
     def _note_arrival(self, unix_s: float) -> None:
         io.append(self._arrivals, f"{self.bytes_n},{unix_s:.6f}\n".encode())
@@ -123,7 +139,6 @@ class _Recorder:
 
     def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
         self._port, self._settings, self._writer, self._watch = port, settings, writer, watch
-        self._frames = FrameStream(settings.wire, settings.chips_n)
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
         self._first_byte_s = math.inf
@@ -134,7 +149,7 @@ class _Recorder:
     def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
         """Read and write chunks until there is a reason to end; return the reason."""
         while not (ended := self._reason_to_end(stop)):
-            report(self._frames.account())
+            report(self._writer.decoder.account())
             try:
                 chunk = read_waiting(device, self._bytes_left_n())
             except OSError:  # pyserial's errors are OSErrors too
@@ -147,19 +162,19 @@ class _Recorder:
 
     def finish(self, ended: Ended) -> Recording:
         """Return the finished recording; raise `CaptureError` if it has no frames."""
-        self._frames.close()
-        account = self._frames.account()
+        self._writer.decoder.close()
+        account = self._writer.decoder.account()
         duration_s = time.monotonic() - self._start_s
         if not self._head:
             remedy = f"Is the board running, and this its port? {found_ports()}"
             raise CaptureError(f"{self._port}: no bytes arrived in {duration_s:.1f} s. {remedy}")
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
-        return Recording(ended, duration_s, self._writer.partial_line_bytes_n, account)
+        return Recording(ended, duration_s, self._writer.partial_line_bytes_n, account, self._writer.rate())
 
     def _reason_to_end(self, stop: threading.Event) -> Ended | None:
         settings, now_s = self._settings, time.monotonic()
-        frames_n = self._frames.account()["frames_n"]
+        frames_n = self._writer.decoder.account()["frames_n"]
         reasons: dict[Ended, bool] = {
             "stopped": stop.is_set(),
             "duration": now_s - self._start_s >= settings.duration_s,
@@ -179,8 +194,7 @@ class _Recorder:
         self._last_byte_s = time.monotonic()
         self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
         self._head = (self._head + chunk)[:HEAD_BYTES_N]
-        if written := self._writer.write(chunk, self._unix_offset_s + self._last_byte_s):
-            self._watch(self._frames.feed(written))
+        self._watch(self._writer.write(chunk, self._unix_offset_s + self._last_byte_s))
 
 
 @contextmanager

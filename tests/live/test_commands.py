@@ -45,6 +45,17 @@ def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
+def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
+    with plugged_in(inject(make_script(), parse_fault("slow-chips@0+99")), loop=True, speed=5) as name:
+        commands.record(port=name, seconds=3.0, out=tmp_path / "run1", **NO_OPTIONS)
+    rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
+    assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
+    assert (rate.method, rate.repeated_frames) == ("arrivals", 0.0)
+    assert rate.repeated_readings == pytest.approx(2 / 3, abs=0.01)
+    output = capsys.readouterr().out
+    assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output
+
+
 def test_wire_and_chips_need_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):

@@ -184,7 +184,17 @@ def test_invalid_ports_raise(tmp_path):
 
 class TestFaults:
     def test_value_faults_change_only_frames_within_their_time(self):
-        for name in ("failed-read", "chip-reset", "stuck", "saturated", "int16-wrap", "magnet", "too-hot", "crlf"):
+        for name in (
+            "failed-read",
+            "chip-reset",
+            "stuck",
+            "slow-chips",
+            "saturated",
+            "int16-wrap",
+            "magnet",
+            "too-hot",
+            "crlf",
+        ):
             changed = inject(SCRIPT, parse_fault(f"{name}@0.5+0.25"))
             inside = (SCRIPT.t_s >= 0.5) & (SCRIPT.t_s < 0.75)
             differs = np.array([one != other for one, other in zip(changed.pieces, SCRIPT.pieces, strict=True)])

@@ -8,7 +8,7 @@ import pytest
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.wire import Frames
 from reskin.live.emulator import inject, parse_fault
-from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, Health
+from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, READINGS_REPEAT, REPEATS_FRAMES_N, Health
 from reskin.recordings.fault_policy import override
 from tests.live.boards import make_script
 
@@ -109,6 +109,15 @@ def test_chip_that_reads_zeros_is_named():
 def test_repeated_frames_and_clock_jumps_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
+
+
+def test_readings_of_slow_chips_raise_an_alarm():
+    health = feed(inject_fault("slow-chips"))
+    assert set(health.alarms) == {READINGS_REPEAT}
+    alarm = health.alarms[READINGS_REPEAT]
+    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # two thirds of the readings in 1.5 s
+    assert 1.5 < alarm.first_s <= 1.5 + REPEATS_FRAMES_N / 400
+    assert alarm.action == "flag"
 
 
 def test_missing_frames_raise_the_alarm_slower_than_before():

@@ -50,7 +50,9 @@ def test_other_devices_are_not_boards():
 @given(st.binary(max_size=3000), st.integers(1, 700))
 def test_arbitrary_bytes_are_described_without_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
-    assert str(find.recognise("port", chunks)).startswith("port: ")
+    found = find.recognise("port", chunks)
+    assert str(found).startswith("port: ")
+    assert found.describe_rate().startswith("port: ")
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
@@ -59,7 +61,9 @@ def test_frames_of_random_values_are_described(seed, chips_n):
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
     data = b"".join(row.tobytes() + b"\r\n" for row in values)
-    assert str(find.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
+    found = find.recognise("port", [(data, 0.0), (data, 1.0)])
+    assert str(found).startswith("port: ")
+    assert found.describe_rate().startswith("port: ")
 
 
 def test_chips_without_noise_have_no_lsb():
@@ -106,9 +110,12 @@ def test_other_device_is_not_a_serial_port():
         find.open_port(os.devnull, find.BAUD)
 
 
-def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
+def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
+        found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
+    with monkeypatch.context() as listened:  # to all ports once, because listening takes 1.5 s
+        listened.setattr(find, "detect_board", lambda port, _: found[port])
         assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
             find.find_board([name, other])

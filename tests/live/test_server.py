@@ -119,6 +119,7 @@ def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monke
             folder = Path(done["recorded"].removeprefix("recorded "))
             header = parse((folder / HEADER_FILE).read_text(), "header")
             assert set(header.files) == {"stream.bin", "arrivals.csv"}
+            assert (header.rate.method, header.rate.repeated_readings) == ("arrivals", 0.0)
             assert (folder / "stream.bin").stat().st_size > 82 * 50
             await socket.send_json({"press": "zero"})
             while not zeroed:

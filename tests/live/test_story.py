@@ -19,7 +19,7 @@ from reskin.recordings.probe import ProbeLog
 from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ, play_to_skin, write_script
 from tests.live.test_processes import Shell, wait_until
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import copy_checkout, warm_stages
 
 POKES_N, QUIET_S, DWELL_S = 30, 1.0, 0.3
 CRLF = "crlf@2+1"
@@ -85,7 +85,8 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # the script has ended
         write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
-    run(root, "dvc", "repro", "report@pressed")
+    with warm_stages(root) as run_stages:
+        run_stages()
 
     numbers = json.loads((root / "reports/pressed/numbers.json").read_text())
     assert numbers["provenance"]["source"] == "recorded"

@@ -10,8 +10,11 @@ from pipeline.experiments.verification import signals
 from reskin.physics.board import Board
 from reskin.physics.chip import (
     CONVERSION_S,
+    DIG_FILT_MAX,
+    OSR_MAX,
     ChipDesign,
     Overruns,
+    conversion_s,
     last_conversions,
     read_field,
     read_temperature,
@@ -131,3 +134,11 @@ def test_reading_is_the_field_at_its_conversion(rate_hz):
     seen = sample_at_conversion(value, age_s, rate_hz)
     late = frame_s - age_s[:, 0] >= frame_s[0]  # earlier conversions use the field of the first frame
     np.testing.assert_allclose(seen[late, 0, 0], (frame_s - age_s[:, 0])[late], atol=1e-9)
+
+
+def test_conversion_time_follows_table_18_of_the_data_sheet():
+    table_ms = [[1.27, 1.84, 3.00, 5.30], [1.46, 2.23, 3.76, 6.84], [1.84, 3.00, 5.30, 9.91], [2.61, 4.53, 8.37, 16.05]]
+    computed_ms = [[1e3 * conversion_s(osr, dig_filt) for osr in range(OSR_MAX + 1)] for dig_filt in range(4)]
+    np.testing.assert_allclose(computed_ms, table_ms, atol=0.005)  # the table has two decimals
+    assert conversion_s(0, 2) == pytest.approx(CONVERSION_S, abs=5e-6)
+    assert conversion_s(OSR_MAX, DIG_FILT_MAX) == pytest.approx(0.200, rel=0.01)

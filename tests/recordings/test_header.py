@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.errors import CaptureError
-from reskin.recordings.header import Clock, check_same_capture, parse, render, write_capture
+from reskin.recordings.header import Clock, Rate, check_same_capture, parse, render, write_capture
 from reskin.recordings.ingest import check_losses, open_capture, read_header
 from reskin.recordings.readers import READERS, lab
 from tests.recordings.headers import DEFAULT_POLICY, make_header
@@ -22,9 +22,31 @@ def test_header_round_trip(rate_hz, marks):
     assert parse(render(header), "header.json") == header
 
 
+def test_rate_is_optional():
+    """Headers of captures that were recorded before rates were measured are read, and written unchanged."""
+    before = render(make_header())
+    assert "rate" not in json.loads(before)
+    assert parse(before, "header.json").rate is None
+    rate = Rate(sent_hz=400.0, method="clock", arrived_hz=398.5, repeated_frames=0.0, repeated_readings=0.25)
+    header = make_header(rate=rate)
+    assert parse(render(header), "header.json").rate == rate
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
+        (
+            {
+                "rate": {
+                    "sent_hz": 400.0,
+                    "method": "clock",
+                    "arrived_hz": 400.0,
+                    "repeated_frames": 1.5,
+                    "repeated_readings": 0.0,
+                }
+            },
+            "rate.repeated_frames: Input should be less than or equal to 1; got 1.5",
+        ),
         ({"unit_b": "mT"}, "header.json: unit_b: Input should be 'uT'; got 'mT'"),
         ({"chips_n": 0}, "chips_n: Input should be greater than or equal to 1; got 0"),
         ({"chips_n": "5"}, "chips_n: Input should be a valid integer; got '5'"),
