@@ -24,6 +24,7 @@ class Experiment(Strict):
     folds: the keys of the scene's section `split` that set how the experiment's folds are drawn; None if no folds are
         drawn for the experiment.
     settings: whether the scene's file must have a section of settings for the experiment, named after the stage.
+    reads: sections of the scene that the experiment reads besides its own.
     recorded: whether scenes with recorded captures may run the experiment.
     alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
     """
@@ -36,6 +37,7 @@ class Experiment(Strict):
     protocol: str | None = None
     folds: tuple[str, ...] | None = None
     settings: bool = False
+    reads: tuple[str, ...] = ()
     recorded: bool = False
     alone: bool = False
 

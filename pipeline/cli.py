@@ -252,6 +252,8 @@ def use(names: Annotated[list[str], Argument(help="Scenes to run, instead of tho
 
     plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
+    for sentence in plan.unused_settings(ROOT, names):
+        typer.echo(f"note: {sentence}")
     if stale := tidying.stale_outputs(ROOT, checked_plan()):
         typer.echo(f"files of stages that no longer run: {', '.join(stale)}; `reskin scenes tidy` removes them")
 
@@ -271,7 +273,12 @@ def tidy() -> None:
 @scenes.command()
 def check() -> None:
     """Check the planned scenes and params.yaml, and that pipeline/plan.yaml is up to date."""
-    typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
+    from pipeline import plan
+
+    names = list(checked_plan().scenes)
+    typer.echo(f"{PLAN} is up to date; scenes: {', '.join(names) or 'none'}")
+    for sentence in plan.unused_settings(ROOT, names):
+        typer.echo(f"note: {sentence}")
 
 
 @models.command("make")
