@@ -125,12 +125,10 @@ class Scene(Strict, extra="allow"):
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
         # Adaptation draws its pokes from the first `pool_passes_n` passes.
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
-        sections: Set[str] = {experiment.stage for experiment in self.entries if experiment.settings}
+        sections = {experiment.stage for experiment in self.entries if experiment.settings}
         sections |= {section for experiment in self.entries for section in experiment.reads}
-        places: dict[str, tuple[Set[str], Set[str]]] = {
-            WHOLE: (set(self.model_extra or ()), sections),
-            "split": (self.split.model_fields_set, split_keys),
-        }
+        places: dict[str, tuple[Set[str], Set[str]]]
+        places = {WHOLE: ({*(self.model_extra or ())}, sections), "split": (self.split.model_fields_set, split_keys)}
         if self.simulate is not None:
             places["simulate.protocols"] = ({*self.simulate.protocols}, self.protocols)
         return places
@@ -155,9 +153,9 @@ class Scene(Strict, extra="allow"):
             if missing := set(experiment.needs) - set(self.experiments):
                 raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
         lacking = [
-            f"{place} lacks {', '.join(sorted(missing))}"
+            f"{place} lacks {', '.join(sorted(absent))}"
             for place, (have, want) in self._settings_by_place.items()
-            if (missing := want - have)
+            if (absent := want - have)
         ]
         if lacking:
             raise ValueError(f"a scene must have the settings that its experiments need; {'; '.join(lacking)}")
