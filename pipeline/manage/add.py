@@ -13,7 +13,8 @@ from typing import Any
 from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import require_idle
-from pipeline.scenes import Scene, read_plan, read_scene, read_shared
+from pipeline.scenes import read_plan, read_scene, read_shared
+from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
 from reskin.errors import CaptureError, ParamsError, ReskinError
@@ -54,7 +55,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         write_registry(root, after)
         plan.use(root, [*read_plan(root / PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, nominal("skin"), shared.faults)
+        _warn_of_departures(target, read_settings(scene, root), nominal("skin"), shared.faults)
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
     return complete
@@ -101,7 +102,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
-def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
+def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
     """Warn if the orientation of chips, labels or skin seems to differ from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
@@ -110,7 +111,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     from reskin.physics.skin import SkinDesign
 
     _, blocks, _ = open_capture(folder, policy)
-    section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
+    section = settings.section(Compare, "compare")
     try:
         sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
     except ReskinError as error:
