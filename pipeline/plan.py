@@ -68,6 +68,10 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
                 name: _folder(name, experiment.protocol) if scenes[name].simulate else name
                 for name in items[experiment.stage]
             }
+        if experiment.file is not None:
+            items[experiment.stage] = {
+                name: scenes[name].named_file(experiment.name) for name in items[experiment.stage]
+            }
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items |= {"report": list(scenes), "publish": list(scenes)}
     return {
@@ -166,6 +170,13 @@ def check(root: Path) -> Plan:
 def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
     """Derive the plan for these scenes of a checkout."""
     scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
+    for name, scene in scenes.items():
+        for experiment in scene.entries:
+            if experiment.file is not None and not (root / scene.named_file(experiment.name)).is_file():
+                file = scene.named_file(experiment.name)
+                remedy = f"Make it: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
+                problem = f"file {file}, which section {experiment.stage} names, not found"
+                raise ParamsError(f"{scene_file(root, name)}: {problem}. {remedy}, or remove the experiment.")
     return make_plan(scenes, read_registry(root))
 
 

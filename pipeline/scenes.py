@@ -74,6 +74,7 @@ class Scene(Strict, extra="allow"):
     selection: Selection
     split: Split
     simulate: Simulation | None = None
+    boards: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None  # names of the boards of a recorded scene
 
     @property
     def entries(self) -> list[Experiment]:
@@ -108,6 +109,11 @@ class Scene(Strict, extra="allow"):
     def protocols(self) -> set[str]:
         """The protocols that a simulated scene needs for its experiments."""
         return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
+
+    def named_file(self, experiment: str) -> str:
+        """Return the file that the section of an experiment names, as a path in the checkout."""
+        entry = EXPERIMENTS[experiment]
+        return str((self.model_extra or {})[entry.stage].get(entry.file, ""))
 
     @property
     def unused(self) -> list[str]:

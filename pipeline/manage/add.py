@@ -17,12 +17,12 @@ from pipeline.scenes import read_plan, read_scene, read_shared
 from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
-from reskin.errors import CaptureError, ParamsError, ReskinError
+from reskin.errors import CaptureError, ParamsError, ReskinError, did_you_mean
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.orientation import other_orientation, presses_of
-from reskin.recordings.preparing import Prepared
+from reskin.recordings.preparing import CaptureNames, Prepared
 from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
@@ -37,12 +37,17 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     """
     require_idle(root)
     header, files = prepared
-    settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, add --like ini.").stem)
+    remedy = f"To create it: reskin new {scene} --boards ..., or add --like ini."
+    settings = read_scene(root, plan.scene_file(root, scene, remedy=remedy).stem)
     if settings.source != header.source:
         remedy = "Choose a scene of the same source"
         if header.source == "recorded":
             remedy += ", or create one: --scene NEW --like ini"
         raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
+    if settings.boards is not None and header.board not in settings.boards:
+        guess, known = did_you_mean(header.board, settings.boards), ", ".join(settings.boards)
+        remedy = f"Correct the name, or add it to key boards of {plan.scene_file(root, scene)}."
+        raise ParamsError(f"board {header.board} is not a board of scene {scene} ({known}).{guess} {remedy}")
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
@@ -59,6 +64,40 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
     return complete
+
+
+def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> CaptureNames:
+    """Return the names of a capture; names that are not given (empty) are taken from the file's name, `BOARD_SKIN.csv`.
+
+    The skin is then named `BOARD_SKIN`, so that skins of different boards have different names. Further parts of the
+    file's name (`BOARD_SKIN_MORE.csv`) distinguish the captures of a skin.
+    """
+    if given.board and given.skin:
+        return given
+    stem = recording.stem
+    boards = config.read_yaml(plan.scene_file(root, scene)).get("boards", ())
+    starts = [name for name in (given.board, *boards) if name and stem.startswith(f"{name}_")]
+    board = max(starts, key=len, default=stem.partition("_")[0])
+    skin = stem.removeprefix(f"{board}_").partition("_")[0]
+    if skin == stem or not skin:
+        raise ParamsError(
+            f"{recording}: the name of the board or of the skin is not given, and the file's name is not "
+            "BOARD_SKIN.csv. Rename the file, or add --board and --skin."
+        )
+    return CaptureNames(given.board or board, given.skin or f"{board}_{skin}", given.name or stem)
+
+
+@contextmanager
+def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
+    """Remove the captures that were added in the `with` block if it fails; `captures` is then read."""
+    try:
+        yield
+    except BaseException:
+        for capture in captures:
+            remove(root, scene, capture)
+        if captures:
+            say(f"Nothing was added: removed {', '.join(captures)} again")
+        raise
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
