@@ -89,15 +89,16 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
 
 @contextmanager
 def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
-    """Remove the captures that were added in the `with` block if it fails; `captures` is then read."""
-    try:
-        yield
-    except BaseException:
-        for capture in captures:
-            remove(root, scene, capture)
-        if captures:
-            say(f"Nothing was added: removed {', '.join(captures)} again")
-        raise
+    """Undo all changes if the `with` block fails; `captures` are those that were added in the block until then."""
+    with io.restoring(root / REGISTRY, root / PLAN):
+        try:
+            yield
+        except BaseException:
+            for capture in captures:
+                _remove_files(root / RAW / scene / capture)
+            if captures:
+                say(f"nothing was added: {', '.join(captures)} were removed again")
+            raise
 
 
 def remove(root: Path, scene: str, capture: str) -> None:

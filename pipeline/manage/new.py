@@ -30,7 +30,7 @@ split:
   transfer_skins_n: {transfer_n} # experiment transfer: number of boards of which one skin is trained on
 {pool_passes}\
   labels_pool_n: {pool_n} # indentations of a held-out skin for calibration, with or without labels; not tested
-  labels_draws_n: 3
+  labels_draws_n: 1 # random draws of these indentations; more take longer, and make the scores more precise
 train_single: {{recipe: paper, steps_n: 3000, seeds_n: 1, variants: {{}}}}
 train_multi: {{recipe: paper, steps_n: 3000, seeds_n: 3, variants: {{}}}}
 train_triplet: {{recipe: triplet, steps_n: 3000, seeds_n: 3, variants: {{}}}}
@@ -147,16 +147,13 @@ def _layout_text(layout: str | None, scene: str) -> str:
 
 def _next_steps(file: Path, scene: str, layout: str | None, *, fits: bool, adapted: bool) -> list[str]:
     steps = [f"wrote {file}"]
-    if layout is None:
-        steps.append(
-            f"1. Edit section compare.layout in {file}: it describes the paper's board. (If your boards are like "
-            "that, delete the file and add --layout reskin.)"
-        )
     if not adapted:
-        steps.append("With one pass in each recording, adaptation (adapt) is left out; it needs --passes 2 or more.")
+        steps.append("left out: adapt, which needs recordings with --passes 2 or more")
     if not fits:
         steps.append(
-            "Experiment calibrated is left out until you make a universal model for your layout: see the file."
+            "left out: calibrated, which needs a universal model for your layout (the file says how to make it)"
         )
-    steps.append(f"next: reskin add BOARD_SKIN.csv ... --layout table --scene {scene}")
-    return steps
+    add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
+    if layout is None:
+        steps.append("next: describe your boards in this file, key layout of section compare: it has the paper's board")
+    return [*steps, f"then: {add}" if layout is None else f"next: {add}"]
