@@ -15,7 +15,6 @@ from reskin.universal.model import FILE
 
 POOL_MAX_N = 40  # largest number of indentations that may be labelled, as in scene lab
 LABELS_N = (0, 5, 10, 20, 40)
-ADAPTED = ("triplet", "adapt")
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\
 # Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/parameters.md explains the keys.
@@ -104,27 +103,30 @@ def new(
         raise ParamsError(f"--boards: {ONE_BOARD}.")
     if scene in scene_names(root):
         raise ParamsError(f"{root / SCENES / scene}.yaml exists. Choose another name, or edit this file.")
-    given = paper_layout() if layout is None else read_layout(layout)
-    fits = layout is not None and is_shipped(given)
     file = root / SCENES / f"{scene}.yaml"
-    model = SHIPPED if fits else f"{scene}.safetensors"
-    adapted = passes_n > 1
-    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit", "compare"]
-    pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
-    text = TEMPLATE.format(
-        scene=scene, boards=", ".join(boards), experiments=", ".join(experiments + ["calibrated"] * fits),
-        transfer_n=max(1, len(boards) // 2), pool_n=pool_n, pool_passes=POOL_PASSES if adapted else "",
-        adapt=ADAPT.format(pokes_n=presses_n) if adapted else "", labels_n=[n for n in LABELS_N if n <= pool_n],
-        model=model, about_model="" if fits else ABOUT_MODEL.format(file=file.relative_to(root), model=model),
-        layout=_layout_text(layout, scene),
-    )  # fmt: skip
-    io.write_text(file, text)
+    io.write_text(file, scene_text(scene, boards, presses_n, passes_n, layout))
     try:
-        read_scene(root, scene)
+        experiments = read_scene(root, scene).experiments
     except BaseException:
         io.remove(file)
         raise
-    return file, _next_steps(file.relative_to(root), scene, layout, fits=fits, adapted=adapted)
+    return file, _next_steps(file.relative_to(root), scene, layout, experiments)
+
+
+def scene_text(scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None) -> str:
+    """Return the text of the scene's file; see `new`."""
+    given = paper_layout() if layout is None else read_layout(layout)
+    fits, adapted = layout is not None and is_shipped(given), passes_n > 1
+    model = SHIPPED if fits else f"{scene}.safetensors"
+    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit", "compare"]
+    pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
+    return TEMPLATE.format(
+        scene=scene, boards=", ".join(boards), experiments=", ".join(experiments + ["calibrated"] * fits),
+        transfer_n=max(1, len(boards) // 2), pool_n=pool_n, pool_passes=POOL_PASSES if adapted else "",
+        adapt=ADAPT.format(pokes_n=presses_n) if adapted else "", labels_n=[n for n in LABELS_N if n <= pool_n],
+        model=model, about_model="" if fits else ABOUT_MODEL.format(file=f"{SCENES}/{scene}.yaml", model=model),
+        layout=_layout_text(layout, scene),
+    )  # fmt: skip
 
 
 def is_shipped(layout: BoardLayout) -> bool:
@@ -145,13 +147,13 @@ def _layout_text(layout: str | None, scene: str) -> str:
     return "".join(f"\n    {line}" if line.strip() else "\n" for line in lines)
 
 
-def _next_steps(file: Path, scene: str, layout: str | None, *, fits: bool, adapted: bool) -> list[str]:
+def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequence[str]) -> list[str]:
     steps = [f"wrote {file}"]
-    if not adapted:
+    if "adapt" not in experiments:
         steps.append("left out: adapt, which needs recordings with --passes 2 or more")
-    if not fits:
+    if "calibrated" not in experiments:
         steps.append(
-            "left out: calibrated, which needs a universal model for your layout (the file says how to make it)"
+            "left out: calibrated, which needs a universal model for your layout (the file says how)"
         )
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
     if layout is None:
