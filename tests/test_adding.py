@@ -453,14 +453,16 @@ def test_several_recordings_are_named_by_their_files(root, tmp_path, monkeypatch
 
     def add_two(name: str) -> str:
         files = [str(tmp_path / f"{one}.csv") for one in ("b1_s1", name)]
-        return output_of(["add", *files, "--layout", "lab", "--scene", "mine"])
+        done = CliRunner().invoke(app, ["add", *files, "--layout", "lab", "--scene", "mine"])
+        return f"{done.output} {done.exception or ''}"
 
     before = contents(root)
     assert "board b3 is not a board of scene mine" in add_two("b3_s1")
     assert contents(root) == before
     with pytest.raises(ReskinError, match=r"file's name is not BOARD_SKIN\.csv"):
         add.names_of(root, "mine", Path("b2.csv"), labels("", ""))
-    add_two("b2_s1_more")
+    output = add_two("b2_s1_more")
+    assert "capture b1_s1 has 2 indentations; split.labels_pool_n of the scene needs more than 6" in output
     captures = read_registry(root).captures["mine"]
     assert {name: (entry.board, entry.skin) for name, entry in captures.items()} == {
         "b1_s1": ("b1", "b1_s1"), "b2_s1_more": ("b2", "b2_s1")

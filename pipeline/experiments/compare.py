@@ -149,7 +149,17 @@ def compare_boards(
         "light_N": LIGHT_N,
         "grip_N_mm": START.grip_N_mm,
     }
-    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": plot_data}
+    outline = {} if section.layout is None else {"outline": _outline(section)}
+    drawn = {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": plot_data}
+    return numbers, drawn | outline
+
+
+def _outline(section: Compare) -> dict[str, Any]:
+    """Return the skin's least x and y, its sides and the chips' centres, in the coordinates of the labels."""
+    middle_mm, sides_mm = np.array(section.labels_middle_mm), np.array(section.skin_mm)
+    chips_mm = np.array(section.design.places_mm) * (1, -1 if section.labels_mirrored else 1) + middle_mm
+    corner_mm = middle_mm - sides_mm / 2
+    return {"corner_mm": corner_mm.tolist(), "sides_mm": sides_mm.tolist(), "chips_mm": chips_mm.tolist()}
 
 
 def _without_law(aligned: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:

@@ -7,13 +7,16 @@ changes are undone.
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import require_idle
-from pipeline.scenes import read_plan, read_scene, read_shared
+from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
@@ -54,7 +57,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     with io.restoring(root / REGISTRY, root / PLAN), _removing_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
+            fingerprints, counts = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
         write_registry(root, after)
@@ -63,6 +66,8 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         _warn_of_departures(target, read_settings(scene, root), nominal("skin"), shared.faults)
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
+    if all(other.skin != complete.skin for other in before.captures.get(scene, {}).values()):
+        _warn_of_small_pool(complete, settings, counts)
     return complete
 
 
@@ -123,23 +128,50 @@ def _check_free(target: Path, registered: bool) -> None:
         raise ParamsError(f"{target}: the folder exists already. {remedy}")
 
 
-def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a whole capture as stage ingest does; return its fingerprints: SHA-256 of the readings and of the stream.
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of passes and of indentations in a capture."""
 
-    Copies of a recording with other names or in another layout have a fingerprint in common.
+    passes_n: int
+    indentations_n: int
+
+
+def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], Counts]:
+    """Read a whole capture as stage ingest does; return its fingerprints, and counts.
+
+    The fingerprints are the SHA-256 of the readings and of the stream. Copies of a recording with other names or in
+    another layout have a fingerprint in common.
     """
     _, blocks, counts = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
+    passes: set[int] = set()
+    indentations: set[int] = set()
     for block in blocks:
         rows_n += len(block)
         readings.update(block.b_uT.tobytes())
+        passes.update(np.unique(block.pass_i).tolist())
+        indentations.update(np.unique(block.indentation).tolist())
     check_losses(counts, limit, folder.name)
     if rows_n == 0:
         raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(counts)}. Check its files.")
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in counts.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
-    return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+    fingerprints = (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+    return fingerprints, Counts(len(passes), len(indentations))
+
+
+def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
+    """Warn if the first capture of a skin has fewer passes or indentations than the scene's section split needs."""
+    for what, have_n, key in (
+        ("passes", counts.passes_n, "pool_passes_n"), ("indentations", counts.indentations_n, "labels_pool_n")
+    ):  # fmt: skip
+        pool_n = getattr(scene.split, key)
+        if pool_n is not None and have_n <= pool_n:
+            say(
+                f"warning: capture {header.capture} has {have_n} {what}; split.{key} of the scene needs more than "
+                f"{pool_n} of each skin. Add further recordings of skin {header.skin}, or reduce {key}."
+            )
 
 
 def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:

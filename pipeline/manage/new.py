@@ -152,9 +152,7 @@ def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequenc
     if "adapt" not in experiments:
         steps.append("left out: adapt, which needs recordings with --passes 2 or more")
     if "calibrated" not in experiments:
-        steps.append(
-            "left out: calibrated, which needs a universal model for your layout (the file says how)"
-        )
+        steps.append("left out: calibrated, which needs a universal model for your layout (the file says how)")
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
     if layout is None:
         steps.append("next: describe your boards in this file, key layout of section compare: it has the paper's board")

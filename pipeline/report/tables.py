@@ -136,7 +136,6 @@ PAIRED = (
     "boards that these networks were tested on, and the interval is also over their training skins. The table claims "
     "has verdicts on the differences."
 )
-FINAL_ROW = "Multi-sensor without triplet loss"  # row of table 2: networks with the recipe of the final model
 FINAL_MEANING = (
     "The scores are those of networks that were trained in the same way without one of the boards, each tested on that "
     "board. They estimate the scores of the final model on a further board. The final model itself was not tested."
@@ -407,15 +406,16 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 def final_model_table(numbers: Numbers) -> pd.DataFrame:
     """Describe the model that was trained on all boards, how to use it, and the scores on held-out boards."""
-    model, source, held_out = numbers["final_model"], numbers["provenance"]["source"], numbers["table2"]["multi"]
+    model, source = numbers["final_model"], numbers["provenance"]["source"]
+    row, held_out = table_2_rows(numbers)["multi"]
     file = model["file"]
     trained_on = f"{model['boards_n']} {source} boards, {model['skins_n']} skins, {model['rows_n']:,} readings"
     scores_of = {title: show(held_out[metric]) for metric, title in COLUMNS.items() if metric in held_out}
     rows = {
         "file": f"{file}; its card is beside it (.json)",
-        "trained on": f"{trained_on}; {model['steps_n']} steps of the recipe of row {FINAL_ROW}",
-        "tested": f"no, because all boards were in training. {FINAL_ROW}, {n_of(held_out)} held-out boards: "
-        + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
+        "trained on": f"{trained_on}; {model['steps_n']} steps",
+        "tested": f"no, because all boards were in training. Networks of the same recipe on {n_of(held_out)} held-out "
+        f"boards (row {row.title} of table 2): " + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
         "use with a log": f"reskin predict LOG.csv --model {file} --out contacts.csv",
         "use with a board": f"reskin live --model {file}",
         "use in Python": f'model = reskin.load_model("{file}").zero(noload_uT); model.predict(b_uT)',

@@ -24,7 +24,7 @@ from pipeline.provenance import (
 from pipeline.report.costs import cost_pages
 from pipeline.report.experiments import experiment_figures
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
-from pipeline.report.figures import error_grids, headline_figures, learning_figures
+from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
 from pipeline.report.formatting import rounded, to_markdown
 from pipeline.report.numbers import (
     add_up,
@@ -88,7 +88,9 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
-        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})"))
+        of_layout = plot_data.get("compare", {}).get("outline")  # if the scene has the layout of its boards
+        outline = None if of_layout is None else Outline(**of_layout)
+        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
         figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
         figures |= figures_future.result()
         costs = costs_future.result()
