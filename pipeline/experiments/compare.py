@@ -41,6 +41,7 @@ WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field,
 NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
 LIGHT_N = 1e-3  # force of a light touch
+FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
 # Values of k / mu in N/mm (spring constant with which the skin is held / friction coefficient under the tip). This
 # ratio limits how far a tip can slide a skin. The first value means no limit (full slide at any force), the last a
@@ -110,11 +111,12 @@ def compare_boards(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the recordings of every board with simulations; return the numbers, and the data for the figures."""
     setup = make_setup(section, design)
-    all_aligned = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
+    all_aligned = {board: to_board_axes(_thin(pokes, FITTED_MAX_N), section) for board, pokes in boards.items()}
     aligned = {board: presses for board, presses in all_aligned.items() if presses.recorded.forces_known}
     fitted = {board: fit(presses, setup, TEN) for board, presses in aligned.items()}
     names = list(aligned)
-    by_board, plot_data = {board: _without_law(presses, setup, section) for board, presses in all_aligned.items()}, {}
+    plot_data = {}
+    by_board = {board: _without_law(presses, boards[board], setup, section) for board, presses in all_aligned.items()}
     for i, (board, aligned_presses) in enumerate(aligned.items()):
         laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
         if len(names) > 1:
@@ -131,13 +133,14 @@ def compare_boards(
             | {"beyond_n": beyond_n(laws.get(name), setup, aligned_presses.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
+        whole = len(aligned_presses.recorded) == len(boards[board])  # memory needs successive presses
         frictions = fit_frictions(aligned_presses, setup, fitted[board])
         curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
         by_board[board] = (
             agreements.pop("fitted")
             | {"grips": frictions}
             | agreements
-            | estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed)
+            | (estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed) if whole else {})
             | {"laws": parameters}
             | by_board[board]
         )
@@ -162,11 +165,12 @@ def _outline(section: Compare) -> dict[str, Any]:
     return {"corner_mm": corner_mm.tolist(), "sides_mm": sides_mm.tolist(), "chips_mm": chips_mm.tolist()}
 
 
-def _without_law(aligned: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Return the numbers of a board that need no fitted law, and therefore no forces."""
-    recorded, noise_uT = aligned.recorded, aligned.recorded.noise_uT
+def _without_law(aligned: AlignedPresses, recorded: RecordedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
+    """Return the numbers of a board that need no fitted law, and therefore no forces; `recorded`: all its presses."""
+    noise_uT = recorded.noise_uT
     noise = {"noise_uT": dict(zip("xyz", noise_uT.tolist(), strict=True))} if np.isfinite(noise_uT).all() else {}
     counts = {"pokes_n": len(recorded), "left_out_n": recorded.excluded_n}
+    counts |= {"fitted_n": len(aligned.recorded)} if len(aligned.recorded) < len(recorded) else {}
     return {"frames": check_frames(aligned, setup, section)} | noise | counts
 
 
@@ -508,7 +512,7 @@ def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDes
     surrounded = len(chips_mm) >= CHIPS_MIN_N and (chips_mm.min(axis=0) < 0).all() and (chips_mm.max(axis=0) > 0).all()
     if not surrounded or not any(_pressed_rows(block).any() for block in blocks):
         return None
-    pokes = _thin(pool(blocks, with_force=False))
+    pokes = _thin(pool(blocks, with_force=False), POKES_MAX_N)
     if len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
         return None
     frames = _frames_of(to_board_axes(pokes, section), make_setup(section, design), section)
@@ -520,9 +524,9 @@ def _pressed_rows(readings: Readings) -> np.ndarray:
     return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & pressed
 
 
-def _thin(pokes: RecordedPresses) -> RecordedPresses:
-    """Select at most `POKES_MAX_N` pokes, evenly distributed over the recording."""
-    kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
+def _thin(pokes: RecordedPresses, most_n: int) -> RecordedPresses:
+    """Select at most `most_n` pokes, evenly distributed over the recording."""
+    kept = np.unique(np.linspace(0, len(pokes) - 1, most_n).round().astype(int))
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[kept] for name in names})
 

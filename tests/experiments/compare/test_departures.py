@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from pipeline.experiments import compare
 from pipeline.experiments.compare import (
     Compare,
     chip_rotations,
@@ -110,11 +111,13 @@ def test_departures_from_a_layout_name_the_layout():
     assert sentence == "Against layout square, chips 1 and 3 are exchanged."
 
 
-def test_boards_without_forces_have_only_frames():
+def test_boards_without_forces_have_only_frames(monkeypatch):
+    monkeypatch.setattr(compare, "FITTED_MAX_N", 22)
     section = square_section()
     boards = pool_skins([square_recording(section)], with_force=False)
     numbers, plot_data = compare_boards(boards, section, DESIGN, 0)
     assert numbers["by_board"]["b"]["frames"]["sentence"] == "Labels, chips and skin lie as layout square says."
+    assert (numbers["by_board"]["b"]["pokes_n"], numbers["by_board"]["b"]["fitted_n"]) == (25, 22)
     assert set(tables(numbers, "recorded")) == {"compare_frames"}
     assert figures(numbers, plot_data, "recorded") == {}
 
