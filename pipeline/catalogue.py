@@ -24,6 +24,8 @@ class Experiment(Strict):
     folds: the keys of the scene's section `split` that set how the experiment's folds are drawn; None if no folds are
         drawn for the experiment.
     settings: whether the scene's file must have a section of settings for the experiment, named after the stage.
+    reads: sections of the scene that the experiment reads besides its own.
+    file: the key of the experiment's section that names a file on which the stage depends; None if there is none.
     recorded: whether scenes with recorded captures may run the experiment.
     without_contact: whether the experiment reads recordings in which nothing touches the skin.
     alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
@@ -37,6 +39,8 @@ class Experiment(Strict):
     protocol: str | None = None
     folds: tuple[str, ...] | None = None
     settings: bool = False
+    reads: tuple[str, ...] = ()
+    file: str | None = None
     recorded: bool = False
     without_contact: bool = False
     alone: bool = False
@@ -66,10 +70,19 @@ def read_experiments() -> list[Experiment]:
 
 def _learning(
     name: str, kind: Kind, stage: str, *, needs: tuple[str, ...] = (), folds: tuple[str, ...] | None = None,
-    settings: bool = True,
+    settings: bool = True, reads: tuple[str, ...] = (), file: str | None = None,
 ) -> Experiment:  # fmt: skip
     return Experiment(
-        name=name, stage=stage, key=name, kind=kind, needs=needs, folds=folds, settings=settings, recorded=True
+        name=name,
+        stage=stage,
+        key=name,
+        kind=kind,
+        needs=needs,
+        folds=folds,
+        settings=settings,
+        recorded=True,
+        reads=reads,
+        file=file,
     )
 
 
@@ -91,5 +104,6 @@ LEARNING = (
     _learning("baselines", "curve", "train_classical", needs=("lobo",)),
     _learning("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n")),
     _learning("universal", "curve", "universal", needs=("labels", "compare")),
+    _learning("calibrated", "curve", "calibrated", needs=("labels",), reads=("compare",), file="model"),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip

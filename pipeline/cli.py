@@ -48,12 +48,41 @@ def checked_plan() -> "Plan":
 
 
 @app.command(rich_help_panel=RECORDINGS)
+def new(
+    scene: Annotated[str, Argument(help="Name of the new scene.")],
+    boards: Annotated[str, Option(help="Names of your boards, separated by commas: b1,b2,b3.")],
+    presses_n: Annotated[int, Option("--presses", help="Indentations of each skin in one pass.", min=4)],
+    passes_n: Annotated[int, Option("--passes", help="Passes over all places in the recordings of a skin.", min=1)] = 1,
+    layout: Annotated[
+        str | None,
+        Option(
+            help="Layout of the boards: reskin (the paper's board), anyskin, eflesh, or a YAML file, which is copied. "
+            "Default: the paper's, written into the scene's file for you to edit."
+        ),
+    ] = None,
+) -> None:
+    """Write a scene for two or more boards of your own, each of which is held out in turn."""
+    from pipeline.manage import new as creating
+
+    names = [name.strip() for name in boards.split(",") if name.strip()]
+    for step in creating.new(ROOT, scene, names, presses_n, passes_n, layout)[1]:
+        typer.echo(step)
+
+
+@app.command(rich_help_panel=RECORDINGS)
 def add(
-    recording: Annotated[Path, Argument(help="A file or a folder, depending on the layout.")],
+    recordings: Annotated[
+        list[Path], Argument(metavar="RECORDING...", help="Files or folders, depending on the layout.")
+    ],
     layout: Annotated[Layout, Option(help=LAYOUT)],
-    board: Board,
-    skin: Annotated[str, Option(help="Name of the skin; a skin that moved to another board needs a new name.")],
-    scene: Annotated[str, Option(help="Scene to add the recording to.")],
+    scene: Annotated[str, Option(help="Scene to add the recordings to.")],
+    board: Annotated[
+        str | None, Option(help="Name of the circuit board. Default: from the name of each file, BOARD_SKIN.csv.")
+    ] = None,
+    skin: Annotated[
+        str | None,
+        Option(help="Name of the skin; a skin that moved to another board needs a new name. Default: BOARD_SKIN."),
+    ] = None,
     like: Annotated[
         str | None, Option(help="If SCENE is new: copy the settings of this recorded scene (ini, lab, ...).")
     ] = None,
@@ -85,7 +114,7 @@ def add(
         Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
     ] = False,
 ) -> None:
-    """Add a recording to a scene. The next `dvc repro` uses it."""
+    """Add recordings to a scene: all of them, or none if one is refused. The next `dvc repro` uses them."""
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.scenes import read_plan
@@ -100,26 +129,39 @@ def add(
             "--force-axis": (force_axis, {"eflesh"}), "--pad": (pad, {"leaphand"}),
         },
     )  # fmt: skip
-    names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
-    planned = read_plan(ROOT / PLAN).scenes
-    with plan.scene_copy(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
-        if layout == "capture":
-            prepared = preparing.native(recording, names, probe, marks)
-        elif layout == "serial-binary" or layout == "serial-text":
-            default_wire: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-            dump_options = preparing.Dump(
-                wire or default_wire, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks
-            )
-            prepared = preparing.dump(recording, names, dump_options)
-        else:
-            options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
-            options |= {"rows_late": str(rows_late)} if rows_late is not None else {}
-            options |= {"pad": str(pad)} if pad is not None else {}
-            prepared = preparing.foreign(recording, layout, names, options)
-        header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
-    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); next: dvc repro report@{scene}")
+    _check_number(recordings, {"--name": name, "--skin": skin, "--probe": probe, "--mark": mark or None})
+    marks, planned = preparing.parse_marks(mark or []), read_plan(ROOT / PLAN).scenes
+    added: list[str] = []
+    with plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
+        for recording in recordings:
+            names = adding.names_of(ROOT, scene, recording, preparing.CaptureNames(board or "", skin or "", name))
+            with preparing.suggesting_layout(recording, layout):
+                if layout == "capture":
+                    prepared = preparing.native(recording, names, probe, marks)
+                elif layout == "serial-binary" or layout == "serial-text":
+                    default_wire: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
+                    dump_options = preparing.Dump(
+                        wire or default_wire, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks
+                    )
+                    prepared = preparing.dump(recording, names, dump_options)
+                else:
+                    options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
+                    options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
+                    options |= {"pad": str(pad)} if layout == "leaphand" and pad is not None else {}
+                    prepared = preparing.foreign(recording, layout, names, options)
+                header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
+            added.append(header.capture)
+            typer.echo(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
+    typer.echo(f"next: dvc repro report@{scene}")
     if scene not in planned:
         typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(planned) or 'none'})")
+
+
+def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None:
+    """Raise `ParamsError` if several recordings are given together with an option that is for one recording."""
+    given = [option for option, value in options.items() if value is not None]
+    if len(recordings) > 1 and given:
+        raise ParamsError(f"{given[0]} is for one recording, but there are {len(recordings)}. Add them one by one.")
 
 
 def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
@@ -282,6 +324,8 @@ def use(names: Annotated[list[str], Argument(help="Scenes to run, instead of tho
 
     plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
+    for sentence in plan.unused_settings(ROOT, names):
+        typer.echo(f"note: {sentence}")
     if stale := tidying.stale_outputs(ROOT, checked_plan()):
         typer.echo(f"files of stages that no longer run: {', '.join(stale)}; `reskin scenes tidy` removes them")
 
@@ -301,14 +345,22 @@ def tidy() -> None:
 @scenes.command()
 def check() -> None:
     """Check the planned scenes and params.yaml, and that pipeline/plan.yaml is up to date."""
-    typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
+    from pipeline import plan
+
+    names = list(checked_plan().scenes)
+    typer.echo(f"{PLAN} is up to date; scenes: {', '.join(names) or 'none'}")
+    for sentence in plan.unused_settings(ROOT, names):
+        typer.echo(f"note: {sentence}")
 
 
 @models.command("make")
 def make_model(
     layout: Annotated[
         Path,
-        Option(help="YAML file of your board, like reskin/universal/layouts/reskin.yaml; or reskin, anyskin, eflesh."),
+        Option(
+            help="YAML file of your board, like reskin/universal/layouts/reskin.yaml, or of a scene with a layout; or "
+            "reskin, anyskin, eflesh."
+        ),
     ],
     out: Annotated[Path, Option(help="The model to write (.safetensors); its card is beside it (.json).")],
 ) -> None:

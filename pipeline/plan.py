@@ -45,7 +45,10 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     simulate: dict[str, dict[str, str]] = {}
     ingest_simulated: dict[str, str] = {}
     for name, scene in scenes.items():
-        for protocol, settings in scene.simulate.protocols.items() if scene.simulate else ():
+        protocols = scene.simulate.protocols if scene.simulate else {}
+        for protocol, settings in protocols.items():
+            if protocol not in scene.protocols:
+                continue
             folder = _folder(name, protocol)
             if folder in simulate or (folder in scenes and folder != name):
                 what = f"protocol {protocol} has the same folder, {folder}, as another scene or protocol"
@@ -64,6 +67,10 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
             items[experiment.stage] = {
                 name: _folder(name, experiment.protocol) if scenes[name].simulate else name
                 for name in items[experiment.stage]
+            }
+        if experiment.file is not None:
+            items[experiment.stage] = {
+                name: scenes[name].named_file(experiment.name) for name in items[experiment.stage]
             }
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items |= {"report": list(scenes), "publish": list(scenes)}
@@ -163,7 +170,20 @@ def check(root: Path) -> Plan:
 def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
     """Derive the plan for these scenes of a checkout."""
     scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
+    for name, scene in scenes.items():
+        for experiment in scene.entries:
+            if experiment.file is not None and not (root / scene.named_file(experiment.name)).is_file():
+                file = scene.named_file(experiment.name)
+                remedy = f"Make it: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
+                problem = f"file {file}, which section {experiment.stage} names, not found"
+                raise ParamsError(f"{scene_file(root, name)}: {problem}. {remedy}, or remove the experiment.")
     return make_plan(scenes, read_registry(root))
+
+
+def unused_settings(root: Path, names: Sequence[str]) -> list[str]:
+    """Describe, for each of these scenes, the settings that none of its experiments reads."""
+    unused = {name: read_scene(root, name).unused for name in names}
+    return [f"{scene_file(root, name)}: no experiment reads {', '.join(keys)}" for name, keys in unused.items() if keys]
 
 
 def _in_flow_style(value: Any) -> Any:

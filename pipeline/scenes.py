@@ -21,6 +21,9 @@ MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
 # The rows of table 2 and their experiments. If a scene runs all four, stage table2 writes the table before the report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
+WHOLE = "the scene"  # place of sections in messages about a scene's settings
+KEPT = {"pool_passes_n"}  # settings that have an effect even if the experiment that needs them is removed
+
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
 ANALYSES = tuple(experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "analysis")
 SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experiment.settings}
@@ -71,6 +74,7 @@ class Scene(Strict, extra="allow"):
     selection: Selection
     split: Split
     simulate: Simulation | None = None
+    boards: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None  # names of the boards of a recorded scene
 
     @property
     def entries(self) -> list[Experiment]:
@@ -106,6 +110,35 @@ class Scene(Strict, extra="allow"):
         """The protocols that a simulated scene needs for its experiments."""
         return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
 
+    def named_file(self, experiment: str) -> str:
+        """Return the file that the section of an experiment names, as a path in the checkout."""
+        entry = EXPERIMENTS[experiment]
+        return str((self.model_extra or {})[entry.stage].get(entry.file, ""))
+
+    @property
+    def unused(self) -> list[str]:
+        """The settings that no experiment of the scene reads, by their place in the scene's file, such as `drift`.
+
+        They change nothing, so an experiment can be removed from a scene without removing its settings.
+        `split.pool_passes_n` is never listed: it also keeps passes out of the test rows of other experiments.
+        """
+        unread = {place: sorted(have - want - KEPT) for place, (have, want) in self._settings_by_place.items()}
+        return [name if place == WHOLE else f"{place}.{name}" for place, names in unread.items() for name in names]
+
+    @property
+    def _settings_by_place(self) -> dict[str, tuple[Set[str], Set[str]]]:
+        """The settings that the scene has, and those that its experiments need, by place in the scene's file."""
+        split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
+        # Adaptation draws its pokes from the first `pool_passes_n` passes.
+        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
+        sections = {experiment.stage for experiment in self.entries if experiment.settings}
+        sections |= {section for experiment in self.entries for section in experiment.reads}
+        places: dict[str, tuple[Set[str], Set[str]]]
+        places = {WHOLE: ({*(self.model_extra or ())}, sections), "split": (self.split.model_fields_set, split_keys)}
+        if self.simulate is not None:
+            places["simulate.protocols"] = ({*self.simulate.protocols}, self.protocols)
+        return places
+
     @property
     def described(self) -> str:
         """The key of the scene's main captures in section `described` of numbers.json."""
@@ -125,20 +158,13 @@ class Scene(Strict, extra="allow"):
         for experiment in self.entries:
             if missing := set(experiment.needs) - set(self.experiments):
                 raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
-        split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
-        # Adaptation draws its pokes from the first `pool_passes_n` passes.
-        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
-        wrong = [
-            *_differences(
-                "the scene",
-                set(self.model_extra or ()),
-                {experiment.stage for experiment in self.entries if experiment.settings},
-            ),
-            *_differences("split", self.split.model_fields_set, split_keys),
-            *(_differences("simulate.protocols", {*self.simulate.protocols}, self.protocols) if self.simulate else ()),
+        lacking = [
+            f"{place} lacks {', '.join(sorted(absent))}"
+            for place, (have, want) in self._settings_by_place.items()
+            if (absent := want - have)
         ]
-        if wrong:
-            raise ValueError(f"a scene must have exactly the settings that its experiments need; {'; '.join(wrong)}")
+        if lacking:
+            raise ValueError(f"a scene must have the settings that its experiments need; {'; '.join(lacking)}")
         return self
 
     @model_validator(mode="after")
@@ -154,13 +180,6 @@ class Scene(Strict, extra="allow"):
         if self.simulate is None and only_simulated:
             raise ValueError(f"only a simulated scene can run experiments {', '.join(only_simulated)}")
         return self
-
-
-def _differences(place: str, have: Set[str], want: Set[str]) -> list[str]:
-    """Describe the keys that are missing at a place of the scene's file, and those that no experiment uses."""
-    missing = [f"{place} lacks {', '.join(sorted(want - have))}"] if want - have else []
-    unused = [f"no experiment uses {', '.join(sorted(have - want))} of {place}"] if have - want else []
-    return missing + unused
 
 
 class Shared(Strict):

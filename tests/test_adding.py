@@ -11,8 +11,12 @@ from typer.testing import CliRunner
 
 from pipeline import PLAN, SCENES, plan
 from pipeline.cli import app
+from pipeline.experiments.compare import Compare
 from pipeline.manage import add
 from pipeline.manage.registry import read_registry
+from pipeline.scenes import read_scene
+from pipeline.settings import read_settings
+from pipeline.training.shipping import read_layout_of
 from reskin import config
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, ReskinError
@@ -23,6 +27,7 @@ from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import leaphand, table
 from reskin.seeds import rng_for
+from reskin.universal.layout import FOLDER, paper_layout
 from tests.board.signals import make_frames
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import PRESSES, row, write
@@ -429,3 +434,52 @@ def test_scene_with_too_little_data_is_an_error(root, lab_file):
     assert done.returncode != 0
     assert "experiment lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout
+
+
+def test_new_scene_holds_out_each_board_of_a_layout(root, tmp_path, monkeypatch):
+    monkeypatch.chdir(root)
+    created = output_of(["new", "mine", "--boards", "b1,b2,b3", "--presses", "60", "--passes", "2"])
+    assert "left out: calibrated" in created
+    assert "describe your boards in this file" in created
+    scene = read_scene(root, "mine")
+    assert scene.experiments == ("transfer", "lobo", "triplet", "adapt", "labels", "audit", "compare")
+    assert scene.unused == ["calibrated"]
+    layout = read_settings("mine", root).section(Compare, "compare").layout
+    assert layout == paper_layout().model_copy(update={"name": "mine"})
+    assert read_layout_of(root / SCENES / "mine.yaml") == layout
+    assert "exists. Choose another name" in output_of(["new", "mine", "--boards", "b1,b2", "--presses", "60"])
+    assert "one board cannot be held out" in output_of(["new", "one", "--boards", "b1", "--presses", "60"])
+    own = tmp_path / "own.yaml"
+    own.write_text((FOLDER / "reskin.yaml").read_text().replace("gap_mm: 1.6", "gap_mm: 2").replace("reskin", "own", 1))
+    for name, layout, tested in (("like_paper", "reskin", True), ("own", str(own), False)):
+        output_of(["new", name, "--boards", "b1,b2", "--presses", "12", "--layout", layout])
+        scene = read_scene(root, name)
+        assert ("calibrated" in scene.experiments) == tested
+        assert "adapt" not in scene.experiments
+        assert read_settings(name, root)["few_labels"]["labels_n"] == [0, 5]
+    assert read_settings("own", root).section(Compare, "compare").layout.gap_mm == 2
+
+
+def test_several_recordings_are_named_by_their_files(root, tmp_path, monkeypatch):
+    monkeypatch.chdir(root)
+    output_of(["new", "mine", "--boards", "b1,b2", "--presses", "12"])
+    for i, name in enumerate(("b1_s1", "b2_s1_more", "b3_s1")):
+        write(tmp_path, *(press.replace("162.0", f"16{i}.5") for press in PRESSES))
+        (tmp_path / "readings.csv").rename(tmp_path / f"{name}.csv")
+
+    def add_two(name: str) -> str:
+        files = [str(tmp_path / f"{one}.csv") for one in ("b1_s1", name)]
+        done = CliRunner().invoke(app, ["add", *files, "--layout", "lab", "--scene", "mine"])
+        return f"{done.output} {done.exception or ''}"
+
+    before = contents(root)
+    assert "board b3 is not a board of scene mine" in add_two("b3_s1")
+    assert contents(root) == before
+    with pytest.raises(ReskinError, match=r"file's name is not BOARD_SKIN\.csv"):
+        add.names_of(root, "mine", Path("b2.csv"), labels("", ""))
+    output = add_two("b2_s1_more")
+    assert "capture b1_s1 has 2 indentations; split.labels_pool_n of the scene needs more than 6" in output
+    captures = read_registry(root).captures["mine"]
+    assert {name: (entry.board, entry.skin) for name, entry in captures.items()} == {
+        "b1_s1": ("b1", "b1_s1"), "b2_s1_more": ("b2", "b2_s1")
+    }  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from pipeline.manage.new import scene_text
 from pipeline.scenes import EXPERIMENTS, check_scene
 from pipeline.settings import Settings, read_shared_files
 from pipeline.statistics import KEYS, UNCERTAINTY
@@ -45,6 +46,12 @@ def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
 @pytest.mark.parametrize("file", SETTINGS, ids=lambda file: file.stem)
 def test_parameters_are_documented(file):
     assert sorted(set(keys(read_yaml(file))) - code_words("docs/parameters.md")) == []
+
+
+def test_parameters_of_new_scenes_are_documented():
+    scene = YAML(typ="safe").load(scene_text("mine", ["b1", "b2"], 60, 2, "reskin"))
+    check_scene(Settings("mine", "mine.yaml", scene, read_shared_files(ROOT)))
+    assert sorted(set(keys(scene)) - code_words("docs/parameters.md")) == []
 
 
 def test_columns_of_readings_are_documented_with_units():

@@ -3,6 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.manage.registry import Registry
+from pipeline.plan import make_plan
 from pipeline.scenes import Scene, parse_scene, read_plan, read_scene, read_shared, stages
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
@@ -33,9 +35,7 @@ def test_params_and_plan_are_valid():
         ({"train_multi": TRAINING | {"recipe": "papr"}}, "train_multi.recipe must be .*Did you mean paper"),
         ({"experiments": []}, "experiments must"),
         ({"source": "simulated"}, "a scene has a section simulate if and only if its source is simulated"),
-        ({"train_single": TRAINING}, "no experiment uses train_single of the scene"),
         ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
-        ({"split": {"transfer_skins_n": 3}}, "no experiment uses transfer_skins_n of split"),
         ({"train_multi": TRAINING | {"recipe": "other"}}, r"train_multi\.recipe must be one of .*; got 'other'"),
         (
             {"train_multi": TRAINING | {"steps_n": 0}},
@@ -106,18 +106,28 @@ def test_simulated_experiment_needs_a_simulated_scene():
         parse_scene(recorded_scene(experiments=["lobo", "sensitivity"]), "scene.yaml")
 
 
-@pytest.mark.parametrize("dropped", ["drift", "shear"])
-def test_removed_experiment_removes_section_and_protocol(dropped):
+@pytest.mark.parametrize(
+    ("removed", "unused"),
+    [
+        ("drift", ["drift"]),  # experiment variation also reads the captures of drift
+        ("shear", ["shear", "simulate.protocols.drag"]),
+        ("transfer", ["split.transfer_skins_n"]),
+        ("adapt", ["adapt"]),  # the passes of the pool are still not tested
+    ],
+)
+def test_removed_experiment_leaves_unused_settings(removed, unused):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
-    settings["experiments"].remove(dropped)
-    settings.pop(dropped)
-    if dropped == "drift":  # variation also uses the captures of drift
-        parse_scene(settings, "ci.yaml")
-        return
-    with pytest.raises(ParamsError, match="no experiment uses drag of simulate.protocols"):
-        parse_scene(settings, "ci.yaml")
-    settings["simulate"]["protocols"].pop("drag")
-    parse_scene(settings, "ci.yaml")
+    assert parse_scene(settings, "ci.yaml").unused == []
+    needing = {"adapt": ["pokes", "sensors", "manual", "flexible", "choice"]}.get(removed, [])
+    dropped = {removed, *needing}
+    settings["experiments"] = [name for name in settings["experiments"] if name not in dropped]
+    remaining = parse_scene(settings, "ci.yaml")
+    assert set(unused) <= set(remaining.unused)
+    if not needing:
+        assert remaining.unused == unused
+    assert "split.pool_passes_n" not in remaining.unused
+    generated = make_plan({"ci": remaining}, Registry(captures={}))["stages"]
+    assert ("ci-drag" in generated["simulate"]) == (removed != "shear")
 
 
 @pytest.mark.parametrize(
@@ -173,8 +183,7 @@ def test_scene_sections_match_experiments(experiment):
     lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct it there."):
         parse_scene(lacking, "scene.yaml")
-    with pytest.raises(ParamsError, match=f"no experiment uses {section} of the scene[.;]"):
-        scene("single_temporal" if experiment == "lobo" else "lobo", **{section: settings})
+    assert section in scene("single_temporal" if experiment == "lobo" else "lobo", **{section: settings}).unused
 
 
 @pytest.mark.parametrize("experiment", SPLIT_SETTINGS)
@@ -190,8 +199,8 @@ def test_split_settings_match_experiments(experiment):
         lacking = {name: value for name, value in with_experiment["split"].items() if name != key}
         with pytest.raises(ParamsError, match=f"split lacks {key}"):
             parse_scene(with_experiment | {"split": lacking}, "scene.yaml")
-        with pytest.raises(ParamsError, match=f"no experiment uses {key} of split"):
-            parse_scene(without | {"split": without["split"] | {key: value}}, "scene.yaml")
+        unused = parse_scene(without | {"split": without["split"] | {key: value}}, "scene.yaml").unused
+        assert unused == [f"split.{key}"] * (key != "pool_passes_n")
 
 
 @pytest.mark.parametrize(
@@ -209,14 +218,12 @@ def test_invalid_experiment_setting_is_an_error(changes, message):
         scene(*ALL, **changes)
 
 
-def test_all_missing_and_unused_settings_are_listed():
-    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "sensitivity"]}
+def test_all_missing_settings_are_listed():
+    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "transfer", "sensitivity"]}
     settings["split"] = {}
     settings["simulate"]["protocols"].pop("glass")
-    with pytest.raises(ParamsError) as error:
+    with pytest.raises(ParamsError, match="split lacks transfer_skins_n; simulate.protocols lacks glass"):
         parse_scene(settings, "ci.yaml")
-    assert "no experiment uses adapt, ambient, audit, contacts, drift" in str(error.value)
-    assert "simulate.protocols lacks glass; no experiment uses drag, flexible" in str(error.value)
 
 
 def test_settings_have_no_defaults():

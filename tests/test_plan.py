@@ -5,6 +5,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
+from pipeline.manage.new import SHIPPED, scene_text
 from pipeline.manage.registry import Entry, Registry
 from pipeline.plan import make_plan
 from pipeline.scenes import ANALYSES, Plan, Scene, parse_scene
@@ -110,6 +111,18 @@ def test_many_captures_have_one_ingest_stage():
 def test_recorded_scene_without_captures_is_an_error():
     with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
         make_plan({"lab": scene()}, Registry(captures={}))
+
+
+def test_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
+    text = scene_text("mine", ["b1", "b2"], 60, 1, "reskin")
+    captures = Registry(captures={"mine": {"c0": ENTRY}})
+    generated = make_plan({"mine": parse_scene(YAML(typ="safe").load(text), "mine.yaml")}, captures)["stages"]
+    assert generated["calibrated"] == {"mine": SHIPPED}
+    root = checkout(tmp_path)
+    shutil.copy(ROOT / PARAMS, root)
+    (root / SCENES / "mine.yaml").write_text(text)  # this checkout has no library, and so no model
+    with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
+        plan.plan_of(root, ["mine"])
 
 
 def checkout(folder: Path, planned: str = "{}") -> Path:

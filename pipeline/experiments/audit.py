@@ -27,12 +27,22 @@ from reskin.seeds import rng_for
 
 NOT_CHOSEN = "not chosen by the study"  # `Check.found` begins with this for a setting that the study did not choose
 COLLAPSE = "collapse"
+COPIES = "copies"
 
 
 class AuditSettings(Strict):
-    """Settings section `audit`: whether training settings were chosen by a study on other boards, or set for speed."""
+    """Settings section `audit`: whether training settings were chosen by a study on other boards, or set for speed.
+
+    similar_skins: pairs of different skins whose readings are so similar that one could be a copy of the other.
+    weak_skins: skins whose fields are too weak to be compared. Both are accepted, and listed in the report.
+    """
 
     settings: Literal["chosen", "for speed"]
+    similar_skins: tuple[tuple[str, str], ...] = ()
+    weak_skins: tuple[str, ...] = ()
+
+
+NOTHING_ACCEPTED = AuditSettings(settings="for speed")
 
 
 @dataclass(frozen=True)
@@ -40,7 +50,7 @@ class Check:
     """The result of one check: the rule, what was found, and whether the rule holds.
 
     `what` names the rule, `where` the fold or the network. With `known`, a violation is reported in the results and
-    does not fail the stage.
+    does not fail the stage. `remedy` is for the error message only.
     """
 
     what: str
@@ -49,6 +59,7 @@ class Check:
     found: str
     holds: bool
     known: bool = False
+    remedy: str = "Check which readings the folds hold out."
 
 
 def audit(
@@ -68,7 +79,12 @@ def audit(
         check
         for side in sides
         for check in audit_fold(
-            side, labels, db_uT=data.rows.db_uT, rng=rng_for(data.settings.seed, "audit", side.experiment, side.name)
+            side,
+            labels,
+            db_uT=data.rows.db_uT,
+            rng=rng_for(data.settings.seed, "audit", side.experiment, side.name),
+            accepted=section,
+            scene=settings.scene,
         )
     ]
     checks += list(model_checks(data, {(side.experiment, side.name): side for side in sides}, models))
@@ -76,14 +92,18 @@ def audit(
         checks += settings_checks(data, choice, models)
     leak = next((check for check in checks if not (check.holds or check.known)), None)
     if leak is not None:
-        remedy = "Check what is held out."
-        raise LeakError(f"audit of {settings.scene}, {leak.where}", leak.what, leak.rule, leak.found, remedy)
-    io.write_json(results, [asdict(check) for check in checks])
+        where = f"audit of {settings.scene}, {leak.where}, {leak.what}"
+        raise LeakError(f"{where}: {leak.found}. Rule: {leak.rule}. {leak.remedy}")
+    io.write_json(
+        results, [{key: value for key, value in asdict(check).items() if key != "remedy"} for check in checks]
+    )
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
     collapsed_n = sum(check.known and check.what == COLLAPSE for check in checks)
-    known_leaks_n = sum(check.known for check in checks) - collapsed_n
+    accepted_n = sum(check.known and check.what == COPIES for check in checks)
+    known_leaks_n = sum(check.known for check in checks) - collapsed_n - accepted_n
     say(
         f"{settings.scene}: {len(checks)} checks, no leak; {known_leaks_n} known leaks of the paper's own protocol; "
+        f"{accepted_n} folds with skins that the scene accepts as similar or weak; "
         f"{collapsed_n} variants with collapsed networks; {unchosen_n} settings that the study did not choose"
     )
 
@@ -123,9 +143,17 @@ class Labels:
 
 
 def audit_fold(
-    sides: Sides, labels: Labels, *, db_uT: Float[np.ndarray, "f ch"], rng: np.random.Generator
+    sides: Sides,
+    labels: Labels,
+    *,
+    db_uT: Float[np.ndarray, "f ch"],
+    rng: np.random.Generator,
+    accepted: AuditSettings = NOTHING_ACCEPTED,
+    scene: str = "SCENE",
 ) -> list[Check]:
     """Check that neither the test rows of a fold nor copies of them were used for training or adaptation.
+
+    accepted: skins that the scene accepts as similar or weak. scene: its name, for remedies.
 
     >>> skin = np.array(["s1", "s1", "s2"])
     >>> labels = Labels(np.array(["b1", "b1", "b2"]), skin, np.array([0, 0, 1]), capture=skin)
@@ -133,22 +161,23 @@ def audit_fold(
     >>> fold = Sides("lobo", "b2", np.array([0, 1]), np.array([], int), np.array([2]))
     >>> for check in audit_fold(fold, labels, db_uT=db_uT, rng=rng):
     ...     print(f"{check.what}: {check.found}: {check.holds}")
-    readings: 0 of 1 test readings trained on or adapted to: True
-    boards: 0 of 1 on both sides: True
-    skins: 0 of 1 on both sides: True
-    indentations: 0 of 1 on both sides: True
-    copies: 1 of 1 captures compared; s2 like s1: 0.0 % of 1 indentations: True
+    readings: 0 of 1 test readings are also used for training or adaptation: True
+    boards: 0 of 1 test boards are also in training: True
+    skins: 0 of 1 test skins are also in training: True
+    indentations: 0 of 1 test indentations are also in training: True
+    copies: 1 of 1 test captures compared. At most 0.0 % of the indentations of a capture match one training skin: True
     """
     _check_experiment(sides)
     checks = [_check_readings(sides)]
     if sides.experiment in SKINS_UNSEEN:
         checks += [_check_disjoint("boards", labels.board, sides), _check_disjoint("skins", labels.skin, sides)]
-        checks += [_check_disjoint("indentations", labels.indentation, sides), _check_copies(sides, labels, db_uT, rng)]
+        checks.append(_check_disjoint("indentations", labels.indentation, sides))
+        checks.append(_check_copies(sides, labels, db_uT, rng, accepted, scene))
     elif sides.experiment in SKIN_SHARED:
-        rule = "apart; the skin is shared by design"
+        rule = "no test indentation is in training; the skin is the same by design"
         checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule))
     else:
-        rule = "apart, but for the paper's own protocol; the skin is shared by design"
+        rule = "no test indentation is in training, except in the paper's own protocol; the skin is the same by design"
         checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule, known=True))
     return checks + (_check_pool(sides, labels) if len(sides.pool) else [])
 
@@ -167,40 +196,64 @@ def _check_experiment(sides: Sides) -> None:
 
 def _check_readings(sides: Sides) -> Check:
     used = np.isin(sides.test, np.concatenate([sides.train, sides.pool]))
-    found = f"{int(used.sum())} of {len(sides.test)} test readings trained on or adapted to"
-    return Check("readings", sides.where, "on one side only", found, holds=not used.any())
+    found = f"{int(used.sum())} of {len(sides.test)} test readings are also used for training or adaptation"
+    rule = "no test reading is used for training or adaptation"
+    return Check("readings", sides.where, rule, found, holds=not used.any())
 
 
-def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
+def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "", known: bool = False) -> Check:
     """Check that training rows and test rows have no value of `label` in common.
 
     With `known`, common values are reported as a known leak.
     """
+    rule = rule or f"no test {what.removesuffix('s')} is in training"
     tested = np.unique(label[sides.test])
     shared = tested[np.isin(tested, np.unique(label[sides.train]))]
-    found = f"{len(shared)} of {len(tested)} on both sides{_first_names(shared)}"
+    found = f"{len(shared)} of {len(tested)} test {what} are also in training{_first_names(shared)}"
     return Check(what, sides.where, rule, found, holds=len(shared) == 0, known=known and len(shared) > 0)
 
 
-def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator) -> Check:
+def _check_copies(
+    sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator, accepted: AuditSettings, scene: str
+) -> Check:
     """Check that no test capture is a copy of a training skin's captures under another name."""
     test, train = (
         strong_indentations(name[side], labels.indentation[side], db_uT[side])
         for name, side in ((labels.capture, sides.test), (labels.skin, sides.train))
     )
-    rule = f"in no capture {100 * COPIED_SHARE_MAX:g} % like one training skin"
+    rule = f"less than {100 * COPIED_SHARE_MAX:g} % of the indentations of a test capture match one training skin"
     captures, skins = labels.capture[sides.test], labels.skin[sides.test]
     weak_skins = np.setdiff1d(skins, skins[np.isin(captures, test.name)])
-    if len(weak_skins) or not len(train.name):
-        found = f"undecidable: fields within the noise{_first_names(weak_skins)}"
-        return Check("copies", sides.where, rule, found, holds=False)
-    likenesses = most_alike(test, train, rng=rng)
-    closest = max(likenesses, key=lambda likeness: likeness.share)
-    found = (
-        f"{len(likenesses)} of {len(np.unique(captures))} captures compared; "
-        f"{closest.capture} like {closest.train_skin}: {100 * closest.share:.1f} % of {closest.compared_n} indentations"
+    if not len(train.name):
+        weak_skins = np.union1d(weak_skins, labels.skin[sides.train])
+    unaccepted = np.setdiff1d(weak_skins, accepted.weak_skins)
+    section = f"section audit of pipeline/scenes/{scene}.yaml"
+    if len(unaccepted) or not (len(train.name) and len(test.name)):
+        least_uT = STRONG_NOISES * noise_uT(db_uT.shape[1])
+        found = f"not checked, because no field change exceeds {least_uT:.0f} µT{_first_names(weak_skins)}"
+        remedy = f"To accept this, write in {section}: weak_skins: [{', '.join(map(str, unaccepted))}]"
+        return Check(COPIES, sides.where, rule, found, holds=False, known=not len(unaccepted), remedy=remedy)
+    likenesses = all_likenesses(test, train, rng=rng)
+    captures_n = len({likeness.capture for likeness in likenesses})
+    found = f"{captures_n} of {len(np.unique(captures))} test captures compared. "
+    pairs = {frozenset(pair) for pair in accepted.similar_skins}
+    skin_of = dict(zip(captures.tolist(), skins.tolist(), strict=True))
+    too_similar = [likeness for likeness in likenesses if likeness.share >= COPIED_SHARE_MAX]
+    not_accepted = [one for one in too_similar if frozenset((skin_of[one.capture], one.train_skin)) not in pairs]
+    closest = max(not_accepted or likenesses, key=lambda likeness: likeness.share)
+    if not too_similar:
+        found += f"At most {100 * closest.share:.1f} % of the indentations of a capture match one training skin"
+        return Check(COPIES, sides.where, rule, found, holds=True)
+    capture, other = closest.capture, closest.train_skin
+    found += (
+        f"{100 * closest.share:.1f} % of the {closest.compared_n} compared indentations of capture {capture} match "
+        f"skin {other}"
     )
-    return Check("copies", sides.where, rule, found, holds=closest.share < COPIED_SHARE_MAX)
+    remedy = (
+        f"Is it the same recording? Then remove one of the two: reskin remove {scene} {capture}. If the recordings are "
+        f"different, write in {section}: similar_skins: [[{skin_of[capture]}, {other}]]"
+    )
+    return Check(COPIES, sides.where, rule, found, holds=False, known=not not_accepted, remedy=remedy)
 
 
 def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
@@ -209,11 +262,12 @@ def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
     shared = pokes[np.isin(pokes, tested)]
     skins = np.unique(labels.skin[sides.pool])
     foreign = np.setdiff1d(skins, labels.skin[sides.test])
-    overlap = f"{len(shared)} of {len(pokes)} unlabelled also tested{_first_names(shared)}"
-    not_held_out = f"{len(foreign)} of {len(skins)} are not held out{_first_names(foreign)}"
+    overlap = f"{len(shared)} of {len(pokes)} indentations for adaptation are also tested{_first_names(shared)}"
+    not_held_out = f"{len(foreign)} of {len(skins)} skins for adaptation are not held out{_first_names(foreign)}"
+    rules = "no indentation for adaptation is tested", "all skins for adaptation are held out"
     return [
-        Check("pool indentations", sides.where, "apart from the test", overlap, holds=len(shared) == 0),
-        Check("pool skins", sides.where, "skins of the test", not_held_out, holds=len(foreign) == 0),
+        Check("pool indentations", sides.where, rules[0], overlap, holds=len(shared) == 0),
+        Check("pool skins", sides.where, rules[1], not_held_out, holds=len(foreign) == 0),
     ]
 
 
@@ -259,7 +313,7 @@ class MeanFields:
 
 @dataclass(frozen=True)
 class Likeness:
-    """The training skin most like a test capture, and the fraction of the capture's indentations that look copied."""
+    """The fraction of a test capture's indentations that look copied from a training skin."""
 
     capture: str
     train_skin: str
@@ -283,8 +337,8 @@ def noise_uT(ch_n: int) -> float:
     return float(np.sqrt(ch_n / len(NOISE_uT) * (NOISE_uT**2).sum()))
 
 
-def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
-    """Find, for each test capture, the training skin from which the largest fraction of its indentations looks copied.
+def all_likenesses(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
+    """Compare each test capture with each training skin.
 
     A random sample of the capture's indentations is compared with all indentations of every training skin.
     """
@@ -295,8 +349,7 @@ def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator)
         db_uT = test.db_uT[test.name == capture]
         sample_uT = db_uT[rng.permutation(len(db_uT))[:sample_n]]
         shares = _copied_shares(sample_uT, train)
-        closest_skin = max(shares, key=lambda skin: shares[skin])
-        likenesses.append(Likeness(str(capture), closest_skin, shares[closest_skin], len(sample_uT)))
+        likenesses += [Likeness(str(capture), skin, share, len(sample_uT)) for skin, share in shares.items()]
     return likenesses
 
 
@@ -388,8 +441,11 @@ def audit_scaler(
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
     )
-    found = f"off by {train_gap:.2g} from training rows alone, by {both_gap:.2g} from both sides"
-    rule = f"that of the training rows, to {SCALER_TOLERANCE:.2g}"
+    found = (
+        f"relative difference {train_gap:.2g} from a scaler of the training rows, {both_gap:.2g} from one of training "
+        "and test rows"
+    )
+    rule = f"the scaler was fitted to the training rows alone; allowed relative difference {SCALER_TOLERANCE:.2g}"
     return Check("scaler", where, rule, found, holds=train_gap <= SCALER_TOLERANCE and train_gap <= both_gap)
 
 
@@ -418,11 +474,15 @@ def audit_tuning(
     tested = np.intersect1d(adapted_to, indentation[sides.test])
     foreign = np.setdiff1d(adapted_to, indentation[sides.pool])
     base_known = tuning["from"] in bases
-    base = "one of this fold and seed" if base_known else "another"
-    pokes = f"{len(tested)} of {len(adapted_to)} are tested, {len(foreign)} are not of the pool"
+    base = f"the pretrained network is {'' if base_known else 'not '}of the same fold and seed"
+    pokes = (
+        f"of {len(adapted_to)} indentations for adaptation, {len(tested)} are tested, and {len(foreign)} are not in "
+        "the fold's pool"
+    )
+    rules = "the pretrained network has the same fold and seed", "all are in the fold's pool, and none is tested"
     return [
-        Check("base", where, "a network of its fold and seed", base, holds=base_known),
-        Check("pokes", where, "of the pool, and none tested", pokes, holds=not len(tested) and not len(foreign)),
+        Check("base", where, rules[0], base, holds=base_known),
+        Check("pokes", where, rules[1], pokes, holds=not len(tested) and not len(foreign)),
     ]
 
 
@@ -435,10 +495,10 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
     ]
     again_n = sum(card["collapsed_before_n"] for card in cards)
     found = (
-        f"{len(collapsed)} of {len(cards)} collapsed{': ' if collapsed else ''}{', '.join(collapsed)}; "
-        f"{again_n} trained again"
+        f"{len(collapsed)} of {len(cards)} networks collapsed{': ' if collapsed else ''}{', '.join(collapsed)}; "
+        f"{again_n} training runs were repeated"
     )
-    rule = "no network answers nearly the same to any input"
+    rule = "no network predicts nearly the same for any input"
     return Check(COLLAPSE, variant, rule, found, holds=not collapsed, known=bool(collapsed))
 
 
@@ -500,22 +560,23 @@ def audit_choice(
     checks = []
     for what, studied, tested in (("boards", record.boards, test_boards), ("skins", record.skins, test_skins)):
         shared = sorted(set(studied) & set(tested)) if same_draw else []
-        found = f"{len(shared)} of {len(set(tested))} tested were chosen on{': ' if shared else ''}{', '.join(shared)}"
-        rule = f"none of those that scene {record.scene} chose on (of its source and seed)"
+        names = f": {', '.join(shared)}" if shared else ""
+        found = f"{len(shared)} of {len(set(tested))} tested {what} were used to choose the settings{names}"
+        rule = f"no tested {what.removesuffix('s')} was used in scene {record.scene} to choose the settings"
         checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared))
     found = "equal" if record.physics == physics else f"{NOT_CHOSEN}: {record.physics}, now {physics}; run it again"
-    rule = f"the simulated skin that scene {record.scene} chose on has the fingerprint of today's"
-    checks.append(Check("settings: physics", "all arms", rule, found, holds=True))
+    rule = f"the settings of the simulated skin are those with which scene {record.scene} chose the training settings"
+    checks.append(Check("settings: physics", "all variants", rule, found, holds=True))
     return checks + [audit_recipe(variant, recipe, record) for variant, recipe in recipes.items()]
 
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
     """Report the differences between a recipe and the one that the study chose; a difference is not a leak."""
-    rule = f"the recipe chosen on scene {record.scene}, or one that is stated here"
+    rule = f"the recipe is the one that scene {record.scene} chose; differences are listed"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)
     if chosen is None:
-        return Check("settings: recipe", variant, rule, f"{NOT_CHOSEN}: it chose none for this", holds=True)
+        return Check("settings: recipe", variant, rule, f"{NOT_CHOSEN}: it chose no recipe for this stage", holds=True)
     used, best = ({key: repr(value) for key, value in settings.items()} for settings in (recipe, chosen))
     differing = [
         f"{key} {used.get(key, 'absent')} (study: {best.get(key, 'absent')})"

@@ -25,15 +25,15 @@ from scipy.spatial.transform import Rotation
 from pipeline.experiments.results import read_captures, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import show_digits, tabulate
-from pipeline.settings import Settings
+from pipeline.settings import Row, SectionWithRows, Settings
 from pipeline.statistics import combine_verdicts, statistic, verdict, verdict_within
-from reskin.config import Strict
 from reskin.errors import ParamsError
 from reskin.physics.board import BoardDesign
 from reskin.physics.skin import SkinDesign
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
+from reskin.universal.layout import BoardLayout, as_layout, read_layout
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
 ARROWS_N = 4  # number of places per board in the figure of arrows
@@ -41,6 +41,7 @@ WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field,
 NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
 LIGHT_N = 1e-3  # force of a light touch
+FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
 # Values of k / mu in N/mm (spring constant with which the skin is held / friction coefficient under the tip). This
 # ratio limits how far a tip can slide a skin. The first value means no limit (full slide at any force), the last a
@@ -51,9 +52,14 @@ Fields = Float[np.ndarray, "n k 3"]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
-class Compare(Strict):
-    """Settings section `compare`: orientation of the recorded board, its labels and skin, and simulated memory."""
+class Compare(SectionWithRows):
+    """Settings section `compare`: orientation of the recorded board, its labels and skin, and simulated memory.
 
+    Instead of the keys from `design` to `labels_middle_mm` and `tip_radius_mm`, the scene's file may have `layout`: the
+    layout of a board as in `reskin/universal/layouts`, or the name of one of these.
+    """
+
+    layout: BoardLayout | None = None
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
     skin_flipped: bool  # all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
@@ -63,11 +69,40 @@ class Compare(Strict):
     # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
     memory: Annotated[float, Field(ge=0, lt=1)]
 
+    @classmethod
+    def expand(cls, section: Row, settings: Settings, where: str) -> Row:
+        if "layout" not in section:
+            return section
+        given, key = section["layout"], f"{where}.layout"
+        if isinstance(given, str) and Path(given).suffix:
+            problem = f"{given} is a file, whose changes DVC would not notice"
+            raise ParamsError(f"{key}: {problem}. Write the content of the file there, as `reskin new` does.")
+        layout = read_layout(given) if isinstance(given, str) else as_layout(given, key)
+        design = {
+            "chips_xy_mm": layout.chips_mm.tolist(), "chips_turn_deg": list(layout.turns_deg), "gap_mm": layout.gap_mm,
+        }  # fmt: skip
+        of_layout = {
+            "layout": layout.model_dump(mode="json"), "design": design, "skin_mm": layout.skin.size_mm,
+            "skin_flipped": layout.skin.flipped, "labels_middle_mm": layout.centre_mm,
+            "tip_radius_mm": layout.tip_radius_mm,
+        }  # fmt: skip
+        if twice := sorted(section.keys() & of_layout.keys() - {"layout"}):
+            raise ParamsError(f"{where}: {', '.join(twice)} cannot be set beside layout. Change the layout instead.")
+        return section | of_layout
+
+    @property
+    def stated_by(self) -> str:
+        """What states the orientations, in messages."""
+        return "the scene" if self.layout is None else f"layout {self.layout.name}"
+
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
-    """Compare the recorded changes of field of a scene's boards with simulated ones, and write the results."""
+    """Compare the recorded changes of field of a scene's boards with simulated ones, and write the results.
+
+    Of boards without known forces, only the orientation of labels, chips and skin is compared.
+    """
     design = settings.shared_section(SkinDesign, "skin")
-    boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))), with_force=False)
     write_results(results, *compare_boards(boards, section, design, settings.seed))
 
 
@@ -76,10 +111,12 @@ def compare_boards(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the recordings of every board with simulations; return the numbers, and the data for the figures."""
     setup = make_setup(section, design)
-    aligned = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
+    all_aligned = {board: to_board_axes(_thin(pokes, FITTED_MAX_N), section) for board, pokes in boards.items()}
+    aligned = {board: presses for board, presses in all_aligned.items() if presses.recorded.forces_known}
     fitted = {board: fit(presses, setup, TEN) for board, presses in aligned.items()}
     names = list(aligned)
-    by_board, plot_data = {}, {}
+    plot_data = {}
+    by_board = {board: _without_law(presses, boards[board], setup, section) for board, presses in all_aligned.items()}
     for i, (board, aligned_presses) in enumerate(aligned.items()):
         laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
         if len(names) > 1:
@@ -96,16 +133,16 @@ def compare_boards(
             | {"beyond_n": beyond_n(laws.get(name), setup, aligned_presses.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
+        whole = len(aligned_presses.recorded) == len(boards[board])  # memory needs successive presses
         frictions = fit_frictions(aligned_presses, setup, fitted[board])
         curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
         by_board[board] = (
             agreements.pop("fitted")
             | {"grips": frictions}
             | agreements
-            | estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed)
-            | {"laws": parameters, "frames": check_frames(aligned_presses, setup, section)}
-            | {"noise_uT": dict(zip("xyz", aligned_presses.recorded.noise_uT.tolist(), strict=True))}
-            | {"pokes_n": len(aligned_presses.recorded), "left_out_n": aligned_presses.recorded.excluded_n}
+            | (estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed) if whole else {})
+            | {"laws": parameters}
+            | by_board[board]
         )
         plot_data[board] = _plot_data(aligned_presses, simulated_uT["fitted"]) | {"curve_uT": curves}
     numbers = {
@@ -115,7 +152,26 @@ def compare_boards(
         "light_N": LIGHT_N,
         "grip_N_mm": START.grip_N_mm,
     }
-    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": plot_data}
+    outline = {} if section.layout is None else {"outline": _outline(section)}
+    drawn = {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": plot_data}
+    return numbers, drawn | outline
+
+
+def _outline(section: Compare) -> dict[str, Any]:
+    """Return the skin's least x and y, its sides and the chips' centres, in the coordinates of the labels."""
+    middle_mm, sides_mm = np.array(section.labels_middle_mm), np.array(section.skin_mm)
+    chips_mm = np.array(section.design.places_mm) * (1, -1 if section.labels_mirrored else 1) + middle_mm
+    corner_mm = middle_mm - sides_mm / 2
+    return {"corner_mm": corner_mm.tolist(), "sides_mm": sides_mm.tolist(), "chips_mm": chips_mm.tolist()}
+
+
+def _without_law(aligned: AlignedPresses, recorded: RecordedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
+    """Return the numbers of a board that need no fitted law, and therefore no forces; `recorded`: all its presses."""
+    noise_uT = recorded.noise_uT
+    noise = {"noise_uT": dict(zip("xyz", noise_uT.tolist(), strict=True))} if np.isfinite(noise_uT).all() else {}
+    counts = {"pokes_n": len(recorded), "left_out_n": recorded.excluded_n}
+    counts |= {"fitted_n": len(aligned.recorded)} if len(aligned.recorded) < len(recorded) else {}
+    return {"frames": check_frames(aligned, setup, section)} | noise | counts
 
 
 def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,7 +192,7 @@ def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
-    return simulation == "fitted" or simulation in board
+    return ("cosine_mean" if simulation == "fitted" else simulation) in board
 
 
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
@@ -169,8 +225,8 @@ def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]
 # --- Recordings in the board's axes ---
 
 
-def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
-    """Pool the captures of each skin.
+def pool_skins(captures: Sequence[Readings], *, with_force: bool = True) -> dict[str, RecordedPresses]:
+    """Pool the captures of each skin; `with_force`: see `pool`.
 
     Keys are names of boards, or `board/skin` for boards with several skins.
     """
@@ -179,7 +235,7 @@ def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
         skins.setdefault(f"{capture.board}/{capture.skin}", []).append(capture)
     boards = [name.partition("/")[0] for name in skins]
     names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
-    return {names[name]: pool(captures_of_skin) for name, captures_of_skin in skins.items()}
+    return {names[name]: pool(captures_of_skin, with_force=with_force) for name, captures_of_skin in skins.items()}
 
 
 def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
@@ -189,6 +245,8 @@ def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
 
 def make_setup(section: Compare, design: SkinDesign) -> Setup:
     """Return the setup for the simulation: the designed skin on the scene's board, pressed with the scene's tip."""
+    if section.layout is not None:
+        return section.layout.setup()
     chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
     return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
 
@@ -197,8 +255,9 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
     """Transform the labels (places) and the fields of pokes to the board's axes."""
     turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
     if len(turn) != chips_n:
-        what = f"{chips_n} chips were recorded, but compare.design has {len(turn)}"
-        raise ParamsError(f"board {pokes.board}: {what}. Correct compare.design of the scene.")
+        where = f"compare.{'design' if section.layout is None else 'layout'}"
+        what = f"{chips_n} chips were recorded, but {where} has {len(turn)}"
+        raise ParamsError(f"board {pokes.board}: {what}. Correct {where} of the scene.")
     place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
     rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
     return AlignedPresses(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
@@ -225,6 +284,8 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
     if either estimate is impossible.
     """
     pokes = aligned.recorded  # in the chips' axes; the memory is the same in any axes
+    if not np.isfinite(pokes.noise_uT).all():
+        return {}
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
@@ -253,7 +314,7 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
     for grip_N_mm in GRIPS_N_MM:
         law = replace(fitted, grip_N_mm=grip_N_mm)
         if grip_N_mm != fitted.grip_N_mm:
-            law = fit(aligned, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
+            law = fit(aligned, setup, TEN, replace(setup.start, grip_N_mm=grip_N_mm))
         agreed = agreement(aligned, simulate_uT(law, setup, aligned.place_mm, aligned.recorded.force_N))
         length_uT = size_against_force(law, setup, aligned.place_mm)
         rows.append(
@@ -271,7 +332,8 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 # displaced by 0.5 mm changes every cosine by less than 0.1.
 PENALTY = 0.1
 AXES = "xyz"
-AS_SAID = "Labels, chips and skin lie as the scene says."
+AS_SAID = "Labels, chips and skin lie as {} says."
+ASSUMED_N = 1.0  # force of presses of unknown force, in simulations that are only compared in direction
 
 
 @dataclass(frozen=True)
@@ -288,10 +350,10 @@ class Turn:
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         return quarter_turn(self.quarters) @ np.diag(self.signs)
 
-    def describe(self) -> str:
+    def describe(self, stated_by: str = "the scene") -> str:
         """Describe the difference from the orientation that the scene states; return an empty string if none."""
         mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
-        turned = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
+        turned = [f"turned by {90 * self.quarters} degrees more than {stated_by} says"] * bool(self.quarters)
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
@@ -326,18 +388,23 @@ class Frames:
     worth: float
 
     @property
-    def sentence(self) -> str:
-        """Describe all differences from the orientations that the scene states."""
-        differences = [f"the labels are {self.labels.describe()}"] * (self.labels != TURNS[0])
+    def as_stated(self) -> bool:
+        """Whether the orientations are those that the scene states."""
+        in_place = bool((self.chips == np.arange(len(self.chips))).all())
+        return in_place and not self.flipped and {self.labels, *self.turns} == {TURNS[0]}
+
+    def sentence(self, stated_by: str = "the scene") -> str:
+        """Describe all differences from the orientations that the scene (or its layout) states."""
+        if self.as_stated:
+            return AS_SAID.format(stated_by)
+        differences = [f"the labels are {self.labels.describe(stated_by)}"] * (self.labels != TURNS[0])
         differences += ["the skin is flipped: every field has the other sign"] * self.flipped
         differences += _describe_exchanges(self.chips)
         for turn in dict.fromkeys(self.turns):
             chips = [i for i, chip_turn in enumerate(self.turns) if chip_turn == turn]
             if turn != TURNS[0]:
-                differences.append(f"{_name_chips(chips, len(self.turns))} {turn.describe()}")
-        if not differences:
-            return AS_SAID
-        return f"Against the scene, {'; '.join(differences)}."
+                differences.append(f"{_name_chips(chips, len(self.turns))} {turn.describe(stated_by)}")
+        return f"Against {stated_by}, {'; '.join(differences)}."
 
 
 def _name_chips(chips: Sequence[int], chips_n: int) -> str:
@@ -355,17 +422,32 @@ def _describe_exchanges(positions: Int[np.ndarray, " k"]) -> list[str]:
 
 
 def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Check whether labels, chips and skin are oriented as the scene states."""
-    frames = find_frames(
-        aligned.place_mm, aligned.recorded.db_uT, chip_rotations(section),
-        lambda places_mm: nominal_uT(setup, places_mm, aligned.recorded.force_N),
-    )  # fmt: skip
+    """Check whether labels, chips and skin are oriented as the scene states.
+
+    `ASSUMED_N` replaces unknown forces.
+    """
+    frames = _frames_of(aligned, setup, section)
     columns = zip(frames.chips.tolist(), frames.as_written.tolist(), frames.cosines.tolist(), frames.turns, strict=True)
     chips = [
-        {"chip": i, "at": position, "cosine_as_written": written, "cosine_best": best, "read": turn.describe()}
+        {
+            "chip": i,
+            "at": position,
+            "cosine_as_written": written,
+            "cosine_best": best,
+            "read": turn.describe(section.stated_by),
+        }
         for i, (position, written, best, turn) in enumerate(columns)
     ]
-    return {"sentence": frames.sentence, "chips": chips}
+    return {"sentence": frames.sentence(section.stated_by), "chips": chips}
+
+
+def _frames_of(aligned: AlignedPresses, setup: Setup, section: Compare) -> Frames:
+    recorded = aligned.recorded
+    force_N = recorded.force_N if recorded.forces_known else np.full(len(recorded), ASSUMED_N)
+    return find_frames(
+        aligned.place_mm, recorded.db_uT, chip_rotations(section),
+        lambda places_mm: nominal_uT(setup, places_mm, force_N),
+    )  # fmt: skip
 
 
 def find_frames(
@@ -415,7 +497,7 @@ def _best_chips(
     return Frames(labels, flipped, positions, turns, signed[chips, positions, turn_i], as_written, float(total))
 
 
-CHIPS_N = 5  # orientations are checked only on boards with five chips, which are on all sides of the middle
+CHIPS_MIN_N = 4  # orientations are checked only on boards with at least four chips, on all sides of the middle
 # With fewer pokes, the check is unreliable. With more, it takes seconds and is no more reliable (in scene lab, every
 # third of 65 places is enough).
 POKES_MIN_N, POKES_MAX_N = 20, 70
@@ -426,22 +508,25 @@ def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDes
 
     Returns None if there is no difference, or too little data to decide. `blocks` are the readings of the capture.
     """
-    if blocks[0].chips_n != CHIPS_N or not any(_pressed_rows(block).any() for block in blocks):
+    chips_mm = np.array(section.design.places_mm)
+    surrounded = len(chips_mm) >= CHIPS_MIN_N and (chips_mm.min(axis=0) < 0).all() and (chips_mm.max(axis=0) > 0).all()
+    if not surrounded or not any(_pressed_rows(block).any() for block in blocks):
         return None
-    pokes = _thin(pool(blocks))
+    pokes = _thin(pool(blocks, with_force=False), POKES_MAX_N)
     if len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
         return None
-    sentence = check_frames(to_board_axes(pokes, section), make_setup(section, design), section)["sentence"]
-    return None if sentence == AS_SAID else str(sentence)
+    frames = _frames_of(to_board_axes(pokes, section), make_setup(section, design), section)
+    return None if frames.as_stated else frames.sentence(section.stated_by)
 
 
 def _pressed_rows(readings: Readings) -> np.ndarray:
-    return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & (readings.Fz_N > 0)
+    pressed = (readings.Fz_N > 0) | np.isnan(readings.Fz_N)
+    return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & pressed
 
 
-def _thin(pokes: RecordedPresses) -> RecordedPresses:
-    """Select at most `POKES_MAX_N` pokes, evenly distributed over the recording."""
-    kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
+def _thin(pokes: RecordedPresses, most_n: int) -> RecordedPresses:
+    """Select at most `most_n` pokes, evenly distributed over the recording."""
+    kept = np.unique(np.linspace(0, len(pokes) - 1, most_n).round().astype(int))
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[kept] for name in names})
 
@@ -504,7 +589,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate agreement with its bounds, the fitted parameters, and the orientation of labels, chips and skin."""
     by_board = numbers["by_board"]
     rows = [
-        _board_row(board, name, _of_simulation(numbers_of_board, name), numbers_of_board["laws"].get(name, {}))
+        _board_row(board, name, _of_simulation(numbers_of_board, name), numbers_of_board.get("laws", {}).get(name, {}))
         for board, numbers_of_board in by_board.items()
         for name in SIMULATIONS
         if _has_simulation(numbers_of_board, name)
@@ -513,14 +598,18 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         {"board": board, "law": _title(name, law)}
         | {title: f"{law[parameter]:.3g}" for parameter, title in TITLES.items()}
         for board, numbers_of_board in by_board.items()
-        for name, law in numbers_of_board["laws"].items()
+        for name, law in numbers_of_board.get("laws", {}).items()
     ]
-    result = {
-        "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
-        "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
-        "compare_grip": tabulate(_friction_rows(by_board), meaning=ABOUT_GRIP.format(**numbers)),
-        "compare_frames": tabulate([_frames_row(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
-    }
+    result = (
+        {}
+        if not laws
+        else {
+            "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
+            "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
+            "compare_grip": tabulate(_friction_rows(by_board), meaning=ABOUT_GRIP.format(**numbers)),
+        }
+    )
+    result["compare_frames"] = tabulate([_frames_row(*row) for row in by_board.items()], meaning=ABOUT_FRAMES)
     for table in result.values():
         table["source"] = source
     return result
@@ -576,12 +665,12 @@ def _title(name: str, law: Mapping[str, Any]) -> str:
 
 
 def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
-    chips, noise_uT = board_numbers["frames"]["chips"], board_numbers["noise_uT"]
+    chips, noise_uT = board_numbers["frames"]["chips"], board_numbers.get("noise_uT", {})
     cosine = {
         f"cosine by chip, {title}": ", ".join(f"{chip[key]:.2f}" for chip in chips)
         for title, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
     }
-    noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values())}
+    noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values()) or NONE}
     pokes = {"pokes": str(board_numbers["pokes_n"]), "left out": str(board_numbers["left_out_n"])}
     return {"board": board, "orientation": board_numbers["frames"]["sentence"]} | cosine | noise | pokes
 
@@ -589,6 +678,8 @@ def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw recorded and simulated changes of field: as arrows at the chips for a few places, and against force."""
     boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
+    if not boards:  # no board has known forces
+        return {}
     return {
         "compare_arrows.svg": _draw_arrows(boards, np.array(drawn["chips_mm"]), source),
         "compare_growth.svg": _draw_growth(drawn["boards"], numbers["by_board"], source),

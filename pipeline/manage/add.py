@@ -7,22 +7,26 @@ changes are undone.
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from pipeline import PARAMS, PLAN, plan
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import require_idle
 from pipeline.scenes import EXPERIMENTS, Scene, read_plan, read_scene, read_shared
+from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io
 from reskin.board.rates import REPEATED_MAX, RepeatCounter
-from reskin.errors import CaptureError, ParamsError, ReskinError
+from reskin.errors import CaptureError, ParamsError, ReskinError, did_you_mean
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
 from reskin.recordings.orientation import other_orientation, presses_of
-from reskin.recordings.preparing import Prepared
+from reskin.recordings.preparing import CaptureNames, Prepared
 from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
@@ -37,20 +41,25 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     """
     require_idle(root)
     header, files = prepared
-    settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, add --like ini.").stem)
+    remedy = f"To create it: reskin new {scene} --boards ..., or add --like ini."
+    settings = read_scene(root, plan.scene_file(root, scene, remedy=remedy).stem)
     if settings.source != header.source:
         remedy = "Choose a scene of the same source"
         if header.source == "recorded":
             remedy += ", or create one: --scene NEW --like ini"
         raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
+    if settings.boards is not None and header.board not in settings.boards:
+        guess, known = did_you_mean(header.board, settings.boards), ", ".join(settings.boards)
+        remedy = f"Correct the name, or add it to key boards of {plan.scene_file(root, scene)}."
+        raise ParamsError(f"board {header.board} is not a board of scene {scene} ({known}).{guess} {remedy}")
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
     with io.restoring(root / REGISTRY, root / PLAN), _removing_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
-            fingerprints, touched = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
-        if not touched and not any(experiment.without_contact for experiment in settings.entries):
+            fingerprints, counts = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
+        if not counts.touched and not any(experiment.without_contact for experiment in settings.entries):
             known = ", ".join(name for name, experiment in EXPERIMENTS.items() if experiment.without_contact)
             raise ParamsError(
                 f"{header.capture}: nothing touches the skin in this recording, and no experiment of scene {scene} "
@@ -61,10 +70,47 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         write_registry(root, after)
         plan.use(root, [*read_plan(root / PLAN).scenes, scene])
     if "compare" in (settings.model_extra or {}):
-        _warn_of_departures(target, settings, nominal("skin"), shared.faults)
+        _warn_of_departures(target, read_settings(scene, root), nominal("skin"), shared.faults)
     else:
         _warn_of_other_labels(target, list(before.captures.get(scene, {})), shared.faults)
+    if all(other.skin != complete.skin for other in before.captures.get(scene, {}).values()):
+        _warn_of_small_pool(complete, settings, counts)
     return complete
+
+
+def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> CaptureNames:
+    """Return the names of a capture; names that are not given (empty) are taken from the file's name, `BOARD_SKIN.csv`.
+
+    The skin is then named `BOARD_SKIN`, so that skins of different boards have different names. Further parts of the
+    file's name (`BOARD_SKIN_MORE.csv`) distinguish the captures of a skin.
+    """
+    if given.board and given.skin:
+        return given
+    stem = recording.stem
+    boards = config.read_yaml(plan.scene_file(root, scene)).get("boards", ())
+    starts = [name for name in (given.board, *boards) if name and stem.startswith(f"{name}_")]
+    board = max(starts, key=len, default=stem.partition("_")[0])
+    skin = stem.removeprefix(f"{board}_").partition("_")[0]
+    if skin == stem or not skin:
+        raise ParamsError(
+            f"{recording}: the name of the board or of the skin is not given, and the file's name is not "
+            "BOARD_SKIN.csv. Rename the file, or add --board and --skin."
+        )
+    return CaptureNames(given.board or board, given.skin or f"{board}_{skin}", given.name or stem)
+
+
+@contextmanager
+def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
+    """Undo all changes if the `with` block fails; `captures` are those that were added in the block until then."""
+    with io.restoring(root / REGISTRY, root / PLAN):
+        try:
+            yield
+        except BaseException:
+            for capture in captures:
+                _remove_files(root / RAW / scene / capture)
+            if captures:
+                say(f"nothing was added: {', '.join(captures)} were removed again")
+            raise
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
@@ -89,19 +135,32 @@ def _check_free(target: Path, registered: bool) -> None:
         raise ParamsError(f"{target}: the folder exists already. {remedy}")
 
 
-def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], bool]:
-    """Read a whole capture as stage ingest does; return its fingerprints, and whether anything touches the skin.
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of passes and of indentations in a capture, and whether anything touches the skin."""
+
+    passes_n: int
+    indentations_n: int
+    touched: bool
+
+
+def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], Counts]:
+    """Read a whole capture as stage ingest does; return its fingerprints, and counts.
 
     The fingerprints are the SHA-256 of the readings and of the stream. Copies of a recording with other names or in
     another layout have a fingerprint in common. An unknown force (NaN) counts as a touch.
     """
     _, blocks, counts = open_capture(folder, policy)
     rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
+    passes: set[int] = set()
+    indentations: set[int] = set()
     for block in blocks:
         rows_n += len(block)
         touched |= bool((block.Fz_N != 0).any())
         readings.update(block.b_uT.tobytes())
         repeats.feed(block.b_uT)
+        passes.update(np.unique(block.pass_i).tolist())
+        indentations.update(np.unique(block.indentation).tolist())
     check_losses(counts, limit, folder.name)
     if rows_n == 0:
         raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(counts)}. Check its files.")
@@ -113,11 +172,24 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
             f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Was the board, "
             "or the program that recorded it, faster than the chips? See reskin ports --rate. It was added anyway."
         )
-    stream = tuple(header.files[name] for name in (STREAM_FILE,) if name in header.files)
-    return (readings.hexdigest(), *stream), touched
+    fingerprints = (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
+    return fingerprints, Counts(len(passes), len(indentations), touched)
 
 
-def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
+def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
+    """Warn if the first capture of a skin has fewer passes or indentations than the scene's section split needs."""
+    for what, have_n, key in (
+        ("passes", counts.passes_n, "pool_passes_n"), ("indentations", counts.indentations_n, "labels_pool_n")
+    ):  # fmt: skip
+        pool_n = getattr(scene.split, key)
+        if pool_n is not None and have_n <= pool_n:
+            say(
+                f"warning: capture {header.capture} has {have_n} {what}; split.{key} of the scene needs more than "
+                f"{pool_n} of each skin. Add further recordings of skin {header.skin}, or reduce {key}."
+            )
+
+
+def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
     """Warn if the orientation of chips, labels or skin seems to differ from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
@@ -126,7 +198,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     from reskin.physics.skin import SkinDesign
 
     _, blocks, _ = open_capture(folder, policy)
-    section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
+    section = settings.section(Compare, "compare")
     try:
         sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
     except ReskinError as error:

@@ -20,10 +20,8 @@ WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest e
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
 TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
-SKIN_MM = (-2.0, 18.0)  # extent of the skin around the grid: "20mm x 20mm" (paper section 2)
-# Centres of the five chips under the skin, in the coordinates of the labels (paper section 2), and the side of a chip.
-CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
-CHIP_MM = 3.0
+CHIP_MM = 3.0  # side of a chip
+MARGIN_MM = 0.5  # of the axes around the skin
 RANGES = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # metrics in figures, with their possible range
 # The axis of the number of pokes is linear below this number, because a logarithmic axis cannot show 0.
 LINEAR_BELOW_N = 65
@@ -34,6 +32,19 @@ BARS = (
 SENSOR_METHODS = ("multi", "triplet", "adapted")
 
 Rows = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Outline:
+    """The outline of a skin, and the centres of the chips below it, in the coordinates of the labels."""
+
+    corner_mm: tuple[float, float]  # least x and y of the skin
+    sides_mm: tuple[float, float]
+    chips_mm: Sequence[tuple[float, float]]
+
+
+# Section 2 of the paper: the skin, "20mm x 20mm", around the grid, and its five chips.
+PAPERS_SKIN = Outline((-2.0, -2.0), (20.0, 20.0), ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0)))
 
 
 def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -112,20 +123,26 @@ def _finish_headline(figure: Any, title: str, *, ncols: int) -> None:
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
 
 
-def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Iterator[tuple[str, str]]:
+def error_grids(
+    predictions: Iterable[pa.Table], recipe: str, scene: str, outline: Outline | None = None
+) -> Iterator[tuple[str, str]]:
     """Draw the position errors of a recipe as a map for each experiment with predictions; yield file name and SVG."""
     for table in predictions:
         for experiment in table["question"].unique().to_pylist():
             wanted = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
             true_mm, predicted_mm = (_places(table.filter(wanted), side) for side in ("true", "predicted"))
             title = f"{scene}, {experiment}: position error on held-out readings"
-            yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title)
+            yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title, outline=outline)
 
 
-def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:
+def error_grid(
+    true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str,
+    outline: Outline | None = None,
+) -> str:  # fmt: skip
     """Draw the places of the indentations, coloured by the mean distance between true and predicted position.
 
-    All maps have the same colour scale. If the places are on the paper's grid, the skin and its chips are drawn too.
+    All maps have the same colour scale. The skin and its chips are drawn too, if their `outline` is given or if the
+    places are on the paper's grid.
     """
     places, place_indices = np.unique(np.round(true_mm, 2), axis=0, return_inverse=True)
     distance_mm = np.linalg.norm(predicted_mm - true_mm, axis=1)
@@ -134,9 +151,13 @@ def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray
         axes = figure.subplots()
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         size = float(np.clip(12_000 / len(places), 6, 170))
-        if places.min() >= 0 and places.max() <= GRID_MM:
+        if outline is not None:
+            _draw_skin(axes, outline)
+        elif places.min() >= 0 and places.max() <= GRID_MM:
             size = MARK_PT**2
-            _draw_skin(axes)
+            _draw_skin(axes, PAPERS_SKIN)
+            ticks_mm = np.arange(0, GRID_MM + 1, TICK_MM)
+            axes.set(xticks=ticks_mm, yticks=ticks_mm)
         look = {"cmap": "viridis", "vmin": 0.0, "vmax": WORST_MM, "marker": "s", "linewidths": 0, "zorder": 1}
         points = axes.scatter(*places.T, c=mean_mm, s=size, **look)
         figure.colorbar(points, label="mean position error / mm", extend="max", shrink=0.8)
@@ -150,23 +171,25 @@ def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray
         return svg(figure)
 
 
-def _draw_skin(axes: Any) -> None:
+def _draw_skin(axes: Any, outline: Outline) -> None:
     """Draw the skin behind the marks of places, and the outlines of its chips in front of them."""
     from matplotlib.patches import FancyBboxPatch, Rectangle
     from matplotlib.patheffects import withStroke
 
-    start_mm, side_mm = SKIN_MM[0], SKIN_MM[1] - SKIN_MM[0]
     look: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.5", "linewidth": 1.2, "zorder": 0}
     shape = "round,pad=0,rounding_size=1"
-    axes.add_patch(FancyBboxPatch((start_mm, start_mm), side_mm, side_mm, shape, **look, label="skin"))
+    axes.add_patch(FancyBboxPatch(outline.corner_mm, *outline.sides_mm, shape, **look, label="skin"))
     halo = [withStroke(linewidth=3.2, foreground="white")]  # makes outlines visible on any colour
-    for i, (x_mm, y_mm) in enumerate(CHIPS_MM):
+    for i, (x_mm, y_mm) in enumerate(outline.chips_mm):
         corner_mm = (x_mm - CHIP_MM / 2, y_mm - CHIP_MM / 2)
         chip = Rectangle(corner_mm, CHIP_MM, CHIP_MM, fill=False, edgecolor="black", linewidth=1.4, zorder=2)
         chip.set(path_effects=halo, label="" if i else "chip below the skin")
         axes.add_patch(chip)
-    limits_mm, ticks_mm = (start_mm - 0.5, SKIN_MM[1] + 0.5), np.arange(0, GRID_MM + 1, TICK_MM)
-    axes.set(xlim=limits_mm, ylim=limits_mm, xticks=ticks_mm, yticks=ticks_mm)
+    limits_mm = [
+        (start_mm - MARGIN_MM, start_mm + side_mm + MARGIN_MM)
+        for start_mm, side_mm in zip(outline.corner_mm, outline.sides_mm, strict=True)
+    ]
+    axes.set(xlim=limits_mm[0], ylim=limits_mm[1])
     axes.spines[["left", "bottom"]].set_visible(False)
 
 

@@ -181,7 +181,7 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
     pokes, sensors, classical, labels = (
         select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
     )
-    labels = pd.concat([labels, select(table, question="universal")])
+    labels = pd.concat([labels, *(select(table, question=name) for name in ("calibrated", "universal"))])
     numbers: dict[str, Any] = {}
     if len(pokes):
         numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _groups(pokes, "pokes_n")]

@@ -26,7 +26,12 @@ Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
 NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
-OPEN = {"table2", "labels", "claims"}  # tables that are unfolded when the page loads; all others are folded
+OPEN = {
+    "table2",
+    "labels",
+    "claims",
+    "final_model",
+}  # tables that are unfolded when the page loads; all others are folded
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
 SUMMARY = "Main scores on held-out boards"
 SOURCES = {

@@ -136,6 +136,10 @@ PAIRED = (
     "boards that these networks were tested on, and the interval is also over their training skins. The table claims "
     "has verdicts on the differences."
 )
+FINAL_MEANING = (
+    "The scores are those of networks that were trained in the same way without one of the boards, each tested on that "
+    "board. They estimate the scores of the final model on a further board. The final model itself was not tested."
+)
 SKINS_MEANING = (
     "Each cell: mean over skins [smallest … largest] (number of skins). The field change of a reading is the length of "
     "the vector of all channels; the table uses the median over readings within 20 % of the stated force. –: too few "
@@ -185,6 +189,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["labels_boards"] = labels_boards_table(numbers["labels"], source)
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
+    if "final_model" in numbers:
+        tables["final_model"] = final_model_table(numbers)
     if "described" in numbers:
         columns = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
         tables["skins"] = skins_table(columns)
@@ -396,6 +402,30 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
         for recipe, row in recipes.items()
     ]
     return pd.DataFrame(lines)
+
+
+def final_model_table(numbers: Numbers) -> pd.DataFrame:
+    """Describe the model that was trained on all boards, how to use it, and the scores on held-out boards."""
+    model, source = numbers["final_model"], numbers["provenance"]["source"]
+    row, held_out = table_2_rows(numbers)["multi"]
+    file = model["file"]
+    trained_on = f"{model['boards_n']} {source} boards, {model['skins_n']} skins, {model['rows_n']:,} readings"
+    scores_of = {title: show(held_out[metric]) for metric, title in COLUMNS.items() if metric in held_out}
+    rows = {
+        "file": f"{file}; its card is beside it (.json)",
+        "trained on": f"{trained_on}; {model['steps_n']} steps",
+        "tested": f"no, because all boards were in training. Networks of the same recipe on {n_of(held_out)} held-out "
+        f"boards (row {row.title} of table 2): " + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
+        "use with a log": f"reskin predict LOG.csv --model {file} --out contacts.csv",
+        "use with a board": f"reskin live --model {file}",
+        "use in Python": f'model = reskin.load_model("{file}").zero(noload_uT); model.predict(b_uT)',
+        "use without Python": 'model.export_onnx("model.onnx")',
+    }
+    if source == "simulated":
+        rows["limits"] = "It was trained on simulated skins, and does not fit real ones."
+    elif not model["forces_known"]:
+        rows["limits"] = "The recordings have no forces, so its forces are NaN."
+    return tabulate([{"final model": name, "": text} for name, text in rows.items()], meaning=FINAL_MEANING)
 
 
 def _captures(numbers: Numbers, source: str) -> pd.DataFrame:

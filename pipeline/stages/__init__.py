@@ -14,7 +14,7 @@ STAGES = {
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
     "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
-    "universal": ("few_labels", "universal"),
+    "universal": ("few_labels", "universal", "calibrated"),
     "report": ("table2", "report", "publish"),
 }
 MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}

@@ -24,7 +24,7 @@ from pipeline.provenance import (
 from pipeline.report.costs import cost_pages
 from pipeline.report.experiments import experiment_figures
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
-from pipeline.report.figures import error_grids, headline_figures, learning_figures
+from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
 from pipeline.report.formatting import rounded, to_markdown
 from pipeline.report.numbers import (
     add_up,
@@ -48,6 +48,7 @@ from pipeline.tracking import Curves, TrackingUnavailable, metrics_of
 from pipeline.tracking import publish as write_runs
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.choice import choose, fingerprint, to_record
+from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
@@ -69,7 +70,7 @@ def table2(settings: Settings, models: Path, tables: Path) -> None:
 def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
     name, scene = settings.scene, planned_scene(settings)
-    source, inputs = scene.source, read_inputs(scene, indentations, folds, models, results)
+    source, inputs = scene.source, read_inputs(name, scene, indentations, folds, models, results)
     scores = tidy(inputs.cards, inputs.points)
     numbers = rounded(compute_numbers(settings, scene, inputs, scores))
     plot_data = {EXPERIMENTS[name].key: result["drawn"] for name, result in inputs.analyses.items()}
@@ -87,7 +88,9 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
-        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})"))
+        of_layout = plot_data.get("compare", {}).get("outline")  # if the scene has the layout of its boards
+        outline = None if of_layout is None else Outline(**of_layout)
+        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
         figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
         figures |= figures_future.result()
         costs = costs_future.result()
@@ -110,12 +113,13 @@ class Inputs:
     analyses: dict[str, Any]
     studies: dict[str, Any]
     described: dict[str, Any]
+    final_model: dict[str, Any]
     before_touch: list[pa.Table]
     ingest_counts: list[dict[str, Any]]
     dropped: dict[str, int]
 
 
-def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, results: Path) -> Inputs:
+def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, models: Path, results: Path) -> Inputs:
     """Read the results of all stages that the scene runs."""
 
     def read(names: Iterable[str]) -> dict[str, Any]:
@@ -128,6 +132,7 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
         analyses=read(scene.analyses),
         studies=read(scene.studies),
         described={scene.described: io.read_json(results / "described.json")},
+        final_model=final_numbers(models, scene_name) if "lobo" in scene.experiments else {},
         before_touch=[
             io.read_table(models / model_stage / BEFORE_CONTACT_FILE)
             for model_stage in scene.model_stages
@@ -154,6 +159,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
         },
         "capture": add_up(inputs.ingest_counts) | {"left_out": dict(inputs.dropped)},
         **learning_numbers(scores, headline=HEADLINE),
+        **inputs.final_model,
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
         "described": inputs.described,

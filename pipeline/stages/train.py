@@ -11,8 +11,10 @@ from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Train
 from pipeline.stage import say
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.before_contact import BY_TIME, score_before_contact
+from pipeline.training.final import train_final
 from pipeline.training.jobs import (
     adaptation_jobs,
+    code_of,
     make_jobs,
     preload_training,
     read_data,
@@ -46,12 +48,15 @@ def train_single(settings: Settings, section: Training, indentations: Path, fold
     io.write_table(models / BEFORE_CONTACT_FILE, score_before_contact(data, indentations, captures, networks))
 
 
-def train_multi(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on the skins of all boards except one (paper section 5.1)."""
+def train_multi(
+    settings: Settings, section: Training, indentations: Path, folds: Path, models: Path, final: Path
+) -> None:
+    """Train on the skins of all boards except one (paper section 5.1); then train the final model on all boards."""
     preload_training()
     data = read_data(settings, indentations, folds)
     jobs = make_jobs(data, section, data.folds_of("lobo"))
-    write_models(models, data, jobs, train_jobs(data, jobs, "train_multi"), "train_multi")
+    cards = write_models(models, data, jobs, train_jobs(data, jobs, "train_multi"), "train_multi")
+    train_final(final, data, section, cards, code_of("train_multi"))
 
 
 def train_triplet(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:

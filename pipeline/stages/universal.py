@@ -1,4 +1,4 @@
-"""Stages few_labels and universal: score methods on held-out boards, with different numbers of labelled presses."""
+"""Stages few_labels, universal and calibrated: score methods on held-out boards, by number of labelled presses."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +8,14 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
+from pipeline.experiments.compare import Compare
 from pipeline.experiments.known_boards import read_known_boards
+from pipeline.experiments.results import read_captures
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few
+from pipeline.training.calibrated import Calibrated, Frame, read_model, rest_by_skin
+from pipeline.training.calibrated import score_fold as score_calibrated
 from pipeline.training.few_labels import FewLabels
 from pipeline.training.jobs import SceneData, collapse_record, read_data, score_test, train_jobs, training_data
 from pipeline.training.universal import (
@@ -57,6 +61,21 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
 def _point(data: SceneData, entry: few.Entry, predicted: np.ndarray) -> dict[str, Any]:
     point = {"method": entry.method, "inputs": entry.inputs, "labels_n": entry.labels_n, "fold": entry.fold.board}
     return point | {"seed_i": entry.fold.draw_i, "scores": score_test(data, entry.fold.test, predicted)}
+
+
+def calibrated(
+    settings: Settings, section: Calibrated, indentations: Path, folds: Path, model: Path, scores: Path
+) -> None:
+    """Score a finished universal model, calibrated to every held-out board, on the test rows of `few_labels`."""
+    data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
+    universal_model = read_model(model, compare.layout, settings)
+    frame = Frame(compare.labels_middle_mm, compare.labels_mirrored)
+    rest_uT = rest_by_skin(read_captures(indentations, tuple(settings.captures_in(indentations))))
+    points = []
+    for fold in data.folds_of(EXPERIMENT):
+        points += score_calibrated(data, fold, universal_model, frame, rest_uT, section)
+        say(f"{settings.scene} calibrated: {fold.name} done")
+    io.write_json(scores, points)
 
 
 class UniversalSection(TrainingSettings):

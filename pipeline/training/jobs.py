@@ -228,9 +228,12 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
-) -> None:
-    """Write models, cards and predictions to folder `models`, and times to a file that is not a stage output."""
-    code = code_version_of(imported(module_name(stage)))
+) -> list[ModelCard]:
+    """Write models, cards and predictions to folder `models`, and times to a file that is not a stage output.
+
+    Returns the cards.
+    """
+    code = code_of(stage)
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
         folder.mkdir()
@@ -240,6 +243,12 @@ def write_models(
             io.write_json(folder / f"{job.name}.json", card | {"git": code})
         io.write_table(folder / "predictions.parquet", _predictions(jobs, results, data.rows))
     write_timings(data.scene, stage, jobs, results)
+    return cards
+
+
+def code_of(stage: str) -> str:
+    """Return the last commit that changed the code of a stage."""
+    return code_version_of(imported(module_name(stage)))
 
 
 def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> ModelCard:

@@ -28,7 +28,7 @@ from reskin.config import parse, read_yaml
 from reskin.errors import ParamsError, require
 from reskin.universal.batches import NOMINAL_NAME, SkinPrior, TrainingSettings
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
-from reskin.universal.layout import BoardLayout, paper_layout, read_layout
+from reskin.universal.layout import BoardLayout, as_layout, paper_layout, read_layout
 from reskin.universal.map import tabulate
 from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
@@ -163,6 +163,19 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
     return Universal(tables, networks, powers, layout, about)
 
 
+def read_layout_of(file: Path) -> BoardLayout:
+    """Read a layout: a file or name that `read_layout` accepts, or a scene with key `layout` in section `compare`."""
+    content = read_yaml(file) if file.suffix in (".yaml", ".yml") else {}
+    if not (isinstance(content, dict) and "source" in content):
+        return read_layout(file)
+    given = content.get("compare", {}).get("layout")
+    if given is None:
+        raise ParamsError(
+            f"{file}: this scene has no layout (key layout in section compare). Give the file of a layout."
+        )
+    return read_layout(given) if isinstance(given, str) else as_layout(given, f"{file}: compare.layout")
+
+
 def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> None:
     """Make the model for the layout in a file, and write it and its card (same name with suffix .json).
 
@@ -170,7 +183,7 @@ def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> No
     ------
     ParamsError : the layout is wrong, `out` is not a new .safetensors file, or PyTorch is not installed
     """
-    layout = read_layout(layout_file)
+    layout = read_layout_of(layout_file)
     if out.suffix != ".safetensors":
         raise ParamsError(f"--out: {out} must end in .safetensors. Try: {out.with_suffix('.safetensors')}")
     for file in (out, out.with_suffix(".json")):

@@ -226,7 +226,7 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
             passes = np.unique(rows.pass_i[held[on_skin]])
             if len(passes) <= split.pool_passes_n:
                 what, rule = f"passes of held-out skin {skin}", f"more than split.pool_passes_n, {split.pool_passes_n}"
-                remedy = "Record more passes, or reduce the size of the pool."
+                remedy = "Record more passes, reduce it, or remove it with experiment adapt."
                 raise ParamsError(f"experiment {experiment}", what, rule, len(passes), remedy)
             pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
     fold = Fold(experiment, name, train, held[~pooled], held[pooled])

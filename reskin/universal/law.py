@@ -83,7 +83,10 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area."""
+    """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area.
+
+    start_law: the law at which fits start, which is also the mean of their priors; by default `START`.
+    """
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
@@ -94,6 +97,11 @@ class Setup:
     rule: Quadrature = RULE
     coarse_rule: Quadrature = COARSE
     area: Area = PAPER_AREA
+    start_law: Law | None = None
+
+    @property
+    def start(self) -> Law:
+        return self.start_law or START
 
     @property
     def sides_m(self) -> tuple[float, float]:
@@ -249,11 +257,12 @@ class AlignedPresses:
     rest_uT: Float[np.ndarray, "k 3"]
 
 
-def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law = START) -> Law:
-    """Fit the named parameters by least squares; the others keep their values in `start`."""
+def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law | None = None) -> Law:
+    """Fit the named parameters by least squares; the others keep their values in `start` (default: `setup.start`)."""
+    start = start or setup.start
     magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)
-    centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (START, PRIOR, STEP))
+    centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (setup.start, PRIOR, STEP))
 
     def residuals(values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
         law = with_parameters(start, names, values)

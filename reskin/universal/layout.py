@@ -20,7 +20,7 @@ from reskin.physics.magnet import Polarity, Quadrature
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import NOMINAL as NOMINAL_FILE
 from reskin.simulation.defaults import nominal
-from reskin.universal.law import COARSE, RULE, Area, Law, Setup, to_board, to_chips, with_parameters
+from reskin.universal.law import COARSE, RULE, START, Area, Law, Setup, to_board, to_chips, with_parameters
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import THICKNESSES, TIPS, Forces
 
@@ -153,8 +153,12 @@ class BoardLayout(Strict):
     @property
     def law(self) -> Law:
         """The central law: the nominal one, with this layout's gap, magnetisation and modulus."""
+        return with_parameters(NOMINAL, *self._own_parameters)
+
+    @property
+    def _own_parameters(self) -> tuple[tuple[str, ...], Float[np.ndarray, " p"]]:
         own = {"gap_mm": self.gap_mm, "amplitude": self.skin.magnetisation, "modulus_MPa": self.skin.modulus_MPa}
-        return with_parameters(NOMINAL, tuple(own), np.array(list(own.values())))
+        return tuple(own), np.array(list(own.values()))
 
     @property
     def all_spreads(self) -> dict[str, float]:
@@ -170,7 +174,7 @@ class BoardLayout(Strict):
         rule, coarse = (Quadrature(each.cell_m * factor, each.layers_n) for each in (RULE, COARSE))
         return Setup(
             design, self.chips_mm, self.gap_mm, self.skin.size_mm, self.skin.flipped, self.tip_radius_mm, rule, coarse,
-            self.places,
+            self.places, with_parameters(START, *self._own_parameters),
         )  # fmt: skip
 
     def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:

@@ -34,22 +34,30 @@ class RecordedPresses:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    noise_uT: Float[np.ndarray, "3"]  # standard deviation of readings from the mean of their press, along x, y and z
+    # Standard deviation of readings from the mean of their press, along x, y and z; NaN if presses have one reading.
+    noise_uT: Float[np.ndarray, "3"]
     excluded_n: int  # number of excluded presses: unknown place, or force unknown or not above 0 N
+    forces_known: bool = True  # if False, no press has a known force, and force_N is NaN
 
     def __len__(self) -> int:
         return len(self.force_N)
 
 
-def pool(captures: Sequence[Readings]) -> RecordedPresses:
-    """Combine the presses of all captures of one skin on one board, in the order of the captures."""
+def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPresses:
+    """Combine the presses of all captures of one skin on one board, in the order of the captures.
+
+    with_force: whether at least one press must have a known force. If not, and no force is known, all presses with a
+    known place are kept.
+    """
     parts = [_means(readings) for readings in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
     place_mm, force_N, db_uT, noload_uT, var_uT2 = (
         np.concatenate([part[i] for part in parts]).astype(float) for i in range(1, 6)
     )
-    known = np.isfinite(place_mm).all(axis=1) & (force_N > 0)
+    placed = np.isfinite(place_mm).all(axis=1)
+    forces_known = with_force or bool(np.isfinite(force_N).any())
+    known = placed & (force_N > 0) if forces_known else placed
     if not known.any():
         what = f"board {captures[0].board} has no press with a known place and force"
         raise SchemaError(f"experiment compare: {what}. Record both, or remove the experiment from the scene.")
@@ -57,8 +65,12 @@ def pool(captures: Sequence[Readings]) -> RecordedPresses:
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],
         place_mm=place_mm[known], force_N=force_N[known], db_uT=db_uT[known], noload_uT=noload_uT[known],
-        noise_uT=np.sqrt(np.nanmean(var_uT2, axis=(0, 1))), excluded_n=int((~known).sum()),
+        noise_uT=_noise_uT(var_uT2), excluded_n=int((~known).sum()), forces_known=forces_known,
     )  # fmt: skip
+
+
+def _noise_uT(var_uT2: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "3"]:
+    return np.full(3, np.nan) if np.isnan(var_uT2).all() else np.sqrt(np.nanmean(var_uT2, axis=(0, 1)))
 
 
 def _means(readings: Readings) -> tuple[np.ndarray, ...]:

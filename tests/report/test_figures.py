@@ -11,6 +11,7 @@ import pytest
 from pipeline.report.drawing import drawing, svg
 from pipeline.report.figures import (
     HEADLINE,
+    Outline,
     bars,
     error_grid,
     headline_figures,
@@ -46,6 +47,12 @@ def test_skin_and_chips_are_drawn_only_on_the_papers_grid():
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
+
+
+def test_given_outline_is_drawn_instead():
+    outline = Outline((10.0, 4.0), (30.0, 20.0), ((20.0, 10.0), (25.0, 15.0)))
+    text = error_grid(PLACES_MM + 12, PLACES_MM + 12, title="mine", outline=outline)
+    assert draw_grid().count('id="patch_') - text.count('id="patch_') == 5 - 2  # chips
 
 
 def test_title_states_the_place_with_the_largest_error():

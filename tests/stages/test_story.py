@@ -406,13 +406,12 @@ def test_missing_tracking_server_is_reported_quickly(story):
 def test_removed_experiment_leaves_no_files(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
-    settings["experiments"].remove("sleeve")
-    settings.pop("sleeve")
-    for part in ("boards", "protocols"):
-        settings["simulate"][part].pop("sleeve")
+    settings["experiments"].remove("sleeve")  # its settings stay
     with scene.open("w") as stream:
         YAML().dump(settings, stream)
-    assert "sleeve@ci" in run(story, "reskin", "scenes", "use", "ci").stdout
+    output = run(story, "reskin", "scenes", "use", "ci").stdout
+    assert "sleeve@ci" in output
+    assert "ci.yaml: no experiment reads sleeve, simulate.protocols.sleeve" in output
     assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")

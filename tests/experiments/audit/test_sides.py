@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.experiments import audit
 from pipeline.experiments.audit import (
+    AuditSettings,
     Labels,
     Sides,
     audit_choice,
@@ -100,7 +101,7 @@ def test_split_leak_is_detected(leak, named):
     checks = run_audit(moved_to_train(leak), LABELS, DB_uT)
     assert not passes(checks)
     assert failing(checks) == named
-    assert checks[1].found == "1 of 1 on both sides: b0"
+    assert checks[1].found == "1 of 1 test boards are also in training: b0"
 
 
 def test_shared_reading_is_detected_within_a_skin():
@@ -116,7 +117,7 @@ def test_papers_random_readings_are_a_known_leak():
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
     # each indentation has 3 readings: 2 are on one side of the split, 1 on the other
-    assert leak.found.startswith("60 of 60 on both sides")
+    assert leak.found.startswith("60 of 60 test indentations are also in training")
     assert passes(checks)
 
 
@@ -138,7 +139,7 @@ def test_pool_must_be_untested_pokes_of_held_out_skins():
     assert failing(tested) == ["pool indentations"]
     trained = run_audit(replace(fold, pool=fold.train[:3]), LABELS, DB_uT)
     assert failing(trained) == ["pool skins"]
-    assert trained[-1].found == "1 of 1 are not held out: b1_s0"
+    assert trained[-1].found == "1 of 1 skins for adaptation are not held out: b1_s0"
 
 
 def with_copy(
@@ -155,7 +156,8 @@ def test_perturbed_copy_is_detected(sd_uT, factor):
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=sd_uT, factor=factor)
     checks = run_audit(held_out(LABELS), LABELS, planted)
     assert failing(checks) == ["copies"]
-    assert checks[-1].found.startswith("2 of 2 captures compared; c_b0_s1 like b2_s1:")
+    assert checks[-1].found.startswith("2 of 2 test captures compared. ")
+    assert checks[-1].found.endswith("of capture c_b0_s1 match skin b2_s1")
     assert not passes(checks)
 
 
@@ -167,7 +169,8 @@ def test_copied_capture_is_detected_among_others():
     planted = DB_uT.copy()
     planted[few] = DB_uT[copied[: len(few)]] + rng_for(1, "copy").normal(0, 4, (len(few), 15))
     check = run_audit(held_out(LABELS), replace(LABELS, capture=capture), planted)[-1]
-    assert check.found.startswith("3 of 3 captures compared; c_b0_s1_more like b2_s1:")
+    assert check.found.startswith("3 of 3 test captures compared. ")
+    assert check.found.endswith("of capture c_b0_s1_more match skin b2_s1")
     assert not check.holds
 
 
@@ -177,7 +180,7 @@ def test_copy_is_detected_in_a_sample(monkeypatch):
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
     check = run_audit(held_out(LABELS), LABELS, planted)[-1]
     # 12,000 compared pairs / (240 training indentations x 2 captures)
-    assert check.found.endswith("of 25 indentations")
+    assert "of the 25 compared indentations" in check.found
     assert not check.holds
     assert run_audit(held_out(LABELS), LABELS, DB_uT)[-1].holds
 
@@ -203,7 +206,11 @@ def test_response_rotated_by_ten_degrees_is_not_a_copy():
 def test_fields_within_the_noise_are_undecidable():
     checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
-    assert checks[-1].found == "undecidable: fields within the noise: b0_s1"
+    assert checks[-1].found == "not checked, because no field change exceeds 153 µT: b0_s1"
+    accepted = AuditSettings(settings="for speed", weak_skins=("b0_s1",))
+    assert "weak_skins: [b0_s1]" in checks[-1].remedy
+    weak_uT = np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT)
+    assert passes(audit_fold(held_out(LABELS), LABELS, db_uT=weak_uT, rng=rng_for(0, "sample"), accepted=accepted))
 
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
@@ -321,7 +328,9 @@ def test_scaler_fitted_to_both_sides_fails_even_if_close():
 
     arrays = fit(DB_uT, TARGET)  # fitted to all rows: the training side and the test side
     check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
-    assert check.found == "off by 3.6e-08 from training rows alone, by 0 from both sides"
+    assert check.found == (
+        "relative difference 3.6e-08 from a scaler of the training rows, 0 from one of training and test rows"
+    )
     assert not check.holds
 
 
@@ -356,7 +365,7 @@ def test_choice_on_another_seed_passes():
 def test_choice_on_test_data_is_detected(source, seed):
     checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
     assert failing(checks) == ["settings: boards", "settings: skins"]
-    assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
+    assert checks[1].found == "1 of 3 tested skins were used to choose the settings: b0_s0"
     assert not passes(checks)
 
 
@@ -377,6 +386,6 @@ def test_recipe_that_differs_from_the_choice_is_reported(recipe, found):
 def test_missing_choice_is_reported_and_broken_record_is_an_error():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
-    assert checks[-1].found == "not chosen by the study: it chose none for this"
+    assert checks[-1].found == "not chosen by the study: it chose no recipe for this stage"
     with pytest.raises(ParamsError, match="skins is missing"):
         choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})

@@ -1,13 +1,30 @@
 """Tests of departures: differences between a capture and the skin of its scene that suggest wrong labels."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from pipeline.experiments.compare import find_departure
+from pipeline.experiments import compare
+from pipeline.experiments.compare import (
+    Compare,
+    chip_rotations,
+    compare_boards,
+    figures,
+    find_departure,
+    make_setup,
+    pool_skins,
+    tables,
+)
+from pipeline.settings import Settings
+from reskin.config import read_yaml
+from reskin.errors import ParamsError
 from reskin.recordings.readers import lab
 from reskin.schema import Readings
+from reskin.universal.law import nominal_uT
+from reskin.universal.layout import FOLDER
+from tests.data.tables import readings
 from tests.experiments.compare.test_run import DESIGN, SECTION
 from tests.recordings.test_recordings import ingest
 
@@ -43,5 +60,77 @@ def test_incomplete_captures_have_no_departure(real):
     unknown = np.full(len(real), np.nan, np.float32)
     few = select(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
-    for cannot in (replace(real, Fz_N=unknown), replace(real, x_mm=unknown), few, fewer_chips):
+    for cannot in (replace(real, x_mm=unknown), few):
         assert find_departure([cannot], SECTION, DESIGN) is None
+    with pytest.raises(ParamsError, match=r"4 chips were recorded, but compare\.design has 5"):
+        find_departure([fewer_chips], SECTION, DESIGN)
+
+
+def test_orientation_is_found_without_forces(real):
+    unknown = np.full(len(real), np.nan, np.float32)
+    assert find_departure([replace(real, Fz_N=unknown)], SECTION, DESIGN) is None
+    mirrored = replace(real, Fz_N=unknown, y_mm=16 - real.y_mm)
+    assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
+
+
+# A square board with four chips: its layout, as a scene's file states it.
+SQUARE = read_yaml(FOLDER / "reskin.yaml") | {
+    "name": "square",
+    "centre_mm": [10.0, 12.0],
+    "chips": [
+        {"x_mm": x_mm, "y_mm": y_mm, "turn_deg": turn_deg}
+        for (x_mm, y_mm), turn_deg in zip(product((-4.0, 5.0), repeat=2), (0, 90, 0, 270), strict=True)
+    ],
+}
+
+
+def square_section(**changes: object) -> Compare:
+    scene = {"compare": {"layout": SQUARE, "labels_mirrored": False, "memory": 0.065} | changes}
+    return Settings("mine", "mine.yaml", scene, {}).section(Compare, "compare")
+
+
+def square_recording(section: Compare) -> Readings:
+    """Return simulated presses at 5 x 5 places of the square board, without forces."""
+    setup, turns = make_setup(section, DESIGN), chip_rotations(section)
+    place_mm = np.stack(np.meshgrid(*[np.linspace(-6, 6, 5)] * 2), axis=-1).reshape(-1, 2)
+    db_uT = np.einsum("kij,nki->nkj", turns, nominal_uT(setup, place_mm, np.full(25, 2.0))).reshape(25, 12)
+    label_mm = (place_mm + section.labels_middle_mm).astype(np.float32)
+    return readings(
+        "c", "b", "s", 25, indentation=np.arange(25, dtype=np.int32), x_mm=label_mm[:, 0], y_mm=label_mm[:, 1],
+        b_uT=db_uT.astype(np.float32), noload_uT=np.zeros((25, 12), np.float32),
+        temperature_degC=np.full((25, 4), 25, np.float32), Fz_N=np.full(25, np.nan, np.float32),
+    )  # fmt: skip
+
+
+def test_departures_from_a_layout_name_the_layout():
+    section = square_section()
+    recording = square_recording(section)
+    assert find_departure([recording], section, DESIGN) is None
+    swapped = recording.b_uT.reshape(25, 4, 3)[:, [0, 3, 2, 1]].reshape(25, 12)
+    sentence = find_departure([replace(recording, b_uT=swapped)], section, DESIGN)
+    assert sentence == "Against layout square, chips 1 and 3 are exchanged."
+
+
+def test_boards_without_forces_have_only_frames(monkeypatch):
+    monkeypatch.setattr(compare, "FITTED_MAX_N", 22)
+    section = square_section()
+    boards = pool_skins([square_recording(section)], with_force=False)
+    numbers, plot_data = compare_boards(boards, section, DESIGN, 0)
+    assert numbers["by_board"]["b"]["frames"]["sentence"] == "Labels, chips and skin lie as layout square says."
+    assert (numbers["by_board"]["b"]["pokes_n"], numbers["by_board"]["b"]["fitted_n"]) == (25, 22)
+    assert set(tables(numbers, "recorded")) == {"compare_frames"}
+    assert figures(numbers, plot_data, "recorded") == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"layout": "my_board.yaml"}, "my_board.yaml is a file, .* Write the content of the file there"),
+        ({"layout": "reskim"}, "reskim: not a YAML file.*Did you mean reskin"),
+        ({"skin_mm": [20.0, 20.0]}, "skin_mm cannot be set beside layout"),
+        ({"layout": SQUARE | {"gap": 1.0}}, "compare.layout: gap is not a known parameter"),
+    ],
+)
+def test_invalid_layout_of_a_scene_is_an_error(changes, message):
+    with pytest.raises(ParamsError, match=message):
+        square_section(**changes)

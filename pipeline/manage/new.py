@@ -1,0 +1,159 @@
+"""Write the file of a new recorded scene that holds out each of several boards: `reskin new`."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline import SCENES
+from pipeline.plan import scene_names
+from pipeline.scenes import read_scene
+from reskin import io
+from reskin.errors import ParamsError
+from reskin.recordings.header import NAME
+from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
+from reskin.universal.model import FILE
+
+POOL_MAX_N = 40  # largest number of indentations that may be labelled, as in scene lab
+LABELS_N = (0, 5, 10, 20, 40)
+SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
+TEMPLATE = """\
+# Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/parameters.md explains the keys.
+source: recorded
+boards: [{boards}] # `reskin add` accepts only these names
+seed: 2021
+# Experiments may be removed from this list; their settings may stay in this file.
+experiments: [{experiments}]
+selection:
+  force_min_N: 0.0 # readings with a smaller measured force are treated as no contact
+split:
+  transfer_skins_n: {transfer_n} # experiment transfer: number of boards of which one skin is trained on
+{pool_passes}\
+  labels_pool_n: {pool_n} # indentations of a held-out skin for calibration, with or without labels; not tested
+  labels_draws_n: 1 # random draws of these indentations; more take longer, and make the scores more precise
+train_single: {{recipe: paper, steps_n: 3000, seeds_n: 1, variants: {{}}}}
+train_multi: {{recipe: paper, steps_n: 3000, seeds_n: 3, variants: {{}}}}
+train_triplet: {{recipe: triplet, steps_n: 3000, seeds_n: 3, variants: {{}}}}
+{adapt}\
+few_labels:
+  labels_n: {labels_n}
+  recipe: paper
+  steps_n: 3000
+  recipes: # each recipe lists the values that differ from the shared row
+    network: {{}}
+    network-shape: {{inputs: shape}}
+  adapted: []
+  adapting: {{adaptation: paper, steps_n: 300}}
+  labelling: {{labelling: few, steps_n: 300}}
+  rows_max_n: 20000
+  methods: few-labels
+{about_model}\
+calibrated:
+  model: {model}
+  labels_n: {labels_n}
+  even: false # true if the places are a grid around the board's centre, and each is pressed equally often
+audit: # optional: similar_skins, weak_skins
+  settings: chosen
+compare:
+  labels_mirrored: false # true if y of the labels points opposite to y of the board
+  memory: 0.065 # part of a field change that remains in the next no-load reading; assumed, as in scene lab
+  # The layout of your boards: all experiments that simulate skins or use the universal model refer to it.
+  layout:{layout}
+"""
+POOL_PASSES = "  pool_passes_n: 1 # the first pass of each held-out skin is for adaptation; it is not tested\n"
+ADAPT = """\
+adapt:
+  adaptation: paper
+  base: paper # recipe of section train_triplet whose networks are adapted
+  steps_n: 300
+  pokes_n: {pokes_n} # unlabelled indentations: those of the first pass
+  variants:
+    control: {{unlabelled_weight: 0.0}} # as many steps, without the new skin's indentations
+"""
+ABOUT_MODEL = """\
+# Experiment calibrated tests a universal model for the layout below. To run it, make the model:
+#   reskin model make --layout {file} --out {model}
+# and add calibrated to the list of experiments.
+"""
+ONE_BOARD = (
+    "one board cannot be held out and trained on. To train on its first passes and test on its last ones, use instead "
+    "of this command: reskin add RECORDING --layout table --board B --skin S --scene NAME --like ini. The universal "
+    "model needs no training: see docs/live.md, Calibrate the universal model"
+)
+
+
+def new(
+    root: Path, scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None
+) -> tuple[Path, list[str]]:
+    """Write `pipeline/scenes/<scene>.yaml`; return its path, and sentences on what to do next.
+
+    boards: names of two or more boards. presses_n: indentations of each skin in one pass; with two passes or more, the
+    scene also adapts networks. layout: a layout of the project, a YAML file whose text is copied, or None for the
+    layout of the paper's board as a text to edit.
+
+    Raises
+    ------
+    ParamsError : a name is invalid or taken, there are fewer than two boards, or the layout is invalid
+    """
+    for option, name in (("SCENE", scene), *(("--boards", board) for board in boards)):
+        if not re.fullmatch(NAME, name):
+            raise ParamsError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
+    if len(set(boards)) < len(boards):
+        raise ParamsError(f"--boards: {', '.join(boards)}: a name occurs twice. Name each board once.")
+    if len(boards) < 2:
+        raise ParamsError(f"--boards: {ONE_BOARD}.")
+    if scene in scene_names(root):
+        raise ParamsError(f"{root / SCENES / scene}.yaml exists. Choose another name, or edit this file.")
+    file = root / SCENES / f"{scene}.yaml"
+    io.write_text(file, scene_text(scene, boards, presses_n, passes_n, layout))
+    try:
+        experiments = read_scene(root, scene).experiments
+    except BaseException:
+        io.remove(file)
+        raise
+    return file, _next_steps(file.relative_to(root), scene, layout, experiments)
+
+
+def scene_text(scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None) -> str:
+    """Return the text of the scene's file; see `new`."""
+    given = paper_layout() if layout is None else read_layout(layout)
+    fits, adapted = layout is not None and is_shipped(given), passes_n > 1
+    model = SHIPPED if fits else f"{scene}.safetensors"
+    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit", "compare"]
+    pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
+    return TEMPLATE.format(
+        scene=scene, boards=", ".join(boards), experiments=", ".join(experiments + ["calibrated"] * fits),
+        transfer_n=max(1, len(boards) // 2), pool_n=pool_n, pool_passes=POOL_PASSES if adapted else "",
+        adapt=ADAPT.format(pokes_n=presses_n) if adapted else "", labels_n=[n for n in LABELS_N if n <= pool_n],
+        model=model, about_model="" if fits else ABOUT_MODEL.format(file=f"{SCENES}/{scene}.yaml", model=model),
+        layout=_layout_text(layout, scene),
+    )  # fmt: skip
+
+
+def is_shipped(layout: BoardLayout) -> bool:
+    """Return whether the universal model that comes with the project is for this layout."""
+    return layout.model_copy(update={"name": paper_layout().name}) == paper_layout()
+
+
+def _layout_text(layout: str | None, scene: str) -> str:
+    """Return the value of key `layout`: a name, or the indented text of a file."""
+    file = FOLDER / "reskin.yaml" if layout is None else Path(layout)
+    if not file.suffix:
+        return f" {layout}"
+    lines = file.read_text(encoding="utf-8").splitlines()
+    if layout is None:
+        first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+        name = f"name: {scene} # saved calibrations of the universal model refer to this name"
+        lines = [name, *lines[first_i + 1 :]]
+    return "".join(f"\n    {line}" if line.strip() else "\n" for line in lines)
+
+
+def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequence[str]) -> list[str]:
+    steps = [f"wrote {file}"]
+    if "adapt" not in experiments:
+        steps.append("left out: adapt, which needs recordings with --passes 2 or more")
+    if "calibrated" not in experiments:
+        steps.append("left out: calibrated, which needs a universal model for your layout (the file says how)")
+    add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
+    if layout is None:
+        steps.append("next: describe your boards in this file, key layout of section compare: it has the paper's board")
+    return [*steps, f"then: {add}" if layout is None else f"next: {add}"]

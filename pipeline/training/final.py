@@ -1,0 +1,65 @@
+"""The final model of a scene: one network, trained on the skins of all boards, for use on further boards.
+
+No reading is left to test it. Its card and the report give the scores of the networks that were trained in the same
+way without one of the boards, and tested on that board.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.settings import Training
+from pipeline.statistics import records, select, tidy, whole
+from pipeline.training.jobs import SceneData, model_card, train_jobs
+from reskin import io
+from reskin.metrics import METRICS
+from reskin.models.job import TrainingJob
+from reskin.models.recipe import HEADLINE
+from reskin.models.trained import SUFFIX
+
+EXPERIMENT = "final"
+FILE = f"{EXPERIMENT}{SUFFIX}"  # in folder data/models/SCENE/final
+NOT_TESTED = (
+    "no: all boards were in training. held_out: networks of the same recipe, by the board that each was tested on"
+)
+NO_ROWS = np.zeros(0, np.int64)
+F = 2  # index of the force among the targets
+
+
+def train_final(folder: Path, data: SceneData, training: Training, held_out: Sequence[Any], code: str) -> None:
+    """Train a network of the headline recipe on all rows of the scene; write it with its card to `folder`.
+
+    held_out: cards of the networks of the same recipe that were tested on held-out boards. If the forces of all
+    readings are unknown, the network's force is NaN.
+    """
+    rows = np.arange(len(data.rows))
+    job = TrainingJob(
+        EXPERIMENT, HEADLINE, training.recipes[HEADLINE], "all boards", data.settings.seed, 0, rows, NO_ROWS
+    )
+    (result,) = train_jobs(data, [job], "train_multi")
+    tensors = dict(result.weights) | result.scaler.arrays()
+    forces_known = bool(np.isfinite(data.rows.target[:, F]).any())
+    if not forces_known:
+        tensors["target_shift"] = np.where(
+            np.arange(tensors["target_shift"].size) == F, np.nan, tensors["target_shift"]
+        )
+    card = model_card(job, result, data.rows, data.scene)
+    scores = whole(select(tidy(held_out), recipe=HEADLINE)).groupby("board")[list(METRICS)].mean()
+    more = {"git": code, "tested": NOT_TESTED, "held_out": records(scores), "forces_known": forces_known}
+    with io.replacing(folder) as temporary:
+        temporary.mkdir()
+        io.write_tensors(temporary / FILE, tensors, {"format": card["format"]})
+        io.write_json((temporary / FILE).with_suffix(".json"), card | more)
+
+
+def final_numbers(models: Path, scene: str) -> dict[str, Any]:
+    """Return the entry `final_model` of numbers.json; empty if the scene has no final model."""
+    card_file = (models / EXPERIMENT / FILE).with_suffix(".json")
+    if not card_file.is_file():
+        return {}
+    card = io.read_json(card_file)
+    numbers = {f"{what}_n": len(card[f"train_{what}"]) for what in ("boards", "skins")}
+    names = {"file": f"data/models/{scene}/{EXPERIMENT}/{FILE}", "forces_known": card["forces_known"]}
+    return {"final_model": names | numbers | {"rows_n": card["train_rows_n"], "steps_n": card["recipe"]["steps_n"]}}
