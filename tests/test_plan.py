@@ -121,9 +121,7 @@ def test_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     (root / SCENES / "mine.yaml").write_text(text)  # this checkout has no library, and so no model
-    with pytest.raises(
-        ParamsError, match=r"universal.safetensors, which section calibrated names, not found"
-    ):
+    with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
         plan.plan_of(root, ["mine"])
 
 
