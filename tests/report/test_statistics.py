@@ -444,6 +444,6 @@ def test_collapsed_network_is_listed_in_the_audit():
     check = audit_collapse(
         "train_multi", [trained(0, collapsed_before_n=2), trained(1, collapsed=True, collapsed_before_n=2)]
     )
-    assert check.found == "1 of 2 collapsed: lobo.paper.b0.seed1; 4 trained again"
+    assert check.found == ("1 of 2 networks collapsed: lobo.paper.b0.seed1; 4 training runs were repeated")
     assert (check.holds, check.known) == (False, True)
     assert audit_collapse("train_multi", [trained(0)]).holds
