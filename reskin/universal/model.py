@@ -26,11 +26,13 @@ from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.physics import external
 from reskin.physics.magnet import cubes_along
+from reskin.recordings.units import WEAKEST_uT
 from reskin.universal import network
 from reskin.universal.calibration import (
     CalibrationData,
     LabelledPresses,
     LikelihoodPowers,
+    check_is_reading,
     check_labels,
     check_number,
     check_presses,
@@ -551,9 +553,15 @@ class Universal:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences for the user if the orientation of the skin or of the labels' axes is uncertain or wrong."""
+        """Sentences for the user about a wrong unit, and about an uncertain or wrong orientation of skin or labels."""
         if not self.zeroed:
             return []
+        usual_uT = float(np.median(np.linalg.norm(self.noload_uT.reshape(-1, 3), axis=1)))
+        if usual_uT < WEAKEST_uT:
+            return [
+                f"the no-load field is weaker than the earth's field: {usual_uT:.3g} uT at most chips. Pass readings "
+                "in uT (convert mT or G), from which the no-load reading is not subtracted."
+            ]
         frame = self.label_frame
         of_labels = None if frame is None else frame.warning()
         return [*self.mounting.warnings(turnable=self.turnable), *([of_labels] if of_labels else [])]
@@ -647,6 +655,7 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
+        The readings are fields as the board sends them, not field changes: the no-load reading is subtracted here.
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
         expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
         presses together are evenly spread over the skin (for example a grid with one press per place), so that their
@@ -655,7 +664,7 @@ class Universal:
         """
         if even and area:
             raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
-        db_uT, data = check_presses(self._change(check_readings(b_uT, self.channels_n))), self._data
+        db_uT, data = self._check_change("see", check_readings(b_uT, self.channels_n)), self._data
         if not len(db_uT):
             return self
         presses_uT, none = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:], no_presses(self.channels_n)
@@ -703,7 +712,7 @@ class Universal:
             self._centre_mm + self.layout.reach_mm,
         )
         check_range(forces_N, self.tables.force_N)
-        db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
+        db_uT, before = self._check_change("label", readings_uT), self._data.labels
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
@@ -788,6 +797,12 @@ class Universal:
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return field changes along the board's axes; raise SchemaError before `zero`."""
         return self._sign * self.layout.to_board(check_shape(b_uT, self.channels_n) - self.noload_uT)
+
+    def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
+        """Return the field changes of presses; raise SchemaError if the readings are in mT or are field changes."""
+        db_uT = check_presses(self._change(b_uT))
+        check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
+        return db_uT
 
     @property
     def _sign(self) -> int:
