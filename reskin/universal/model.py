@@ -83,6 +83,9 @@ SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks'
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+# If the no-load field differs from that of the saved calibration by more than this fraction, a warning says that this
+# may be another skin. In scene lab, recordings of one board differ by at most 5 %, those of the two boards by 65 %.
+OTHER_SKIN_MIN = 0.25
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 # With external fields, the errors of map and networks are more strongly correlated. The power is divided by 1 +
 # external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Chosen so that intervals on simulated skins cover 90 %.
@@ -460,6 +463,7 @@ class Universal:
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
         self._turned_given = False  # whether the user stated the orientation of the skin
+        self._saved_uT: Float[np.ndarray, " ch"] | None = None  # no-load reading in the file of a saved calibration
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
@@ -553,7 +557,7 @@ class Universal:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences for the user about a wrong unit, and about an uncertain or wrong orientation of skin or labels."""
+        """Sentences for the user about a wrong unit, another skin, and a wrong orientation of the skin or of labels."""
         if not self.zeroed:
             return []
         usual_uT = float(np.median(np.linalg.norm(self.noload_uT.reshape(-1, 3), axis=1)))
@@ -562,9 +566,22 @@ class Universal:
                 f"the no-load field is weaker than the earth's field: {usual_uT:.3g} uT at most chips. Pass readings "
                 "in uT (convert mT or G), from which the no-load reading is not subtracted."
             ]
+        found = self.mounting.warnings(turnable=self.turnable)
+        if self._saved_uT is not None:
+            changed = float(np.linalg.norm(self.noload_uT - self._saved_uT) / np.linalg.norm(self._saved_uT))
+            if changed > OTHER_SKIN_MIN:
+                found.append(
+                    f"the no-load field differs by {changed:.0%} from that of the saved calibration. If this is "
+                    "another skin, load its own calibration, or calibrate it from scratch."
+                )
         frame = self.label_frame
         of_labels = None if frame is None else frame.warning()
-        return [*self.mounting.warnings(turnable=self.turnable), *([of_labels] if of_labels else [])]
+        return [*found, *([of_labels] if of_labels else [])]
+
+    @property
+    def reach_mm(self) -> Float[np.ndarray, "2 2"]:
+        """Edges of the skin, in the coordinates of places; rows: least and largest x and y."""
+        return self._centre_mm + self.layout.reach_mm
 
     @property
     def presses_n(self) -> int:
@@ -645,6 +662,7 @@ class Universal:
         noload_uT = noload_uT.mean(axis=0)
         rest_uT = self.layout.to_board(noload_uT[None])[0]
         self._turned_given = turned is not None or (kept and self._turned_given)
+        self._saved_uT = self._saved_uT if kept else None
         if turned is None:
             found = self.turnable and find_mounting(self.tables, rest_uT).turned
             turned = self._data.turned if bound else found
@@ -709,7 +727,7 @@ class Universal:
             np.asarray(place_mm, float),
             np.asarray(force_N, float),
             len(readings_uT),
-            self._centre_mm + self.layout.reach_mm,
+            self.reach_mm,
         )
         check_range(forces_N, self.tables.force_N)
         db_uT, before = self._check_change("label", readings_uT), self._data.labels
@@ -784,6 +802,7 @@ class Universal:
             rule = f"false, because a quarter turn does not reverse the fields of skin {self.layout.name}"
             raise SchemaError(file, "turned", rule, "true", "Calibrate the skin again.")
         self._noload_uT = (-1 if data.turned else 1) * self.layout.to_chips(data.rest_uT[None])[0]
+        self._saved_uT = self._noload_uT
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data.next_day() if new_day else data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:

@@ -266,6 +266,16 @@ def test_saved_skin_has_equal_estimates_and_follows_drift(skin, tmp_path):
     assert again.zero(drifted_uT).presses_n == 0
 
 
+def test_calibration_of_another_skin_is_reported(skin, tmp_path):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    other_uT = np.roll(rest_uT.reshape(-1, 3), 1, axis=0).reshape(1, -1)
+    skin.zero(rest_uT).see(pokes(skin) + rest_uT).save(tmp_path / "s0.safetensors")
+    loaded = load_universal(tmp_path / "s0.safetensors")
+    assert loaded.warnings == loaded.zero(1.05 * rest_uT, keep=True).warnings == []
+    assert any("from that of the saved calibration" in text for text in loaded.zero(other_uT, keep=True).warnings)
+    assert not any("saved calibration" in text for text in loaded.zero(other_uT).warnings)  # nothing was kept
+
+
 def test_adaptation_keeps_labels_on_request(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
