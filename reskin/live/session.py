@@ -474,11 +474,13 @@ class Session:
             return
         if not isinstance(label, dict):
             raise ParamsError("label: the place and the force are missing. Enter x and y in mm.")
-        x_mm = _number(label.get("x_mm"), "x", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
-        y_mm = _number(label.get("y_mm"), "y", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
+        estimator, learn = self.skin.estimator, False
+        limits_mm = np.array([[-PLACE_MAX_MM] * 2, [PLACE_MAX_MM] * 2])
+        if label.get("learn") is True and isinstance(estimator, UniversalEstimator):
+            learn, limits_mm = True, estimator.model.reach_mm  # the place must be on the skin
+        x_mm, y_mm = (_number(label.get(f"{axis}_mm"), axis, *limits_mm[:, i], "mm") for i, axis in enumerate("xy"))
         force_N = label.get("force_N")
         force_N = math.nan if force_N is None else _number(force_N, "the force", 0.0, FORCE_MAX_N, "N")
-        learn = label.get("learn") is True and isinstance(self.skin.estimator, UniversalEstimator)
         if not learn and self._recording is None:
             raise ParamsError("label: nothing would use it. Start a recording, or select that the model learns it.")
         if self._presses is not None:
