@@ -189,6 +189,12 @@ def record(
         raise typer.Exit(2)
 
 
+def _announce_simulation(source: str) -> None:
+    """Print on stderr that the program simulates a board, during which nothing else happens for some seconds."""
+    if source == "nominal" or Path(source).is_file():
+        typer.echo("simulating the board; the first time, the simulation is also compiled: please wait", err=True)
+
+
 @app.command(rich_help_panel=BOARD)
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
@@ -204,6 +210,7 @@ def emulate(
     from reskin.live.emulator import TouchPrinter, inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
+    _announce_simulation(source)
     script = read_script(source)
     for spec in faults:
         script = inject(script, spec)
@@ -260,6 +267,7 @@ def live(
     with ExitStack() as stack:
         description, emulated = "a board", None
         if source := replay or emulate:
+            _announce_simulation(source)
             script = read_script(source)
             emulated = stack.enter_context(playing(script))
             port, description = [emulated.port], f"{script.source}: {source}, played"

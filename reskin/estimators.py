@@ -294,15 +294,16 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         ParamsError
             If `noload_uT` is missing, or `spread` is none of the three values.
         SchemaError
-            If the number of channels is not that of the board, only one of x_mm and y_mm is known, or a label or a
-            field is out of range (see `reskin.universal.model.Universal.label`).
+            If the number of channels is not that of the board, X has readings instead of changes, only one of x_mm and
+            y_mm is known, or a label or a field is out of range (see `reskin.universal.model.Universal.label`).
 
         Warns
         -----
         UserWarning
             If the orientation of the skin or of the labels' axes is uncertain or wrong (`model_.warnings`).
         """
-        from reskin.universal.model import FILE, load_universal  # imported late, because it imports Numba
+        from reskin.universal.calibration import check_is_change  # imported late, because it imports Numba
+        from reskin.universal.model import FILE, load_universal
 
         if self.noload_uT is None:
             raise ParamsError("UniversalRegressor: noload_uT is missing. Pass fields of the untouched skin.")
@@ -318,7 +319,12 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
             row_i = int(half_known.argmax())
             raise SchemaError(f"UniversalRegressor: row {row_i} of y has only one of x_mm and y_mm. Give both or none.")
         model = load_universal(file=FILE if self.file is None else Path(self.file), external_uT=self.external_uT)
-        b_uT = db_uT + model.zero(np.asarray(self.noload_uT, float)).noload_uT
+        if db_uT.shape[1] != model.channels_n:
+            needed = f"This model needs {model.channels_n}: Bx, By, Bz of each chip"
+            raise SchemaError(f"UniversalRegressor: X has {db_uT.shape[1]} columns. {needed}.")
+        noload_uT = model.zero(np.asarray(self.noload_uT, float)).noload_uT
+        check_is_change("UniversalRegressor", db_uT, noload_uT)
+        b_uT = db_uT + noload_uT
         if not placed.all():
             model.see(b_uT[~placed], even=self.spread == "even", area=self.spread == "area")
         if (rows := placed & weighed).any():

@@ -223,3 +223,9 @@ def test_universal_regressor_refuses_wrong_data(pressed):
     ):  # fmt: skip
         with pytest.raises(ReskinError, match=message):
             regressor.fit(X, changed)
+    for wrong, message in (
+        (X[:, :12], "X has 12 columns. This model needs 15"),
+        (X + noload_uT, "like readings. Pass"),
+    ):
+        with pytest.raises(SchemaError, match=message):
+            reskin.UniversalRegressor(noload_uT).fit(wrong, y)

@@ -390,7 +390,7 @@ class Session:
             "alarms": [alarm for alarm in (self._error, *skin.alarms()) if alarm not in ("", WAITING)],
             "recording": f"{recording.folder} {skin.reader.writer_problem}".strip() if recording else "",
             "recorded": self._recorded,
-            "labelling": "" if press is None else f"press {_place(press.label)}. {press.problem}".strip(),
+            "labelling": "" if press is None else _waiting_for(press),
             "label_mm": None if press is None else [press.label.x_mm, press.label.y_mm],
             "labelled": self._labelled,
             "skins": self._skins.names(), "skins_folder": str(self._skins.folder),
@@ -474,11 +474,15 @@ class Session:
             return
         if not isinstance(label, dict):
             raise ParamsError("label: the place and the force are missing. Enter x and y in mm.")
-        x_mm = _number(label.get("x_mm"), "x", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
-        y_mm = _number(label.get("y_mm"), "y", -PLACE_MAX_MM, PLACE_MAX_MM, "mm")
+        estimator, learn = self.skin.estimator, False
+        limits_mm = np.array([[-PLACE_MAX_MM] * 2, [PLACE_MAX_MM] * 2])
+        if label.get("learn") is True and isinstance(estimator, UniversalEstimator):
+            learn, limits_mm = True, estimator.model.reach_mm  # the place must be on the skin
+        least_mm, most_mm = limits_mm
+        x_mm = _number(label.get("x_mm"), "x", least_mm[0], most_mm[0], "mm")
+        y_mm = _number(label.get("y_mm"), "y", least_mm[1], most_mm[1], "mm")
         force_N = label.get("force_N")
         force_N = math.nan if force_N is None else _number(force_N, "the force", 0.0, FORCE_MAX_N, "N")
-        learn = label.get("learn") is True and isinstance(self.skin.estimator, UniversalEstimator)
         if not learn and self._recording is None:
             raise ParamsError("label: nothing would use it. Start a recording, or select that the model learns it.")
         if self._presses is not None:
@@ -503,6 +507,10 @@ class Session:
                 self._recorded = recording.end()
             except OSError as error:
                 self._recorded = f"cannot close {recording.folder}.part: {error.strerror}"
+
+
+def _waiting_for(press: LabelledPress) -> str:
+    return f"press {_place(press.label)}. {press.problem[:1].upper()}{press.problem[1:]}".strip()
 
 
 def _place(label: Label) -> str:

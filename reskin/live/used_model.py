@@ -93,10 +93,10 @@ def _expected_of_universal(model: Universal) -> str:
     if not fitting:
         return f"{NOT_MEASURED} for so few presses"
     best = fitting[-1]
-    calibration = f"{best.presses_n} presses and {best.labels_n} labels" if best.presses_n else "no calibration"
+    when = f"after {best.presses_n} presses and {best.labels_n} labels" if best.presses_n else "before calibration"
     accuracy, error = _join(best.accuracy_pct, ".0f"), _join(best.median_mm, ".1f")
     boards = f"{len(best.accuracy_pct)} {measured.source} boards of scene {measured.scene}"
-    text = f"median error {error} mm, {accuracy} % within 1 mm ({boards}, after {calibration})"
+    text = f"median error {error} mm, {accuracy} % within 1 mm ({boards}, {when})"
     return text if not model.external_uT else f"{text}; {NOT_MEASURED} with external fields"
 
 

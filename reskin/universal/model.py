@@ -26,11 +26,13 @@ from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.physics import external
 from reskin.physics.magnet import cubes_along
+from reskin.recordings.units import WEAKEST_uT
 from reskin.universal import network
 from reskin.universal.calibration import (
     CalibrationData,
     LabelledPresses,
     LikelihoodPowers,
+    check_is_reading,
     check_labels,
     check_number,
     check_presses,
@@ -81,6 +83,9 @@ SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks'
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+# If the no-load field differs from that of the saved calibration by more than this fraction, a warning says that this
+# may be another skin. In scene lab, recordings of one board differ by at most 5 %, those of the two boards by 65 %.
+OTHER_SKIN_MIN = 0.25
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 # With external fields, the errors of map and networks are more strongly correlated. The power is divided by 1 +
 # external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Chosen so that intervals on simulated skins cover 90 %.
@@ -458,6 +463,7 @@ class Universal:
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
         self._turned_given = False  # whether the user stated the orientation of the skin
+        self._saved_uT: Float[np.ndarray, " ch"] | None = None  # no-load reading in the file of a saved calibration
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
@@ -556,12 +562,31 @@ class Universal:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences for the user if the orientation of the skin or of the labels' axes is uncertain or wrong."""
+        """Sentences for the user about a wrong unit, another skin, and a wrong orientation of the skin or of labels."""
         if not self.zeroed:
             return []
+        usual_uT = float(np.median(np.linalg.norm(self.noload_uT.reshape(-1, 3), axis=1)))
+        if usual_uT < WEAKEST_uT:
+            return [
+                f"the no-load field is weaker than the earth's field: {usual_uT:.3g} uT at most chips. Pass readings "
+                "in uT (convert mT or G), from which the no-load reading is not subtracted."
+            ]
+        found = self.mounting.warnings(turnable=self.turnable)
+        if self._saved_uT is not None:
+            changed = float(np.linalg.norm(self.noload_uT - self._saved_uT) / np.linalg.norm(self._saved_uT))
+            if changed > OTHER_SKIN_MIN:
+                found.append(
+                    f"the no-load field differs by {changed:.0%} from that of the saved calibration. If this is "
+                    "another skin, load its own calibration, or calibrate it from scratch."
+                )
         frame = self.label_frame
         of_labels = None if frame is None else frame.warning()
-        return [*self.mounting.warnings(turnable=self.turnable), *([of_labels] if of_labels else [])]
+        return [*found, *([of_labels] if of_labels else [])]
+
+    @property
+    def reach_mm(self) -> Float[np.ndarray, "2 2"]:
+        """Edges of the skin, in the coordinates of places; rows: least and largest x and y."""
+        return self._centre_mm + self.layout.reach_mm
 
     @property
     def presses_n(self) -> int:
@@ -642,6 +667,7 @@ class Universal:
         noload_uT = noload_uT.mean(axis=0)
         rest_uT = self.layout.to_board(noload_uT[None])[0]
         self._turned_given = turned is not None or (kept and self._turned_given)
+        self._saved_uT = self._saved_uT if kept else None
         if turned is None:
             found = self.turnable and find_mounting(self.tables, rest_uT).turned
             turned = self._data.turned if bound else found
@@ -652,6 +678,7 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
+        The readings are fields as the board sends them, not field changes: the no-load reading is subtracted here.
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
         expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
         presses together are evenly spread over the skin (for example a grid with one press per place), so that their
@@ -660,7 +687,7 @@ class Universal:
         """
         if even and area:
             raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
-        db_uT, data = check_presses(self._change(check_readings(b_uT, self.channels_n))), self._data
+        db_uT, data = self._check_change("see", check_readings(b_uT, self.channels_n)), self._data
         if not len(db_uT):
             return self
         presses_uT, none = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:], no_presses(self.channels_n)
@@ -705,10 +732,10 @@ class Universal:
             np.asarray(place_mm, float),
             np.asarray(force_N, float),
             len(readings_uT),
-            self._centre_mm + self.layout.reach_mm,
+            self.reach_mm,
         )
         check_range(forces_N, self.tables.force_N)
-        db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
+        db_uT, before = self._check_change("label", readings_uT), self._data.labels
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
@@ -801,6 +828,7 @@ class Universal:
             rule = f"false, because a quarter turn does not reverse the fields of skin {self.layout.name}"
             raise SchemaError(file, "turned", rule, "true", "Calibrate the skin again.")
         self._noload_uT = (-1 if data.turned else 1) * self.layout.to_chips(data.rest_uT[None])[0]
+        self._saved_uT = self._noload_uT
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data.next_day() if new_day else data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
@@ -814,6 +842,12 @@ class Universal:
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return field changes along the board's axes; raise SchemaError before `zero`."""
         return self._sign * self.layout.to_board(check_shape(b_uT, self.channels_n) - self.noload_uT)
+
+    def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
+        """Return the field changes of presses; raise SchemaError if the readings are in mT or are field changes."""
+        db_uT = check_presses(self._change(b_uT))
+        check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
+        return db_uT
 
     @property
     def _sign(self) -> int:

@@ -102,7 +102,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         assert "nothing to undo" in said(session, {"press": "undo"})
         assert not folder.exists()
         before = session.skin.estimator(db_uT).target
-        assert session.state()["expected"].endswith("after no calibration)")
+        assert session.state()["expected"].endswith("before calibration)")
         receive(session, '{"press": "adapt"}')
         reader.resume()
         until(lambda: session.state()["adapted"].startswith(f"adapted to {PRESSES_N} presses"), session)
@@ -128,6 +128,8 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         assert "s3.safetensors" in said(session, {"load": "s3"})
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
         assert "loaded" in said(session, {"load": "s1"})
+        off_skin = {"label": {"x_mm": 1, "y_mm": 99, "force_N": 1, "learn": True}}
+        assert "y must be a number above -2 and below 18 mm; got 99" in said(session, off_skin, "labelled")
         # 0.02 mm and N: the file holds the presses of the same readings in single precision
         np.testing.assert_allclose(session.skin.estimator(db_uT).target, adapted, atol=0.02)
         state = session.state()

@@ -110,8 +110,24 @@ def test_fields_in_mT_are_refused(skin):
         with pytest.raises(SchemaError, match=rule):
             calibrate(read_mT)
     assert skin.presses_n == 0
+    assert "no-load field is weaker than the earth's" in skin.warnings[0]
+    assert skin.zero(rest_uT).warnings == []
     lightest_uT = pokes(skin, 0)[:1]
     assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # a single light touch is accepted
+
+
+def test_field_changes_instead_of_readings_are_refused(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    changes_uT = pokes(skin.zero(rest_uT))
+    places = (PLACES_MM, np.ones(len(PLACES_MM)))
+    for name, calibrate in (("see", skin.see), ("label", lambda b_uT: skin.label(*places, b_uT))):
+        with pytest.raises(SchemaError, match=f"{name}: .* like field changes. Pass readings"):
+            calibrate(changes_uT)
+    assert skin.presses_n == 0
+    skin.see(changes_uT + rest_uT)
+    skin.zero(np.zeros(CHANNELS_N)[None]).see(
+        changes_uT
+    )  # readings of a board that subtracts the no-load reading itself
 
 
 @pytest.mark.parametrize(
@@ -250,6 +266,16 @@ def test_saved_skin_has_equal_estimates_and_follows_drift(skin, tmp_path):
     assert again.zero(drifted_uT).presses_n == 0
 
 
+def test_calibration_of_another_skin_is_reported(skin, tmp_path):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    other_uT = np.roll(rest_uT.reshape(-1, 3), 1, axis=0).reshape(1, -1)
+    skin.zero(rest_uT).see(pokes(skin) + rest_uT).save(tmp_path / "s0.safetensors")
+    loaded = load_universal(tmp_path / "s0.safetensors")
+    assert loaded.warnings == loaded.zero(1.05 * rest_uT, keep=True).warnings == []
+    assert any("from that of the saved calibration" in text for text in loaded.zero(other_uT, keep=True).warnings)
+    assert not any("saved calibration" in text for text in loaded.zero(other_uT).warnings)  # nothing was kept
+
+
 def test_adaptation_keeps_labels_on_request(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
@@ -259,7 +285,7 @@ def test_adaptation_keeps_labels_on_request(skin):
     np.testing.assert_allclose(in_turn, at_once, rtol=1e-6)
     assert skin.presses_n == 4
     with pytest.raises(SchemaError, match="2003 are too many, at most 2000"):
-        skin.label(np.full((1999, 2), 8.0), np.ones(1999), np.ones((1999, CHANNELS_N)), keep=True)
+        skin.label(np.full((1999, 2), 8.0), np.ones(1999), rest_uT + np.full((1999, 1), 9.0), keep=True)
     assert skin.presses_n == 4
     assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
 

@@ -85,7 +85,7 @@ class Board {
   show(next) {
     const state = this.state = next;
     this.say("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
-    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "The positions of its chips are unknown; they are drawn in a row."}`);
+    this.say("about", state.waiting ? "" : `${state.board.replaceAll("uT", "µT")}. ${state.places_known ? "" : "The positions of its chips are unknown; they are drawn in a row."}`);
     this.say("model", state.model || "none, so no place or force; to load one, use --model");
     this.say("expected", state.expected || "–"); this.say("least_force", state.least_force || "–"); this.say("learnt", state.learnt || "nothing yet");
     this.parts.emulated.hidden = !state.true_places;
@@ -104,7 +104,7 @@ class Board {
       this.parts[name].disabled = state.waiting || !state.adaptable || Boolean(state.adapting) && name !== this.chosen(state);
       this.parts[name].classList.toggle("on", Boolean(state.adapting) && name === this.chosen(state));
     }
-    this.say("adapting", state.adapting || state.adapted || "–");
+    this.say("adapting", state.adapting || state.adapted || "–"); this.say("skin_said", state.adapted || ""); // near the buttons, too
     this.parts.record.classList.toggle("on", Boolean(state.recording));
     this.parts.record.firstChild.textContent = state.recording ? "Stop " : "Record ";
     this.say("recording", state.recording ? `${state.recording}; labelled presses: ${state.recording_n}` : state.recorded || "–");
@@ -154,7 +154,7 @@ class Board {
     const more = this.traces.map((trace, i) => trace.draw(this.rows, this.changed, i ? last.chips : 1, state.zero_bins));
     this.changed = Infinity; this.dirty = more.includes(true);
     this.parts.truth_key.hidden = !this.truthShown();
-    this.say("off", this.truthShown() ? this.truthText() : "(this board is emulated, so the true place is known)");
+    this.say("off", this.truthShown() ? this.truthText() : "(this board is emulated, so the true place is known; its touches do not follow the crosses of Places)");
     const sure = (sd) => Number.isNaN(sd) ? "" : ` ± ${sd.toFixed(1)}`, among = Number.isNaN(last.sdX) || state.adaptable ? "" : " between models";
     this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${last.x.toFixed(1)}${sure(last.sdX)}, y ${last.y.toFixed(1)}${sure(last.sdY)} mm${among}` : last.contact ? "contact" : "no contact");
     this.say("force", number(last.force, 2, "N"));
