@@ -115,7 +115,7 @@ class TwoDays:
     def score(self, change: str, n: int, way: str) -> Score:
         data, last = self.new_data(change, n), self.first if way == BY_DAY else None
         if way == TOGETHER:
-            data = data.same_slide(self.first_data)
+            data = data.joined_to(self.first_data)
         calibration = calibrate_day(self.rest_map, self.networks, data, last)
         tested = presses(self.skin, self.skin.later_uT[change], TESTED)
         (estimate,) = calibration.with_labels(calibration.data.labels).estimate(tested.db_uT, [1.0])
