@@ -304,3 +304,5 @@ def test_commands_begin_a_day(first_day):
     assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
     with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):
         read_models([], new_day=True)
+    with pytest.raises(ParamsError, match="later.safetensors: model file not found"):
+        read_models([file.with_name("later.safetensors")], new_day=True)
