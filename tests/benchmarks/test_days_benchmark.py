@@ -188,7 +188,10 @@ def test_accuracy_on_a_later_day():
             gain = of_ways[:, 2, i] - of_ways[:, better, i]
             gains.append(f"{gain.mean():+.2f} ± {gain.std() / np.sqrt(len(gain)):.2f}")
         print(f"| {change} | {labels_n} | {n} | {' | '.join(cells)} | {' / '.join(gains)} |")
-    assert np.isfinite(list(scores.values())).all()
+    for (change, labels_n, _), of_skins in scores.items():
+        if change == CHANGED and labels_n:
+            together, alone, by_day = np.mean(of_skins, axis=0)[:, 0]
+            assert by_day > max(together, alone)
 
 
 @FULL_ONLY
@@ -223,6 +226,9 @@ def test_coverage_and_force_on_a_later_day(tmp_path):
         place, force, square = np.mean(of_skins, axis=0)
         cells = " | ".join(str(cell) for cell in row)
         print(f"| {cells} | {100 * place:.0f} | {100 * force:.0f} | {np.exp(np.sqrt(square)):.2f} |")
+    for change, labels_n in product((CHANGED, OTHER_ERRORS), LABELS_N):
+        together, by_day = (np.mean(scores[change, labels_n, way], axis=0)[0] for way in (TOGETHER, BY_DAY))
+        assert abs(by_day - 0.9) < abs(together - 0.9)
 
 
 def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
@@ -266,3 +272,5 @@ def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
     for labels_n, n in product(LABELS_N, RECORDED_PRESSES_N):
         means = [np.mean(scores[labels_n, n, way], axis=0) for way in WAYS]
         print(f"| {labels_n} | {n} | {' | '.join(f'{within:.1f} / {mse:.2f}' for within, mse in means)} |")
+        if labels_n:  # the labels of the other depth help
+            assert means[WAYS.index(BY_DAY)][0] > means[WAYS.index(ALONE)][0]
