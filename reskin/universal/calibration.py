@@ -73,7 +73,8 @@ def check_labels(
 def check_number(labels_n: int) -> None:
     """Raise SchemaError if there are more than LABELS_MAX_N labels."""
     if labels_n > LABELS_MAX_N:
-        raise SchemaError(f"labels: {labels_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
+        rule = f"at most {LABELS_MAX_N} can be used, those of earlier days included"
+        raise SchemaError(f"labels: {labels_n} are too many, {rule}. Select some of them.")
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
