@@ -129,7 +129,7 @@ def read_models(
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
-    if new_day and not calibrations:
+    if new_day and not calibrations and all(file.exists() for file in files):
         raise ParamsError("--new-day: there is no calibration of an earlier day. Pass one with --model.")
     if not (made or calibrations):
         if files and external_uT:

@@ -100,7 +100,11 @@ class MovingHand(Strict):
     presses: Compare  # orientation of the boards with presses, and their skin
 
     @model_validator(mode="after")
-    def _check_names(self) -> "MovingHand":
+    def _check(self) -> "MovingHand":
+        if sorted(self.pad_chips) != list(range(leaphand.CHIPS_N)):
+            raise ValueError(f"pad_chips must contain each of 0 to {leaphand.CHIPS_N - 1} once")
+        if self.magnet_mm[0] > self.magnet_mm[1]:
+            raise ValueError("magnet_mm must be the least distance, then the largest one")
         names = [NO_FIELD, *(group.name for group in self.groups)]
         if len(set(names)) < len(names):
             raise ValueError(f"groups must have different names, other than {NO_FIELD}")

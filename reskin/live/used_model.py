@@ -88,6 +88,8 @@ def _expected_of_universal(model: Universal) -> str:
     measured = _measured_of(model)
     if measured is None:
         return f"{NOT_MEASURED} for this model"
+    if model.slide is not None:
+        return f"{NOT_MEASURED} after a calibration on an earlier day"
     own_n = model.presses_n - model.labels_n, model.labels_n
     fitting = [each for each in measured.places if each.presses_n <= own_n[0] and each.labels_n <= own_n[1]]
     if not fitting:

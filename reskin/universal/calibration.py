@@ -73,7 +73,8 @@ def check_labels(
 def check_number(labels_n: int) -> None:
     """Raise SchemaError if there are more than LABELS_MAX_N labels."""
     if labels_n > LABELS_MAX_N:
-        raise SchemaError(f"labels: {labels_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
+        rule = f"at most {LABELS_MAX_N} can be used, those of earlier days included"
+        raise SchemaError(f"labels: {labels_n} are too many, {rule}. Select some of them.")
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
@@ -133,7 +134,7 @@ EARLIER_DAY = "earlier_{}_"  # how names of arrays begin that are of earlier day
 DAYS_MAX_N = 5  # a saved skin has at most this number of days
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
-FILE_BYTES_MAX_N = 2**23  # a full set of presses and labels on a board with 64 chips takes 3.5 MB
+FILE_BYTES_MAX_N = 2**23  # five full days with all labels on a board with 64 chips take 4.1 MB
 REMEDY = "Use a file that `save` wrote."
 BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in the file; name that files without the key have
 
@@ -210,6 +211,11 @@ class CalibrationData:
         """Number of presses on all days, labelled or not."""
         return len(self.presses_uT) + len(self.labels) + sum(day.presses_n for day in self.earlier)
 
+    @property
+    def labels_n(self) -> int:
+        """Number of labelled presses on all days."""
+        return len(self.labels) + sum(day.labels_n for day in self.earlier)
+
     def next_day(self) -> "CalibrationData":
         """Return the data at the beginning of another day: a day with presses becomes the last of the earlier days.
 
@@ -220,8 +226,8 @@ class CalibrationData:
         data = CalibrationData.at_rest(self.rest_uT)
         return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
 
-    def same_slide(self, last: "CalibrationData") -> "CalibrationData":
-        """Join the presses with those of the last day, on which the skin slid in the same way.
+    def joined_to(self, last: "CalibrationData") -> "CalibrationData":
+        """Return the data with the presses of the last day, on which the skin slid in the same way, before its own.
 
         As on a single day, presses that are all over the area are then used only if no others were made after them.
         """
@@ -284,15 +290,18 @@ def read_calibration(
     if turned not in ("true", "false"):
         raise SchemaError(file, "turned", "true or false", turned, REMEDY)
     earlier: list[CalibrationData] = []
-    while names := [name for name in tensors if name.startswith(prefix := EARLIER_DAY.format(len(earlier)))]:
-        arrays = {name.removeprefix(prefix): tensors.pop(name) for name in names}
+    while arrays := _take_day(tensors, EARLIER_DAY.format(len(earlier))):
         earlier.append(replace(_read_day(file, arrays, reach_mm, channels_n), turned=turned == "true"))
     data = replace(_read_day(file, tensors, reach_mm, channels_n), turned=turned == "true", earlier=tuple(earlier))
-    labels_n = sum(len(day.labels) for day in (data, *earlier))
-    if len(earlier) >= DAYS_MAX_N or labels_n > LABELS_MAX_N:
-        rule, got = f"at most {DAYS_MAX_N} days with {LABELS_MAX_N} labels", f"{len(earlier) + 1} with {labels_n}"
+    if len(earlier) >= DAYS_MAX_N or data.labels_n > LABELS_MAX_N:
+        rule, got = f"at most {DAYS_MAX_N} days with {LABELS_MAX_N} labels", f"{len(earlier) + 1} with {data.labels_n}"
         raise SchemaError(file, "days", rule, got, REMEDY)
     return data
+
+
+def _take_day(tensors: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """Remove the arrays whose names begin with a prefix, and return them under the rest of their names."""
+    return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
 
 def _read_day(

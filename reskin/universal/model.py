@@ -366,7 +366,7 @@ def join_day(
     data: CalibrationData, last: PressCalibration | None, *, same: bool
 ) -> tuple[CalibrationData, PressCalibration | None]:
     """Return the data since the last change of the slide, and the calibration to the days before this change."""
-    return (data.same_slide(last.data), last.earlier) if same and last is not None else (data, last)
+    return (data.joined_to(last.data), last.earlier) if same and last is not None else (data, last)
 
 
 def start_day(noload_map: SkinMap, earlier: PressCalibration | None) -> SkinMap:
@@ -551,14 +551,17 @@ class Universal:
 
     @property
     def label_frame(self) -> LabelFrame | None:
-        """Most probable orientation of the labels' axes other than the given one; None if there are few labels."""
-        data = self._calibration.data
-        labels = data.labels
+        """Most probable orientation of the axes of the current day's labels other than the given one.
+
+        None if there are few labels on the current day. Labels of earlier days are taken as right.
+        """
+        labels, data = self._data.labels, self._calibration.data
         if len(labels) < LABELS_MIN_N:
             return None
-        power = self.powers.power_for(len(data.presses_uT), 0, even=len(data.even_uT) > 0)
-        unlabelled = self._calibration.with_labels(labels[:0])
-        return find_label_frame(unlabelled.estimate(labels.db_uT, [power])[0], labels.place_mm)
+        earlier = data.labels[: len(data.labels) - len(labels)]  # if the slide is the same; the current labels are last
+        power = self.powers.power_for(len(data.presses_uT), len(earlier), even=len(data.even_uT) > 0)
+        without_current = self._calibration.with_labels(earlier)
+        return find_label_frame(without_current.estimate(labels.db_uT, [power])[0], labels.place_mm)
 
     @property
     def warnings(self) -> list[str]:
@@ -602,8 +605,8 @@ class Universal:
 
     @property
     def labels_n(self) -> int:
-        """Number of labelled presses that the model is calibrated to."""
-        return len(self._data.labels)
+        """Number of labelled presses that the model is calibrated to, on all days."""
+        return self._data.labels_n
 
     @property
     def misfit(self) -> float:
@@ -739,8 +742,9 @@ class Universal:
         labels = LabelledPresses(places_mm - self._centre_mm, forces_N, db_uT, np.full(len(forces_N), known))
         if keep:
             labels = join_labels(before, labels)
-        check_number(len(labels) + sum(len(day.labels) for day in self._data.earlier))
-        data, label_odds = replace(self._data, labels=labels), self._log_odds(labels.db_uT)
+        data = replace(self._data, labels=labels)
+        check_number(data.labels_n)
+        label_odds = self._log_odds(labels.db_uT)
         if self._decide(self._press_odds, label_odds) != self._same_slide:
             return self._begin(data)
         self._label_odds, press_map = label_odds, self._calibration.skin

@@ -10,11 +10,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
+from pathlib import Path
 
 import numpy as np
 import pytest
 from jaxtyping import Float
 
+from reskin.data.grid import CENTRE_MM
+from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
 from reskin.universal import map, model
 from reskin.universal.batches import ERROR_OF_NOMINAL, NOISE_uT, add_error
@@ -24,7 +27,7 @@ from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, SLIDE, condition_on_n
 from reskin.universal.model import calibrate_day, load_universal
 from reskin.universal.population import PLACES_N, THICKNESSES, TIPS, draw_law, draw_skin
 from tests.benchmarks import FULL, size
-from tests.benchmarks.test_moving_benchmark import boards
+from tests.recordings.test_recordings import ingest
 from tests.universal.skins import SETUP
 
 CHOICE_SEED, SEED = 1, 2
@@ -115,7 +118,7 @@ class TwoDays:
     def score(self, change: str, n: int, way: str) -> Score:
         data, last = self.new_data(change, n), self.first if way == BY_DAY else None
         if way == TOGETHER:
-            data = data.same_slide(self.first_data)
+            data = data.joined_to(self.first_data)
         calibration = calibrate_day(self.rest_map, self.networks, data, last)
         tested = presses(self.skin, self.skin.later_uT[change], TESTED)
         (estimate,) = calibration.with_labels(calibration.data.labels).estimate(tested.db_uT, [1.0])
@@ -185,7 +188,10 @@ def test_accuracy_on_a_later_day():
             gain = of_ways[:, 2, i] - of_ways[:, better, i]
             gains.append(f"{gain.mean():+.2f} ± {gain.std() / np.sqrt(len(gain)):.2f}")
         print(f"| {change} | {labels_n} | {n} | {' | '.join(cells)} | {' / '.join(gains)} |")
-    assert np.isfinite(list(scores.values())).all()
+    for (change, labels_n, _), of_skins in scores.items():
+        if change == CHANGED and labels_n:
+            together, alone, by_day = np.mean(of_skins, axis=0)[:, 0]
+            assert by_day > max(together, alone)
 
 
 @FULL_ONLY
@@ -220,6 +226,18 @@ def test_coverage_and_force_on_a_later_day(tmp_path):
         place, force, square = np.mean(of_skins, axis=0)
         cells = " | ".join(str(cell) for cell in row)
         print(f"| {cells} | {100 * place:.0f} | {100 * force:.0f} | {np.exp(np.sqrt(square)):.2f} |")
+    for change, labels_n in product((CHANGED, OTHER_ERRORS), LABELS_N):
+        together, by_day = (np.mean(scores[change, labels_n, way], axis=0)[0] for way in (TOGETHER, BY_DAY))
+        assert abs(by_day - 0.9) < abs(together - 0.9)
+
+
+def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
+    """Return the no-load field and the means of all presses of one depth, along the board's axes and in its frame."""
+    rows, _ = ingest(lab, file, folder)
+    place_mm = np.column_stack([rows.x_mm - CENTRE_MM, CENTRE_MM - rows.y_mm]).astype(float)
+    parts = place_mm, rows.Fz_N.astype(float), to_board(rows.b_uT.astype(float) - rows.noload_uT)
+    means = [part.reshape(PLACES_N, -1, *part.shape[1:]).mean(axis=1) for part in parts]
+    return to_board(rows.noload_uT.mean(axis=0)[None].astype(float))[0], LabelledPresses(*means)
 
 
 @FULL_ONLY
@@ -232,19 +250,18 @@ def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
     """
     scores: dict[tuple[int, int, str], list[Score]] = {}
     odds = []
-    for name, board in boards(shared_data, tmp_path).items():
+    for name in ("board1", "board2"):
         order = rng_for(SEED, "recorded", name).permutation(PLACES_N)
-        own = board.presses
-        db_uT = to_board(own.db_uT).reshape(-1, PLACES_N, own.db_uT.shape[1])[:, order]
-        force_N, place_mm = own.force_N.reshape(-1, PLACES_N)[:, order], own.place_mm[:PLACES_N][order]
-        np.testing.assert_array_equal(own.place_mm.reshape(-1, PLACES_N, 2)[:, order], [place_mm] * len(db_uT))
+        files = [shared_data / "lab" / f"{name}_depth{depth}.csv" for depth in (1, 2, 3)]
+        rests_uT, depths = zip(*(read_depth(file, tmp_path) for file in files), strict=True)
+        depths, place_mm = [presses[order] for presses in depths], depths[0].place_mm[order]
+        np.testing.assert_allclose([presses.place_mm for presses in depths], [place_mm] * len(depths), atol=1e-9)
         new_n = max(RECORDED_PRESSES_N)
         presses_i = np.concatenate([np.arange(PLACES_N), np.arange(PLACES_N - new_n)])  # the last new_n are not tested
-        for first, later in permutations(range(len(db_uT)), 2):
+        for first, later in permutations([presses[presses_i] for presses in depths], 2):
             skin = SkinOnTwoDays(
-                to_board(board.rest_uT[None])[0], place_mm[presses_i], force_N[first][presses_i],
-                db_uT[first][presses_i], {CHANGED: db_uT[later][presses_i]},
-            )  # fmt: skip
+                np.mean(rests_uT, axis=0), first.place_mm, first.force_N, first.db_uT, {CHANGED: later.db_uT}
+            )
             for labels_n in LABELS_N:
                 days = TwoDays(skin, labels_n)
                 odds.append(days.log_odds(CHANGED, new_n))
@@ -255,3 +272,5 @@ def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
     for labels_n, n in product(LABELS_N, RECORDED_PRESSES_N):
         means = [np.mean(scores[labels_n, n, way], axis=0) for way in WAYS]
         print(f"| {labels_n} | {n} | {' | '.join(f'{within:.1f} / {mse:.2f}' for within, mse in means)} |")
+        if labels_n:  # the labels of the other depth help
+            assert means[WAYS.index(BY_DAY)][0] > means[WAYS.index(ALONE)][0]

@@ -13,6 +13,7 @@ from pipeline.settings import read_settings
 from pipeline.stages.ingest import ingest
 from pipeline.training.universal_variants import Frame
 from reskin import io
+from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.logs import CONTACT_SDS, magnitudes_uT
 from reskin.physics import external
@@ -113,6 +114,19 @@ def test_groups_must_name_captures_of_pads():
         hand.pairs_of(group, pads)
     with pytest.raises(ParamsError, match="1 captures in threshold, but 2 in tested"):
         hand.pairs_of(group.model_copy(update={"tested": ("a", "a")}), pads)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"pad_chips": [0, 1, 2, 3, 3]}, "pad_chips must contain each of 0 to 4 once"),
+        ({"magnet_mm": [80.0, 40.0]}, "magnet_mm must be the least distance, then the largest one"),
+        ({"groups": 2 * [SECTION.groups[0].model_dump()]}, "groups must have different names, other than none"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused(change, expected):
+    with pytest.raises(ParamsError, match=expected):
+        parse(MovingHand, SECTION.model_dump(mode="json") | change, "moving_hand")
 
 
 def test_scene_needs_recordings_of_presses():

@@ -310,6 +310,10 @@ def test_described_model_and_its_expected_accuracy(random_pokes, tmp_path):  # n
     assert texts["model"] == "universal model, file s1.safetensors"
     assert texts["learnt"] == "77 presses in the file"
     assert texts["expected"].endswith("after 65 presses and 10 labels)")
+    many.save(tmp_path / "s1.safetensors")
+    later = load_universal(tmp_path / "s1.safetensors", new_day=True)
+    texts = describe(UniversalEstimator(later), later, "s1.safetensors")
+    assert texts["expected"] == "not measured after a calibration on an earlier day"
     outside = load_universal(external_uT=30.0)
     assert describe(UniversalEstimator(outside), outside, "")["expected"].endswith("not measured with external fields")
     other = replace(load_universal(), card={"name": "a model of another board"})

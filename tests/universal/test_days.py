@@ -10,6 +10,13 @@ from reskin.errors import ParamsError, SchemaError
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal import calibration, map
+from reskin.universal.calibration import (
+    CalibrationData,
+    LabelledPresses,
+    is_calibration,
+    read_calibration,
+    write_calibration,
+)
 from reskin.universal.law import to_chips
 from reskin.universal.map import (
     OFFSET_uT,
@@ -21,6 +28,7 @@ from reskin.universal.map import (
     new_map,
 )
 from reskin.universal.model import Slide, Universal, load_universal
+from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import grid
 from tests.universal.skins import REST_SLOPE_uT, make_tables, poked_uT
 
@@ -229,6 +237,54 @@ def test_days_are_limited_and_checked(first_day, monkeypatch):
     assert later.presses_n == 22
 
 
+def test_full_days_of_a_large_board_fit_a_file(tmp_path):
+    channels_n, file = 3 * 64, tmp_path / "full.safetensors"
+    full = CalibrationData.at_rest(np.zeros(channels_n))
+    pressed_uT = np.ones((FULL_SET_N, channels_n))
+    labels_n = calibration.LABELS_MAX_N // calibration.DAYS_MAX_N
+    labels = LabelledPresses(np.zeros((labels_n, 2)), np.ones(labels_n), np.ones((labels_n, channels_n)))
+    full = replace(full, presses_uT=pressed_uT, even_uT=pressed_uT, labels=labels)
+    write_calibration(replace(full, earlier=(calibration.DAYS_MAX_N - 1) * (full,)), file, "large")
+    assert is_calibration(file)
+    again = read_calibration(file, np.array([[-10.0, -10.0], [10.0, 10.0]]), channels_n, "large")
+    assert again.labels_n == calibration.LABELS_MAX_N
+    assert again.presses_n == calibration.LABELS_MAX_N + calibration.DAYS_MAX_N * FULL_SET_N
+
+
+def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
+    """The labels of the first day, whose axes are right, must not hide them."""
+    rest_uT, file = first_day
+    axis_mm = skin.tables.axis_mm[[4, 9, 14, 19]] + 8
+    place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)[[0, 3, 6, 9, 12]]
+    for shift in ({}, OTHER_SLIDE):
+        pressed_uT = pokes(skin, shift)[[0, 3, 6, 9, 12]] + rest_uT
+        later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(pokes(skin, shift) + rest_uT)
+        assert later.label_frame is None  # no label on this day
+        assert later.label(place_mm, None, pressed_uT).label_frame.log_odds < 0
+        assert later.slide.same == (not shift)
+        assert later.label(place_mm * [1, -1] + [0, 16], None, pressed_uT).label_frame.log_odds > 5
+        assert later.label_frame.name == "mirrored in y"
+        assert later.labels_n == 6 + 5
+
+
+@pytest.mark.parametrize("external_uT", [0.0, 30.0])
+def test_days_of_a_turned_skin_equal_those_of_one_that_is_not_turned(skin, tmp_path, external_uT):
+    rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
+    changed_uT, found = pokes(skin, OTHER_SLIDE) + rest_uT, []
+    for turned in (False, True):
+        sign = -1 if turned else 1
+        first = load_universal(external_uT=external_uT).zero(sign * rest_uT, turned=turned)
+        first.see(sign * (pokes(skin) + rest_uT)).label([[4.0, 4.0]], 1.5, sign * (pokes(skin)[0] + rest_uT)).save(file)
+        later = load_universal(file, external_uT=external_uT, new_day=True)
+        later.zero(sign * rest_uT, keep=True).see(sign * changed_uT)
+        assert not later.slide.same
+        found.append((later.slide.log_odds, *vars(later.estimate(sign * changed_uT)).values()))
+        with pytest.raises(SchemaError, match="from a skin in the other orientation"):
+            later.zero(-sign * rest_uT, keep=True, turned=not turned)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_middle_of_the_skin_is_carried_over(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
@@ -248,3 +304,5 @@ def test_commands_begin_a_day(first_day):
     assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
     with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):
         read_models([], new_day=True)
+    with pytest.raises(ParamsError, match="later.safetensors: model file not found"):
+        read_models([file.with_name("later.safetensors")], new_day=True)
