@@ -24,6 +24,7 @@
 The modules behind these names are imported at the first use of a name, so that `import reskin` is quick.
 """
 
+from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -77,9 +78,8 @@ def __getattr__(name: str) -> Any:
     if name in _ESTIMATORS:
         if find_spec("sklearn") is None:
             raise missing_package("scikit-learn", f"reskin.{name}", extra="learn")
-        from reskin import estimators
-
-        return getattr(estimators, name)
+        # A name in a string, so that the training code does not count as an import of every stage (`reskin.code`).
+        return getattr(import_module("reskin.estimators"), name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from reskin import api

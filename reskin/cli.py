@@ -20,7 +20,7 @@ from typer import Argument, Option
 from reskin.errors import ParamsError, ReskinError, explaining
 
 CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
-    "add", "check-cache", "compare", "fetch", "merge", "model", "publish", "readme", "remove", "scenes", "score",
+    "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes", "score",
     "verify-reports",
 )  # fmt: skip
 

@@ -148,7 +148,9 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
     largest_mT = (
         float(np.abs(layout.to_chips(tables.rest_uT + tables.mean_uT.reshape(-1, layout.channels_n))).max()) / 1e3
     )
-    say(f"fields up to {largest_mT:.1f} mT are expected on the nominal skin: your chips must measure twice that")
+    say(
+        f"fields up to {largest_mT:.1f} mT are expected on the nominal skin; the range of your chips must be twice that"
+    )
     say("2 of 3: training the network on simulated skins ...")
     networks = train_networks(inputs.prior, inputs.training, inputs.seed)
     times_s.append(time.process_time())

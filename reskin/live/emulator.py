@@ -403,7 +403,9 @@ def make_port(kind: str) -> EmulatedPort:
         return TcpServer(int(number or 0))
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))
-    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT, or ./NAME of a link to create. Try: pty")
+    raise ParamsError(
+        f"--port: {kind} is none of pty, tcp, tcp:PORT and ./NAME (a link with this name is created). Try: pty"
+    )
 
 
 def play(

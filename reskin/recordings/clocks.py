@@ -103,7 +103,7 @@ AWAY_NOISES = 1.5
 STRETCH_PERIODS_N = 32  # the no-load field is updated once per stretch; a stretch has this many indentations
 START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
 REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
-_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
+_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S (the times of one event on the two clocks)."
 
 # Stream times [f] and fields in uT [f ch]; the axes are not named, because f differs from block to block.
 Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
@@ -114,8 +114,8 @@ class ClockMap:
     """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
     `residual_s` is the largest misfit of the sync marks (or of the windows) to which the line was fitted. `explained`
-    is the fraction of dwell time that agrees with the field (0 on average for a random offset), or 1 if marks were
-    given.
+    tells how well the dwells coincide with contacts in the field: 1 if all of them do, 0 on average for a random
+    offset. It is 1 if marks were given.
     """
 
     offset_s: float

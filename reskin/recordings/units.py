@@ -73,12 +73,12 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
-        rule = f"{FORCE_MIN_N:g} N or more somewhere in contact"
+        rule = f"at least {FORCE_MIN_N:g} N in one or more rows with contact"
         raise CaptureError(where, "force", rule, got, "Convert kg or kN to N, or press the skin.")
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
-    """Raise if places are closer together or farther apart than on a skin, as places in m or um are.
+    """Raise if the spread of the places is too small or too large for a skin: they are probably in m or um, not in mm.
 
     A single place and NaN (unknown) are allowed.
     """

@@ -53,7 +53,7 @@ class Row:
         )
 
 
-def test_error_against_time_of_map_and_network(monkeypatch):
+def test_print_errors_and_times_of_maps_and_networks(monkeypatch):
     design = parse(SkinDesign, nominal("skin"), "skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)

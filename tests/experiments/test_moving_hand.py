@@ -14,8 +14,8 @@ from pipeline.stages.ingest import ingest
 from pipeline.training.universal_variants import Frame
 from reskin import io
 from reskin.config import parse
+from reskin.data.contact import CONTACT_SDS, magnitudes_uT
 from reskin.errors import ParamsError
-from reskin.logs import CONTACT_SDS, magnitudes_uT
 from reskin.physics import external
 from reskin.recordings.header import HEADER_FILE, render
 from reskin.recordings.readers import leaphand

@@ -273,7 +273,7 @@ def feed(press, contact, seconds, rate_hz=100.0):
     feed.t_s = start_s + seconds
     db_uT = np.full((len(t_s), 15), 100.0 * contact, np.float32)
     none = np.zeros((len(t_s), 3))
-    press.add(Estimates(t_s, db_uT, db_uT, none, none[:, :2], np.full(len(t_s), contact)))
+    press.add(Estimates(t_s, db_uT, db_uT, none, none[:, :2], none[:, 2], np.full(len(t_s), contact)))
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ UNITS_LOG = probe.parse(
         ("depth_mm", 1e3, "depth must be .* Convert m or um"),
         ("Fz_N", 102.0, "force must be below 100 N; got 127.5 in line 3. Convert grams"),
         ("Fz_N", 1e3, "force must be below 100 N"),
-        ("Fz_N", 1e-3, "force must be 0.05 N or more somewhere in contact; got 0.0025 at most"),
+        ("Fz_N", 1e-3, "force must be at least 0.05 N in one or more rows with contact; got 0.0025 at most"),
         ("Fz_N", -1.0, "the usual Fz_N in contact must be positive; got -1.875 N. Reverse its sign"),
     ],
 )

@@ -45,7 +45,7 @@ def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
     return to_chips(tables.mean_uT[lattice_i[:, 0], lattice_i[:, 1], force_i])
 
 
-def test_nominal_skin_is_estimated_within_the_lattice(skin):
+def test_estimates_on_the_nominal_skin_are_within_a_step_of_the_lattice(skin):
     tables, rest_uT = skin.tables, to_chips(skin.tables.rest_uT[None])
     found = skin.zero(rest_uT).predict(pokes(skin) + rest_uT)
     lattice_mm = tables.axis_mm[np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)] + 8

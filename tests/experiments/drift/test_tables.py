@@ -86,7 +86,7 @@ def test_note_states_the_time_per_contact():
     assert "The times of the contacts are not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
-def test_note_states_over_what_the_spread_is():
+def test_note_states_what_the_spread_is_taken_over():
     text = to_markdown(tables(numbers(), "simulated")["drift"])
     assert "± is the standard deviation over 2 network seeds, all tested on the same contacts." in text
     text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])

@@ -219,8 +219,9 @@ def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
     )
     states[:, 4] = np.where(states[:, 4] == -1, -1, states[:, 4] / 1000)
     (folder / eflesh.STATES).write_text(lines_of(states.tolist()))
-    assert "force must be 0.05 N or more somewhere in contact; got 0.00981 at most. Convert kg" in error_of(
-        folder, GAUGED
+    assert (
+        "force must be at least 0.05 N in one or more rows with contact; got 0.00981 at most. Convert kg"
+        in error_of(folder, GAUGED)
     )
 
 

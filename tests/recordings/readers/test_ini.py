@@ -223,7 +223,7 @@ def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> 
     [
         (slice(0, 2), 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.008"),
         (slice(0, 2), 1e3, "Convert m or um to mm"),
-        (slice(2, 3), 0.01, "force must be 0.05 N or more somewhere in contact; got 0.015 at most"),
+        (slice(2, 3), 0.01, "force must be at least 0.05 N in one or more rows with contact; got 0.015 at most"),
         (slice(2, 3), 1e3, "Convert grams or mN to N"),
     ],
 )

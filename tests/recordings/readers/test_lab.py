@@ -205,7 +205,7 @@ def scale_column(column: str, factor: float) -> list[str]:
         ("_mm", 1e3, "got 4000. Convert m or um"),
         ("F", 102.0, "force must be below 100 N; got -357 in line 4. Convert grams"),
         ("F", 1e3, "Convert grams or mN to N"),
-        ("F", 1e-3, "force must be 0.05 N or more somewhere in contact; got 0.0035 at most. Convert kg"),
+        ("F", 1e-3, "force must be at least 0.05 N in one or more rows with contact; got 0.0035 at most. Convert kg"),
         ("Fz", -1.0, "the usual Fz in contact must be negative; got 3.5 N. Is compression negative Fz in this file?"),
     ],
 )
