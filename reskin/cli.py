@@ -53,9 +53,9 @@ SCAN = (
 )
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
 FAULT = (
-    "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. Names: failed-read, zeros, chip-reset, stuck, "
-    "slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, "
-    "unplug."
+    "NAME[@START_S[+SECONDS]], such as stuck@8+2; default: 1 s, after 3 s. May be repeated. Names: failed-read, "
+    "zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, "
+    "dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = (
     "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or the last "
