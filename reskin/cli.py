@@ -52,10 +52,14 @@ SCAN = (
     "note, which is written to the header."
 )
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
+SIMULATED = (
+    "Mark the capture as simulated. Needed for a port of `reskin emulate` that sends a simulation: it looks like a "
+    "board."
+)
 FAULT = (
-    "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. Names: failed-read, zeros, chip-reset, stuck, "
-    "slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, "
-    "unplug."
+    "NAME[@START_S[+SECONDS]], such as stuck@8+2; default: 1 s, after 3 s. May be repeated. Names: failed-read, "
+    "zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, "
+    "dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = (
     "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or the last "
@@ -166,12 +170,13 @@ def record(
     dwell_s: Annotated[
         float, Option("--dwell", help="Seconds for which a label is valid after you press Enter.", min=0.1)
     ] = 1.0,
+    simulated: Annotated[bool, Option("--simulated", help=SIMULATED)] = False,
 ) -> None:
     """Record a board, with labels if requested. `reskin add` can add labels from a robot's log later."""
     from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
-    source = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
+    label_of = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
     if port is None:
         if wire is not None or chips_n is not None:
             raise ParamsError(
@@ -183,7 +188,10 @@ def record(
         detected = DetectedBoard(port, None, wire or "binary", chips_n or 5)
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}
-    result = record_board(detected, source, folder=out, seconds=seconds, baud=baud, names=names)
+    result = record_board(
+        detected, label_of, folder=out, seconds=seconds, baud=baud, names=names,
+        source="simulated" if simulated else "recorded",
+    )  # fmt: skip
     typer.echo(result.summary)
     if result.error is not None:
         raise typer.Exit(2)

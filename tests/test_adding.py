@@ -460,6 +460,24 @@ def test_new_scene_holds_out_each_board_of_a_layout(root, tmp_path, monkeypatch)
     assert read_settings("own", root).section(Compare, "compare").layout.gap_mm == 2
 
 
+def test_table_without_its_passes_is_a_warning(root, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: None)
+    output_of(["new", "mine", "--boards", "b1,b2", "--presses", "20", "--passes", "2"])
+    rng = rng_for(0, "passes")
+    places_mm = np.concatenate([rng.permutation([[i, i % 5] for i in range(20)]) for _ in range(2)])
+    rows = pd.DataFrame({"phase": ["noload", "contact"] * 40, "pass": [0] * 40 + [1] * 40})
+    rows[["x_mm", "y_mm"]] = places_mm.repeat(2, axis=0)
+    for name, stated in (("b1_s1", False), ("b2_s1", True)):
+        rows[table.columns_of(5)[3:18]] = 500.0 + rng.normal(0, 30, (80, 15))
+        (rows if stated else rows.drop(columns="pass")).to_csv(tmp_path / f"{name}.csv", index=False)
+        prepared = preparing.foreign(tmp_path / f"{name}.csv", "table", labels(name[:2], name), {})
+        add.add(root, "mine", prepared, allow_copy=False)
+        warned = "1 passes found; split.pool_passes_n of the scene needs more than 1 of each skin. Add further"
+        output = capsys.readouterr().err
+        assert (warned in output, "fill in column pass" in output) == (not stated, not stated)
+
+
 def test_several_recordings_are_named_by_their_files(root, tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     output_of(["new", "mine", "--boards", "b1,b2", "--presses", "12"])
@@ -478,7 +496,7 @@ def test_several_recordings_are_named_by_their_files(root, tmp_path, monkeypatch
     with pytest.raises(ReskinError, match=r"file's name is not BOARD_SKIN\.csv"):
         add.names_of(root, "mine", Path("b2.csv"), labels("", ""))
     output = add_two("b2_s1_more")
-    assert "capture b1_s1 has 2 indentations; split.labels_pool_n of the scene needs more than 6" in output
+    assert "capture b1_s1: 2 indentations found; split.labels_pool_n of the scene needs more than 6" in output
     captures = read_registry(root).captures["mine"]
     assert {name: (entry.board, entry.skin) for name, entry in captures.items()} == {
         "b1_s1": ("b1", "b1_s1"), "b2_s1_more": ("b2", "b2_s1")

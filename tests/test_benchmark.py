@@ -306,6 +306,10 @@ def test_other_files_are_errors(tiny, tmp_path):
         read_predictions(tmp_path / "mine.txt")
     with pytest.raises(SchemaError, match="file not found"):
         read_predictions(tmp_path / "none.csv")
+    for head, message in (("", "line 1 is empty"), ("fold;press;x_mm;y_mm", "no comma"), (f",{HEAD}", "has no name")):
+        (tmp_path / "head.csv").write_text(head)
+        with pytest.raises(SchemaError, match=message):
+            read_predictions(tmp_path / "head.csv")
     pd.DataFrame({"fold": ["t.tiny.a.draw0.labels0"], "press": ["one"], "x_mm": [1.0], "y_mm": [1.0]}).to_parquet(
         tmp_path / "text.parquet"
     )

@@ -155,6 +155,10 @@ def _read_table(file: Path) -> pa.Table:
     types = {"fold": pa.string(), "press": pa.int64(), **dict.fromkeys((*PLACE, *optional), pa.float64())}
     if _suffix(file) == ".csv":
         head = io.read_bytes(file).partition(b"\n")[0].decode("utf-8-sig", errors="replace")
+        if not head.strip():
+            raise SchemaError(f"{file}: line 1 is empty; it must have the names of the columns. {HELP}")
+        if "," not in head and (";" in head or "\t" in head):
+            raise SchemaError(f"{file}: line 1 has no comma. Separate columns by commas. {HELP}")
         _check_columns(file, names := [name.strip() for name in head.split(",")], list(types), optional)
         try:
             table = parse_csv(file, {name: kind for name, kind in types.items() if name in names}, str(file))
@@ -178,6 +182,8 @@ def _read_table(file: Path) -> pa.Table:
 
 def _check_columns(file: Path, names: Sequence[str], known: Sequence[str], optional: Sequence[str]) -> None:
     for name in names:
+        if not name:
+            raise SchemaError(f"{file}: a column has no name. pandas: to_csv(..., index=False). {HELP}")
         if name not in known:
             raise SchemaError(f"{file}: column {name[:40]!r} is unknown.{did_you_mean(name, known)} {HELP}")
         if names.count(name) > 1:

@@ -438,7 +438,30 @@ def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dic
         }
         for i, (position, written, best, turn) in enumerate(columns)
     ]
-    return {"sentence": frames.sentence(section.stated_by), "chips": chips}
+    outside = describe_outside(aligned.place_mm, section)
+    return {"sentence": outside or frames.sentence(section.stated_by), "chips": chips}
+
+
+def describe_outside(place_mm: Float[np.ndarray, "n 2"], section: Compare) -> str | None:
+    """Describe the presses that are not on the skin, according to the scene; return None if all are on it.
+
+    `place_mm` are places relative to the board's centre. If presses seem to be elsewhere, the orientations that agree
+    best with them mean nothing.
+    """
+    outside_n = int((np.abs(place_mm) > np.array(section.skin_mm) / 2).any(axis=1).sum())
+    if not outside_n:
+        return None
+    (x_mm, y_mm), (width_mm, height_mm) = section.labels_middle_mm, section.skin_mm
+    ranges = [
+        f"{axis} from {low:.3g} to {high:.3g} mm"
+        for axis, low, high in zip(AXES, place_mm.min(axis=0), place_mm.max(axis=0), strict=False)
+    ]
+    key = "labels_middle_mm" if section.layout is None else "centre_mm"
+    return (
+        f"{outside_n} of {len(place_mm)} presses are outside the skin ({width_mm:g} x {height_mm:g} mm) that "
+        f"{section.stated_by} states: relative to {key} [{x_mm:g}, {y_mm:g}], they have {' and '.join(ranges)}. "
+        f"Correct {key}, the size of the skin or the places."
+    )
 
 
 def _frames_of(aligned: AlignedPresses, setup: Setup, section: Compare) -> Frames:
@@ -504,16 +527,20 @@ POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Describe how labels, chips and skin of a capture differ from the orientations that the scene states.
+    """Describe how places, labels, chips and skin of a capture differ from what the scene states.
 
-    Returns None if there is no difference, or too little data to decide. `blocks` are the readings of the capture.
+    Presses outside the skin are described instead of orientations. Returns None if there is no difference, or too
+    little data to decide. `blocks` are the readings of the capture.
     """
+    if not any(_pressed_rows(block).any() for block in blocks):
+        return None
+    all_pokes = pool(blocks, with_force=False)
+    if outside := describe_outside(to_board_axes(all_pokes, section).place_mm, section):
+        return outside
     chips_mm = np.array(section.design.places_mm)
     surrounded = len(chips_mm) >= CHIPS_MIN_N and (chips_mm.min(axis=0) < 0).all() and (chips_mm.max(axis=0) > 0).all()
-    if not surrounded or not any(_pressed_rows(block).any() for block in blocks):
-        return None
-    pokes = _thin(pool(blocks, with_force=False), POKES_MAX_N)
-    if len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
+    pokes = _thin(all_pokes, POKES_MAX_N)
+    if not surrounded or len(pokes) < POKES_MIN_N or not (np.linalg.norm(pokes.db_uT, axis=(0, 2)) > 0).all():
         return None
     frames = _frames_of(to_board_axes(pokes, section), make_setup(section, design), section)
     return None if frames.as_stated else frames.sentence(section.stated_by)

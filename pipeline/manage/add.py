@@ -183,9 +183,11 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
     ):  # fmt: skip
         pool_n = getattr(scene.split, key)
         if pool_n is not None and have_n <= pool_n:
+            column = "fill in column pass (needed if each pass has another order of places), "
             say(
-                f"warning: capture {header.capture} has {have_n} {what}; split.{key} of the scene needs more than "
-                f"{pool_n} of each skin. Add further recordings of skin {header.skin}, or reduce {key}."
+                f"warning: capture {header.capture}: {have_n} {what} found; split.{key} of the scene needs more than "
+                f"{pool_n} of each skin. Add further recordings of skin {header.skin}, "
+                f"{column if (what, header.layout) == ('passes', 'table') else ''}or reduce {key}."
             )
 
 

@@ -209,9 +209,10 @@ def about(numbers: Mapping[str, Any]) -> str:
 
 def counts_of(numbers: Mapping[str, Any]) -> str:
     """List the counts of the main captures."""
-    counts = next(iter(numbers["described"].values()))["counts"]
-    listed = ", ".join(f"{name.removesuffix('_n').replace('_', ' ')} {n:,}" for name, n in counts.items() if n)
-    return f"Main captures: {listed}."
+    counts = dict(next(iter(numbers["described"].values()))["counts"])
+    captures_n = counts.pop("captures_n")
+    listed = " and ".join(f"{n:,} {name.removesuffix('_n').replace('_', ' ')}" for name, n in counts.items() if n)
+    return f"Main captures: {captures_n:,}, with {listed}."
 
 
 def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -26,7 +26,7 @@ from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE
+from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Source
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
@@ -60,8 +60,6 @@ LATE_MAX_S = 0.1
 BATCH_MAX_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
 TCP_PORT_MAX = 65535
-
-Source = Literal["simulated", "recorded"]
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@
 """
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -12,9 +13,8 @@ from reskin import io
 from reskin.board.find import DetectedBoard
 from reskin.board.reader import Reader
 from reskin.errors import CaptureError
-from reskin.live.emulator import Source
 from reskin.live.tracker import Estimates
-from reskin.recordings.header import HEADER_FILE, Clock, render
+from reskin.recordings.header import HEADER_FILE, Clock, Source, render
 from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.recordings.stream_recorder import CaptureWriter
@@ -99,10 +99,8 @@ class PageRecording:
             port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
             self.folder = self.folder.with_name(f"{self.folder.name}-{port}")
         self._part, self._header = begin_capture(
-            self.folder, NO_INFO, wire=board.wire, chips_n=board.chips_n, by="reskin live"
+            self.folder, replace(NO_INFO, source=source), wire=board.wire, chips_n=board.chips_n, by="reskin live"
         )
-        if source != self._header.source:
-            self._change_header(source=source)
         self._reader = reader
         self._labels: ProbeLogWriter | None = None
         self._begun_s = reader.unix_s()

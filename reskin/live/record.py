@@ -5,12 +5,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from reskin.board.find import BAUD, DetectedBoard
 from reskin.board.port import check_name
 from reskin.errors import ParamsError
 from reskin.live.health import Health
+from reskin.recordings.header import Source
 from reskin.recordings.label_sources import (
     RANDOM,
     SNAKE,
@@ -80,6 +81,7 @@ def record_board(
     seconds: float = float("inf"),
     baud: int = BAUD,
     names: Mapping[str, str] | None = None,
+    source: Source = "recorded",
 ) -> RecordingResult:
     """Record a board until the user stops it, `seconds` have passed, the labels end, or the board is unplugged.
 
@@ -92,15 +94,18 @@ def record_board(
     baud : baud rate; USB ports ignore it
     names : values for the capture's header: names of the board and the skin, and the order of places, under the keys
         board, skin and scan
+    source : "simulated" if the port is an emulated board that sends a simulation
     """
     check_name(board.port)  # before a folder is created
     folder, health = folder or new_folder(), Health(board.chips_n)
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
+    stated: dict[str, Any] = scan | dict(names or {})
+    info = replace(NO_INFO, **stated, labels=labels, source=source)
     settings = PortSettings(
         baud, board.wire, board.chips_n, seconds, bytes_max_n=None, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S
     )
     stream, labels_summary, error = record_capture(
-        board.port, folder, info=replace(NO_INFO, **(scan | dict(names or {})), labels=labels), settings=settings,
+        board.port, folder, info=info, settings=settings,
         report=print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())]),
         watch=lambda frames: health.feed(frames, time.monotonic()),
     )  # fmt: skip

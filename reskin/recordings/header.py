@@ -27,6 +27,7 @@ LOG_FILE = "log.csv"
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
+Source = Literal["simulated", "recorded"]
 Layout = Literal["native", ReaderLayout, "sd-card"]
 
 
@@ -83,7 +84,7 @@ class Header(_Frozen):
     capture: Name
     board: Name
     skin: Name
-    source: Literal["simulated", "recorded"]
+    source: Source
     layout: Layout
     wire: Wire | None
     chips_n: Annotated[int, Field(ge=1, le=64)]

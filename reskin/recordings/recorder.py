@@ -17,7 +17,7 @@ from reskin import io
 from reskin.board.rates import RateMeasurement
 from reskin.board.wire import Wire
 from reskin.errors import CaptureError
-from reskin.recordings.header import HEADER_FILE, Clock, Header, Rate, make_header, render, seal
+from reskin.recordings.header import HEADER_FILE, Clock, Header, Rate, Source, make_header, render, seal
 from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
 from reskin.recordings.labels import ProbeLogWriter
 from reskin.recordings.preparing import UNNAMED
@@ -35,6 +35,7 @@ class CaptureInfo:
     skin: str
     scan: str  # order of the places: random, snake or other text
     labels: LabelSource | None = None
+    source: Source = "recorded"  # "simulated" if the port is an emulated board that sends a simulation
 
 
 class CaptureResult(NamedTuple):
@@ -112,7 +113,8 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
             raise CaptureError(f"{path}: the folder exists already. Choose another --out.")
     options = {"scan": info.scan} | ({"labels": info.labels.name} if info.labels is not None else {})
     header = make_header(
-        f"--out {folder.name}", capture=folder.name, board=info.board, skin=info.skin, layout="native",
+        f"--out {folder.name}", capture=folder.name, source=info.source, board=info.board, skin=info.skin,
+        layout="native",
         wire=wire, chips_n=chips_n, options=options,
         clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
         note=f"recorded by {by}; arrival times are unix seconds of the host",

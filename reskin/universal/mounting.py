@@ -66,8 +66,8 @@ class Mounting:
         elif turnable and self.log_odds < LOG_ODDS_MIN:
             sentences.append(
                 f"the skin is taken as {found}, but its no-load field fits both orientations (log odds "
-                f"{self.log_odds:.1f}). If you know the orientation, pass it to `zero` as `turned` (in "
-                "Python). Otherwise, compare errors at known places with both."
+                f"{self.log_odds:.1f}). If you know the orientation, state it in Python: zero(noload_uT, turned=True "
+                "or False). Otherwise, compare errors at known places with both."
             )
         return sentences
 

@@ -5,6 +5,7 @@ The statistics are cosine, explained fraction, growth of the field change with f
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -16,6 +17,7 @@ from reskin.schema import AXES_PER_CHIP_N, Readings
 # with degree 12, because the polynomial then also fits the memory.
 DRIFT_DEGREE = 4
 SERIES_MIN_N = 20  # captures with fewer presses are not used to estimate the memory
+DEPTHS_MAX_N = 10  # captures with more depths have been pressed to arbitrary depths, so few presses share a depth
 SPREAD_MIN = 0.2  # places with a smaller range of log F are not used to estimate the growth
 
 
@@ -23,7 +25,8 @@ SPREAD_MIN = 0.2  # places with a smaller range of log F are not used to estimat
 class RecordedPresses:
     """Presses of one skin on its board; values are means over the readings of a press, and fields are in chip axes.
 
-    group_i: index of the press's group. A group is a capture or, if depths are known, one depth of a capture.
+    group_i: index of the press's group. A group is a capture or, if depths are known, one depth of a capture. If a
+        capture has more than `DEPTHS_MAX_N` depths, its groups are the thirds of its presses by depth.
     """
 
     board: str
@@ -89,11 +92,21 @@ def _means(readings: Readings) -> tuple[np.ndarray, ...]:
     mean_uT = mean(b_uT)
     with np.errstate(divide="ignore", invalid="ignore"):  # a single reading has no variance
         var_uT2 = mean((b_uT - mean_uT[press_i.ravel()]) ** 2) * (counts / (counts - 1))[:, None]
-    depths_mm = readings.depth_mm[first]
-    group = [readings.capture + (f" {mm:g} mm" if np.isfinite(mm) else "") for mm in depths_mm]
+    group = _name_groups(readings.capture, readings.depth_mm[first])
     place_mm = np.stack([readings.x_mm[first], readings.y_mm[first]], axis=1)
     fields = [values.reshape(chips) for values in (mean_uT - noload_uT, noload_uT, var_uT2)]
-    return np.array(group), place_mm, mean(readings.Fz_N.astype(float)), *fields
+    return group, place_mm, mean(readings.Fz_N.astype(float)), *fields
+
+
+def _name_groups(capture: str, depths_mm: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Return the name of each press's group; see `RecordedPresses`."""
+    known = np.isfinite(depths_mm)
+    names = [f" {mm:g} mm" for mm in depths_mm]
+    if len(np.unique(depths_mm[known])) > DEPTHS_MAX_N:
+        limits_mm = np.quantile(depths_mm[known], [0, 1 / 3, 2 / 3, 1])
+        thirds = [f" {low:.3g} to {high:.3g} mm" for low, high in pairwise(limits_mm)]
+        names = [thirds[i] for i in np.searchsorted(limits_mm[1:-1], depths_mm)]
+    return np.array([capture + (name if is_known else "") for name, is_known in zip(names, known, strict=True)])
 
 
 def magnitudes_uT(db_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:

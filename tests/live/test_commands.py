@@ -56,6 +56,13 @@ def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
     assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output
 
 
+def test_recording_of_an_emulated_board_is_marked_as_simulated_on_request(tmp_path):
+    for simulated, source in ((True, "simulated"), (False, "recorded")):
+        with plugged_in(make_script(), loop=True) as name:
+            commands.record(port=name, seconds=0.5, out=tmp_path / source, simulated=simulated, **NO_OPTIONS)
+        assert parse((tmp_path / source / HEADER_FILE).read_text(), "header").source == source
+
+
 def test_wire_and_chips_need_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
@@ -64,6 +71,8 @@ def test_wire_and_chips_need_a_port(tmp_path):
 
 def test_help_lists_all_faults():
     assert all(f" {name}" in commands.FAULT for name in FAULTS)
+    default = parse_fault("stuck")
+    assert f"default: {default.duration_s:g} s, after {default.start_s:g} s" in commands.FAULT
 
 
 def test_live_without_options_shows_all_boards(monkeypatch):

@@ -47,6 +47,17 @@ def test_header_is_that_of_the_text_firmware(log):
     assert lines(log)[0] == "t_s,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1\n"
 
 
+def test_temperatures_may_be_missing(log):
+    with_temperatures = read_log(log)
+    columns = [[cell for i, cell in enumerate(row.split(",")) if i % 4 != 1] for row in lines(log)]
+    log.write_text("".join(",".join(row) for row in columns))
+    t_s, b_uT, temperature_degC, account = read_log(log)
+    for read, expected in zip((t_s, b_uT, account), (*with_temperatures[:2], with_temperatures[3]), strict=True):
+        np.testing.assert_equal(read, expected)
+    assert temperature_degC.shape == with_temperatures[2].shape
+    assert np.isnan(temperature_degC).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -54,7 +65,9 @@ def test_header_is_that_of_the_text_firmware(log):
         (lambda rows: [rows[0].replace("Bx0,By0", "By0,Bx0"), *rows[1:]], "column 3 is 'By0'; it must be Bx0"),
         (lambda rows: [rows[0].replace("Bz1", "bz1"), *rows[1:]], "column 9 is 'bz1'; it must be Bz1"),
         (lambda rows: [rows[0].replace(",Bz1", ""), *rows[1:]], "column 9 must be Bz1; the line ends at By1"),
-        (lambda rows: [rows[0].replace("T0,", "").replace("T1,", ""), *rows[1:]], "column 2 is 'Bx0'; it must be T0"),
+        (lambda rows: [rows[0].replace("T1,", ""), *rows[1:]], "column 6 is 'Bx1'; it must be T1"),
+        (lambda rows: [rows[0].replace("T0,", ""), *rows[1:]], "column 5 is 'T1'; it must be Bx1"),
+        (lambda rows: [rows[0].replace("T0,", "").replace("T1,", ""), *rows[1:]], "9 columns, but row 1 has 7"),
         (lambda rows: [line.replace(",", ";") for line in rows], "semicolons in line 1"),
         (lambda rows: ["phase,x_mm,y_mm,Bx0\n", *rows[1:]], "labels or estimates.* reskin add"),
         (lambda rows: [*rows[:-1], rows[-1].rstrip()], "the last line is incomplete"),

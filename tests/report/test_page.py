@@ -165,7 +165,7 @@ def test_section_about_lists_counts():
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
     counts.update(captures_n=1, readings_n=2000, indentations_n=0)
-    assert about(numbers).endswith("captures 1, readings 2,000.")
+    assert about(numbers).endswith("Main captures: 1, with 2,000 readings.")
 
 
 def test_results_with_verdicts_come_first():
@@ -194,7 +194,7 @@ def test_badge_shows_the_source(source):
 
 
 def test_page_starts_with_the_scene(read):
-    place = next(i for i, word in enumerate(read.words) if "captures 2, readings 1,000" in word)
+    place = next(i for i, word in enumerate(read.words) if "Main captures: 2, with 1,000 readings." in word)
     assert place < read.words.index(read_sections()[0].title)
 
 

@@ -1,6 +1,7 @@
 """Read and write the log that a board writes to an SD card (paper section 6): one CSV line per frame, without labels.
 
 A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as in wire format `text-txyz`.
+All columns T may be missing; temperatures are then unknown (NaN).
 """
 
 from codecs import BOM_UTF8
@@ -28,9 +29,10 @@ Log = tuple[
 GAP_FRAMES = 1.5  # frames are missing in a time step that exceeds the median step by this factor
 
 
-def column_names(chips_n: int) -> list[str]:
+def column_names(chips_n: int, *, temperatures: bool = True) -> list[str]:
     """Return the names of a log's columns, in order."""
-    return [TIME, *(f"{name}{chip_i}" for chip_i in range(chips_n) for name in CHIP_COLUMNS)]
+    of_chip = CHIP_COLUMNS if temperatures else CHIP_COLUMNS[1:]
+    return [TIME, *(f"{name}{chip_i}" for chip_i in range(chips_n) for name in of_chip)]
 
 
 def render(
@@ -47,19 +49,22 @@ def render(
 def read_log(path: Path) -> Log:
     """Read a log; return times in s, fields in uT and temperatures in degC of the fault-free frames, and an account.
 
-    Frames with failed reads or stuck chips are dropped and counted. Raises `CaptureError` if fewer than half of the
-    frames remain, or if a chip lost its settings. In the account, `gaps_n` is the number of overlong time steps, and
-    `gap_frames_n` the number of frames that are missing in them.
+    Temperatures are NaN if the log has none. Frames with failed reads or stuck chips are dropped and counted. Raises
+    `CaptureError` if fewer than half of the frames remain, or if a chip lost its settings. In the account, `gaps_n` is
+    the number of overlong time steps, and `gap_frames_n` the number of frames that are missing in them.
     """
     where = str(path)
-    chips_n = _chips_n(path, where)
-    table = tables.parse_csv(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
+    names = _read_names(path, where)
+    table = tables.parse_csv(path, dict.fromkeys(names, pa.float64()), where)
     if not len(table):
         raise CaptureError(f"{where}: the log has no lines below the column names. Copy the log again.")
     numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
-    chips = numbers[:, 1:].reshape(len(numbers), chips_n, 4)
-    b_uT = chips[:, :, 1:].reshape(len(chips), -1).astype(np.float32)
-    return keep_whole(numbers[:, 0], b_uT, chips[:, :, 0].astype(np.float32), where, first_row=FIRST_ROW)
+    chips_n = sum(name.startswith("Bx") for name in names)
+    chips = numbers[:, 1:].reshape(len(numbers), chips_n, -1)
+    b_uT = chips[:, :, -3:].reshape(len(chips), -1).astype(np.float32)
+    measured = chips.shape[2] == len(CHIP_COLUMNS)
+    temperature_degC = (chips[:, :, 0] if measured else np.full(chips.shape[:2], np.nan)).astype(np.float32)
+    return keep_whole(numbers[:, 0], b_uT, temperature_degC, where, first_row=FIRST_ROW)
 
 
 def keep_whole(
@@ -97,8 +102,8 @@ def _check_kept(account: dict[str, int], where: str) -> None:
         )
 
 
-def _chips_n(path: Path, where: str) -> int:
-    """Count the chips from the column names in line 1; raise if the last line has no line break, as in a cut file."""
+def _read_names(path: Path, where: str) -> list[str]:
+    """Read the column names in line 1; raise if they are wrong, or if the last line has no line break (a cut file)."""
     try:
         with path.open("rb") as file:
             first = file.readline(HEADER_CHARACTERS_MAX)
@@ -111,21 +116,26 @@ def _chips_n(path: Path, where: str) -> int:
         raise CaptureError(f"{where}: cannot read the log: {reason}. Check the name.") from None
     # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
-    chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
-    if chips_n < 1 or names != column_names(chips_n):
+    temperatures = _has_temperatures(names)
+    chips_n = (len(names) - 1) // (4 if temperatures else 3)
+    if chips_n < 1 or names != column_names(chips_n, temperatures=temperatures):
         raise CaptureError(f"{where}: {_header_fault(names)}")
     if last != b"\n":
         raise CaptureError(
             f"{where}: the last line is incomplete: it does not end with a line feed. If the board was switched off "
             "while it wrote this line, remove the line."
         )
-    return chips_n
+    return names
+
+
+def _has_temperatures(names: list[str]) -> bool:
+    return names[1:2] != ["Bx0"]
 
 
 def _header_fault(names: list[str]) -> str:
     """Return what is wrong with the names in line 1, and what to do."""
-    wanted = column_names(len(names) // len(CHIP_COLUMNS) + 1)
-    rule = f"{','.join(column_names(1))}, then T1 and so on"
+    wanted = column_names(len(names), temperatures=_has_temperatures(names))
+    rule = f"{','.join(column_names(1))}, then T1 and so on (all T may be missing)"
     if tables.is_number(names[0]):
         chips_n, left_n = divmod(len(names) - 1, len(CHIP_COLUMNS))
         whole = f": {','.join(column_names(chips_n))}" if not left_n and 0 < chips_n <= SHOWN_CHIPS_MAX else ""

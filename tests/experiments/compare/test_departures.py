@@ -9,6 +9,7 @@ import pytest
 from pipeline.experiments import compare
 from pipeline.experiments.compare import (
     Compare,
+    check_frames,
     chip_rotations,
     compare_boards,
     figures,
@@ -16,6 +17,7 @@ from pipeline.experiments.compare import (
     make_setup,
     pool_skins,
     tables,
+    to_board_axes,
 )
 from pipeline.settings import Settings
 from reskin.config import read_yaml
@@ -24,6 +26,7 @@ from reskin.recordings.readers import lab
 from reskin.schema import Readings
 from reskin.universal.law import nominal_uT
 from reskin.universal.layout import FOLDER
+from reskin.universal.presses import pool
 from tests.data.tables import readings
 from tests.experiments.compare.test_run import DESIGN, SECTION
 from tests.recordings.test_recordings import ingest
@@ -109,6 +112,19 @@ def test_departures_from_a_layout_name_the_layout():
     swapped = recording.b_uT.reshape(25, 4, 3)[:, [0, 3, 2, 1]].reshape(25, 12)
     sentence = find_departure([replace(recording, b_uT=swapped)], section, DESIGN)
     assert sentence == "Against layout square, chips 1 and 3 are exchanged."
+
+
+def test_presses_outside_the_skin_are_named_instead_of_orientations():
+    section = square_section()
+    recording = square_recording(section)
+    elsewhere = replace(recording, x_mm=recording.x_mm + 20, y_mm=recording.y_mm - 5)
+    sentence = find_departure([elsewhere], section, DESIGN)
+    assert sentence == (
+        "25 of 25 presses are outside the skin (20 x 20 mm) that layout square states: relative to centre_mm [10, 12], "
+        "they have x from 14 to 26 mm and y from -11 to 1 mm. Correct centre_mm, the size of the skin or the places."
+    )
+    aligned = to_board_axes(pool([elsewhere], with_force=False), section)
+    assert check_frames(aligned, make_setup(section, DESIGN), section)["sentence"] == sentence
 
 
 def test_boards_without_forces_have_only_frames(monkeypatch):

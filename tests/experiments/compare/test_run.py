@@ -204,6 +204,18 @@ def test_presses_are_means_of_readings_with_force():
         to_board_axes(pokes, SECTION)
 
 
+def test_presses_of_arbitrary_depths_are_grouped_by_thirds_of_depth():
+    depths_mm = np.arange(60, 0, -5, np.float32) / 100
+    one = readings(
+        f=12, indentation=np.arange(12, dtype=np.int32), depth_mm=np.append(depths_mm[:-1], np.float32(np.nan))
+    )
+    pokes = pool([one])
+    assert pokes.groups == ("c0", "c0 0.1 to 0.267 mm", "c0 0.267 to 0.433 mm", "c0 0.433 to 0.6 mm")
+    assert pokes.group_i.tolist() == [3] * 4 + [2] * 3 + [1] * 4 + [0]
+    ten = replace(one, depth_mm=np.append(depths_mm[:-2], depths_mm[:2]))
+    assert len(pool([ten]).groups) == 10  # one group per depth
+
+
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
     """Return the presses of the recordings of lab boards 1 and 2."""
