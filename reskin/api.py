@@ -420,8 +420,9 @@ def load_universal(
         For a board that a robot moves: standard deviation in uT of each component of the external field's change since
         the no-load reading, about 30 for the earth's field. Default: 0, no external field.
     new_day : bool
-        Whether the skin may slide under presses in another way than when the calibration was saved, as after a day or
-        two. A few further presses then tell whether it does (`slide`). Default: False, it slides in the same way.
+        Whether the skin may slide under presses differently than when the calibration was saved, for example a day
+        later. A few further presses then show whether it does (see `Universal.slide`). Default: False, which assumes
+        that it slides in the same way.
 
     Returns
     -------
@@ -460,7 +461,7 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
         - a table with labels (CSV or Parquet, layout `table` in data/README.md)
         - an ingested capture, `data/indentations/SCENE/CAPTURE.parquet`
     frames : bool
-        Whether to load all frames of a capture that has labels, instead of its labelled readings.
+        Whether to load all frames of a labelled capture instead of only its labelled readings.
     rate_hz : float
         Frames per second, only for a decoded file without a clock.
 
@@ -468,7 +469,7 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
     -------
     DataFrame
         Column names end in units; `frame.attrs["units"]` maps each column to its unit ("1" for counts, "" for text).
-        `frame.attrs["counts"]` tells how many frames and rows were read, and how many were dropped for which reason.
+        `frame.attrs["counts"]` has the number of frames and rows that were read, and the number dropped by reason.
 
         If the recording has labels, there is one row per reading in contact, as in an ingested capture: the columns of
         data/README.md (`board`, `x_mm`, `Fz_N`, ...), with one column per channel for the field (`bx0_uT`, `by0_uT`,
@@ -482,7 +483,7 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
     Raises
     ------
     ReskinError
-        If the path does not exist, is none of these recordings, or the recording is damaged; or if pandas is missing.
+        If the path does not exist, it is none of these recordings, the recording is damaged, or pandas is missing.
 
     Examples
     --------

@@ -66,7 +66,7 @@ MODEL = (
     "two. Default: the universal model for the paper's board."
 )
 EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
-NEW_DAY = "The calibration is of an earlier day, so the skin may slide in another way (docs/live.md)."
+NEW_DAY = "The calibration was made on an earlier day, so the skin may now slide differently (docs/live.md)."
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -198,7 +198,7 @@ def record(
 
 
 def _announce_simulation(source: str) -> None:
-    """Print on stderr that the program simulates a board, during which nothing else happens for some seconds."""
+    """Print on stderr that the program is simulating a board, because there is no other output for some seconds."""
     if source == "nominal" or Path(source).is_file():
         typer.echo("simulating the board; the first time, the simulation is also compiled: please wait", err=True)
 
@@ -211,7 +211,7 @@ def emulate(
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
     true_places: Annotated[
-        bool, Option("--true-places", help="Print the true place and force of each touch of a simulation.")
+        bool, Option("--true-places", help="Print the true place and force of each simulated touch.")
     ] = False,
 ) -> None:
     """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""

@@ -129,7 +129,7 @@ def require(package: str, where: object) -> None:
 def missing_package(package: str, where: object, *, extra: str | None = None) -> ParamsError:
     """Create the error for a missing package, with the command that installs the package.
 
-    extra: the smallest extra with all that `where` needs; by default, the one in `EXTRAS`.
+    extra: the smallest extra that installs all that `where` needs; by default, the one in `EXTRAS`.
     """
     extra = extra or EXTRAS.get(package, "pipeline")
     return ParamsError(

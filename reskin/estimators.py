@@ -34,7 +34,7 @@ TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "
 
 
 class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The paper's network, trained by the code of the stages: equal rows and settings give equal weights, bit for bit.
+    """The paper's network, trained by the code of the pipeline: equal data and settings give identical weights.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         Warns
         -----
         ConvergenceWarning
-            If the network predicts nearly the same for all rows, in all of `MAX_ATTEMPTS_N` training runs.
+            If the network predicts nearly the same values for all rows in each of `MAX_ATTEMPTS_N` training runs.
         """
         require("torch", "ContactRegressor")
         recipe, seed = self._recipe(), _as_seed(self.random_state)
@@ -191,7 +191,7 @@ def _as_seed(random_state: Any) -> int:
 
 
 def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
-    """Train as `reskin.models.runner.run_jobs`; return the result, and the number of runs before that collapsed."""
+    """Train as `reskin.models.runner.run_jobs` does; return the result, and the number of earlier collapsed runs."""
     from reskin.models.train import train_stack  # imported late, because it imports torch
 
     for attempt_i in range(MAX_ATTEMPTS_N):
@@ -213,7 +213,7 @@ def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
 def _card(
     recipe: Recipe, seed: int, channels_n: int, result: TrainingResult, collapsed_before_n: int
 ) -> dict[str, Any]:
-    """Describe a trained network, with the entries of a card on which predictions depend."""
+    """Describe a trained network by those entries of a card on which predictions depend."""
     return {
         "format": FORMAT,
         "recipe": recipe.model_dump(mode="json"),
@@ -339,8 +339,8 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike, *, return_std: bool = False) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT.
 
-        With `return_std`, also return their standard deviations [n 3]. That of the force is the force times the
-        standard deviation of its logarithm, and NaN if the forces are not calibrated by at least one known force.
+        With `return_std`, also return their standard deviations [n 3]. The one of the force is the force times
+        the standard deviation of its logarithm. It is NaN if the forces are not calibrated by at least one known force.
         """
         check_is_fitted(self)
         db_uT = validate_data(self, X, dtype=np.float64, reset=False)
@@ -352,7 +352,7 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def _metric(y: ArrayLike, predicted: ArrayLike, *, name: str) -> float:
-    """Return one of the project's metrics for the rows whose place is known; NaN if no row has what it needs."""
+    """Return one of the project's metrics for the rows whose place is known; NaN if no row has the values it needs."""
     true, estimated = np.asarray(y, float), np.asarray(predicted, float)
     placed = ~np.isnan(true[:, :2]).any(axis=1)
     return metrics.score(true[placed], estimated[placed]).get(name, np.nan) if placed.any() else np.nan

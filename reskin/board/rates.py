@@ -1,7 +1,8 @@
 """Measure a board's frame rate and its repeated readings, and explain what limits the rate.
 
 `RateMeter` measures. `find_limits` computes the rates that conversion time, I2C bus, baud rate and USB allow.
-`explain` compares the two in one sentence. An agreement of both is no proof, so the sentence says "would explain".
+`explain` compares the measured rate with these limits in one sentence. Agreement with a limit does not prove that this
+limit is the cause, so the sentence says "would explain".
 """
 
 from collections.abc import Sequence
@@ -15,17 +16,18 @@ from reskin.board.faults import SILENCE_S, clock_jumps, find_reading_faults, mis
 from reskin.board.wire import Frames
 from reskin.physics.chip import CONVERSION_S, DIG_FILT_MAX, OSR_MAX, conversion_s
 
-# A larger share of repeated readings is reported. In 30 public recordings of real boards, the share is at most 0.024;
+# Repeated readings are reported above this share. In 30 public recordings of real boards, it is at most 0.024;
 # the values of a chip with a coarse LSB are sometimes equal by chance.
 REPEATED_MAX = 0.05
 ALL_REPEATED = 0.99  # above this share, the board sends the same reading again and again
 FRAMES_MIN_N = 20  # with fewer frames, no rate is given
-CLOCK_FRAMES_N = 400  # frames for which the usual step of the board's clock is determined
+CLOCK_FRAMES_N = 400  # number of frames from which the usual step of the board's clock is determined
 # A board's clock is a float32 in s. After hours, its resolution is too coarse for single steps.
 CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of resolution to step
 
-# Bits on the I2C bus for one chip: 9 a byte, with the acknowledge, and one for each start, repeated start and stop.
-# Bytes: address and command, address again, status; reading (command RM) has 8 more, for T, X, Y and Z.
+# Bits on the I2C bus for one chip: 9 per byte, including the acknowledge bit, and one for each start, repeated start and
+# stop. Each command takes 4 bytes: address, command, address again, and status. Command RM (read the measurement) takes
+# 8 more bytes, for T, X, Y and Z.
 START_BITS_N = 9 * 4 + 3  # command SM: start a single conversion
 READ_BITS_N = 9 * (4 + 8) + 3
 I2C_HZ = (100e3, 400e3, 1e6)  # Arduino's default, the rate in the ReSkin and AnySkin firmware, and the chip's maximum
@@ -34,7 +36,7 @@ UART_BITS_PER_BYTE_N = 10  # start bit, 8 data bits, stop bit
 USB_BYTES_PER_S = 19 * 64 * 1000  # full speed: at most 19 bulk packets of 64 bytes in 1 ms (USB 2.0, table 5-9)
 
 ERROR = 0.03  # assumed: relative error of a measured rate
-NEAR = 0.8  # assumed: a limit would explain a rate above this fraction of it; the board's program also takes time
+NEAR = 0.8  # assumed: a limit explains rates above this fraction of it, because the board's program also takes time
 
 Method = Literal["arrivals", "clock"]
 
@@ -158,11 +160,11 @@ class RateMeter:
         )
 
     def _count_sent(self) -> None:
-        """Count the frames that the board sent according to its clock, with those that are missing."""
+        """Count the frames that the board sent according to its clock, including missing ones."""
         clock_s = np.concatenate(self._clock_s) if self._clock_s else np.zeros(0)
         self._clock_s, self._clocked_n = [clock_s[-1:]], 0
         step_s = np.diff(clock_s)
-        # A frame with the time of the one before was sent once, and arrived twice.
+        # A frame with the same time as the frame before was sent once but arrived twice.
         step_s = step_s[~clock_jumps(step_s) & (step_s > 0)]
         if not len(step_s) or np.spacing(np.float32(clock_s[-1])) > CLOCK_STEP_RESOLUTION_MAX * np.median(step_s):
             return
@@ -180,7 +182,7 @@ def measure(frames: Frames, chunks: Sequence[tuple[bytes, float]]) -> RateMeasur
 
 
 class Limit(NamedTuple):
-    """A computed upper limit of the frame rate, and what it belongs to."""
+    """A computed upper limit of the frame rate, and its cause."""
 
     hz: float
     cause: str
@@ -261,7 +263,7 @@ def _hz(rate_hz: float) -> str:
 
 
 def _settings_with(time_s: float) -> str:
-    """Name the settings of the chip whose conversions take about `time_s`; "" if there are none."""
+    """Name the chip settings with which a conversion takes about `time_s`; "" if there are none."""
     found = [
         f"OSR {osr} with DIG_FILT {dig_filt}"
         for osr in range(OSR_MAX + 1)

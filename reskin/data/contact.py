@@ -11,12 +11,12 @@ CONTACT_SDS = 6.0
 def magnitudes_uT(
     db_uT: Float[np.ndarray, "f ch"], suppressor: Float64[np.ndarray, "ch ch"] | None
 ) -> Float[np.ndarray, " f"]:
-    """Return |dB| of each reading, by which contact is detected; external fields are removed with the suppressor."""
+    """Return |dB| of each reading, to detect contact; the suppressor removes external fields."""
     return np.linalg.norm(db_uT if suppressor is None else db_uT @ suppressor, axis=1)
 
 
 def noise_uT(db_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Return the rms over all channels of field changes without contact."""
+    """Return the noise: the rms over all channels of field changes without contact."""
     return float(np.sqrt((db_uT.astype(np.float64) ** 2).mean()))
 
 

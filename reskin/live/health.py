@@ -56,7 +56,7 @@ class Health:
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._repeats = RepeatCounter(chips_n)
-        self._frames_repeat = False  # whether there was an alarm for whole frames since the last check of readings
+        self._frames_repeat = False  # whether whole frames repeated since the last check of readings
         self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
@@ -126,7 +126,7 @@ class Health:
             self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
-        """Raise an alarm if a few readings repeat the one before; for many, alarm `frames repeat` is raised."""
+        """Raise an alarm if single readings repeat the one before; whole frames that repeat have their own alarm."""
         self._repeats.feed(batch.b_uT)
         self._frames_repeat |= bool(faults.repeated.any())
         if self._repeats.frames_n >= REPEATS_FRAMES_N:

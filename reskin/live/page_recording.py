@@ -20,10 +20,10 @@ from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_
 from reskin.recordings.stream_recorder import CaptureWriter
 
 # Assumed times of a labelled press. The no-load dwell ends before the contact, because the tip may approach slowly, and
-# begins some time after the contact before, because the skin recovers.
+# begins some time after the previous contact, because the skin needs time to recover.
 REST_MAX_S, REST_MIN_S, RECOVERY_S, APPROACH_S = 1.0, 0.2, 0.3, 0.05
 PLATEAU = 0.8  # assumed: the press is held while |dB| is at least this fraction of its maximum
-PRESS_READINGS_MAX_N = 20_000  # readings of a press that are kept, to limit memory; 50 s at 400 Hz
+PRESS_READINGS_MAX_N = 20_000  # most readings that are kept of one press, to limit memory; 50 s at 400 Hz
 
 
 class LabelledPress:
@@ -71,12 +71,12 @@ class LabelledPress:
         held = np.flatnonzero(size_uT >= PLATEAU * size_uT.max())
         first_s, last_s = float(t_s[held[0]]), float(t_s[held[-1]])
         if self._rest is None:
-            self.problem = "the press had already begun; press again"
+            self.problem = "the press began before the label was entered; press again"
             return
         rest_end_s = self._rest[1] - APPROACH_S
         rest_start_s = max(self._rest[0] + RECOVERY_S, rest_end_s - REST_MAX_S)
         if rest_end_s - rest_start_s < REST_MIN_S:
-            self.problem = "the skin had no rest before the press; lift for a second, then press again"
+            self.problem = "the skin was touched shortly before the press; lift for a second, then press again"
         elif last_s - first_s < DWELL_MIN_s:
             self.problem = "the press was too short; hold it for half a second"
         else:
@@ -87,7 +87,7 @@ class LabelledPress:
 class PageRecording:
     """A recording of a board that `reskin live` reads, with labels from the page.
 
-    `source` tells whether the board is emulated from a simulation. Raises `ReskinError` or `OSError` if the folder
+    `source` states whether the board is emulated from a simulation. Raises `ReskinError` or `OSError` if the folder
     cannot be created.
     """
 
@@ -118,12 +118,14 @@ class PageRecording:
         Raises
         ------
         CaptureError
-            If the rest before the press is not in the recording.
+            If the time without contact before the press is not in the recording.
         OSError
             If the log cannot be written.
         """
         if press.rest_s is None or press.held_s is None or press.rest_s[0] < self._begun_s:
-            raise CaptureError("not recorded: the recording began after the rest before this press. Press again.")
+            raise CaptureError(
+                "not recorded: the recording has no reading without contact before this press. Press again."
+            )
         if self._labels is None:  # a capture without labels has no probe log
             self._labels = ProbeLogWriter(self._part)
             # Labels and arrivals are on the same clock, so one mark with equal times aligns them.

@@ -212,7 +212,7 @@ class Session:
     ----------
     port : the board's port
     models : the model that estimates
-    source : what the board is, for the page
+    source : description of the board that the page shows
     fault_policy : which faulty readings give no estimate
     alone : whether this is the only board of the page
     skins : folder of saved calibrations
@@ -239,11 +239,11 @@ class Session:
         self._error = ""
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
-        self._guided_press: LabelledPress | None = None  # the current one of the presses at crosses, for the recording
+        self._guided_press: LabelledPress | None = None  # the current press at a cross, for the recording
         self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
-        # Changes of the model, which the polling thread makes, because it also estimates with the model.
+        # Requested changes of the model. The polling thread makes them, because it also estimates with the model.
         self._changes: deque[Callable[[UniversalEstimator], str]] = deque()
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
@@ -360,7 +360,7 @@ class Session:
                 done.append(estimator.add_label((press.label.x_mm, press.label.y_mm), press.label.Fz_N, press.db_uT))
             except ReskinError as error:
                 done.append(f"not used for calibration: {error}")
-        self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'nothing used it'}"
+        self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'neither recorded nor used'}"
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Return the next binary message, with the bins from `after_bin` on, and the number of the newest bin."""
@@ -467,7 +467,7 @@ class Session:
         Raises
         ------
         ParamsError
-            If the label is invalid, nothing would use it, or other presses are being collected.
+            If the label is invalid, it would be neither recorded nor used, or other presses are being collected.
         """
         self._labelled_press, self._labelled = None, ""
         if label is None:
@@ -484,7 +484,9 @@ class Session:
         force_N = label.get("force_N")
         force_N = math.nan if force_N is None else _number(force_N, "the force", 0.0, FORCE_MAX_N, "N")
         if not learn and self._recording is None:
-            raise ParamsError("label: nothing would use it. Start a recording, or select that the model learns it.")
+            raise ParamsError(
+                "label: it would be neither recorded nor used. Start a recording, or let the model learn it."
+            )
         if self._presses is not None:
             raise ParamsError("label: other presses are being collected. Finish them first.")
         self._labelled_press = LabelledPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)

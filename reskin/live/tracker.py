@@ -304,7 +304,7 @@ class UniversalEstimator:
         known = np.isfinite(force_N)
         if known.any():
             model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
-        if not known.all():  # after the known forces, with which the model estimates the others
+        if not known.all():  # after the known forces, because they help to estimate the unknown ones
             model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
         model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
         self._model, self.warnings = model, model.warnings

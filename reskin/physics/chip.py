@@ -71,13 +71,13 @@ def read_temperature(
 
 CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 OSR_MAX, DIG_FILT_MAX = 3, 7
-START_AND_END_S = 232e-6  # what table 18 of the data sheet adds to the conversions of three axes and temperature
+START_AND_END_S = 232e-6  # time in table 18 of the data sheet beyond the conversions themselves
 
 
 def conversion_s(osr: int, dig_filt: int) -> float:
     """Return the time of one conversion of X, Y, Z and temperature at settings OSR and DIG_FILT, with OSR2 0.
 
-    The data sheet states the time of an axis and of temperature; tests compare the sum with its table 18.
+    The data sheet states the times of one axis and of temperature; tests compare their sum with its table 18.
     """
     axis_s = 67e-6 + 64e-6 * 2**osr * (2 + 2**dig_filt)
     temperature_s = 67e-6 + 192e-6

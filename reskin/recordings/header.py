@@ -64,7 +64,7 @@ class Firmware(_Frozen):
 class Rate(_Frozen):
     """Frame rate and repeated readings, as the recorder measured them; see `reskin.board.rates.RateMeasurement`.
 
-    `sent_hz` is the rate by the board's clock (`method` is `clock`) or, if it has none, the rate of arrival.
+    `sent_hz` is the rate by the board's clock (`method` is `clock`) or, without such a clock, the rate of arrival.
     """
 
     sent_hz: Annotated[float, Field(gt=0)]
@@ -136,7 +136,7 @@ def make_header(where: str, **fields: Any) -> Header:
 
 
 def render(header: Header) -> str:
-    """Write a header as JSON, two-space indented, keys in the order of `Header`; a rate of None is left out."""
+    """Write a header as JSON, indented by two spaces, with keys in the order of `Header`; omit a rate of None."""
     without = {"rate"} if header.rate is None else set()
     return json.dumps(header.model_dump(mode="json", exclude=without), indent=2) + "\n"
 

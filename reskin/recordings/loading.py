@@ -75,7 +75,7 @@ def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
 
 
 def _hint(path: Path, *, frames: bool) -> str:
-    """Return what else the user can do if a recording cannot be loaded; "" if nothing."""
+    """Return advice for a recording that cannot be loaded; "" if there is none."""
     layouts = [layout for layout in layouts_of(path) if layout != "table"]
     if layouts == ["capture"]:
         return "" if frames else "To load the frames without labels, try: frames=True"
@@ -95,7 +95,7 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
         kind = _kind_of(path)
     if kind != "log":
         if frames:
-            raise ParamsError(f"{path}: only a capture of `reskin record` has frames. Load it without frames=True.")
+            raise ParamsError(f"{path}: only a capture of `reskin record` has frames. Omit frames=True.")
         readings, counts = READ[kind](path)
         return _readings_frame(pd, readings, counts)
     t_s, b_uT, temperature_degC, counts = read_any_log(path, rate_hz)

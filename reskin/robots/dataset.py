@@ -35,7 +35,7 @@ from reskin.schema import from_table
 
 VERSION = "v3.0"
 FPS_MAX = 10_000
-RATE_TOLERANCE = 0.05  # relative difference between recordings of which one rate is assumed
+RATE_TOLERANCE = 0.05  # largest relative difference between rates of recordings that are treated as equal
 ROUNDING = 1e-6  # tolerance of times, as a fraction of the time between frames
 GAP_S = 0.3  # an episode ends at a longer gap between readings; the last reading is then outdated
 FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
@@ -57,7 +57,7 @@ class Recording:
     """The readings of one file. values: feature -> values, NaN if unknown. t_s: None if the times are unknown.
 
     part: number of the part of the recording (such as the indentation) to which a reading belongs; each part becomes
-    an episode or, if it has gaps, several ones. dropped_n: number of faulty frames, which are left out.
+    an episode or, if it has gaps, several episodes. dropped_n: number of faulty frames, which are left out.
     """
 
     where: str
@@ -82,18 +82,18 @@ class Episode:
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
 ) -> dict[str, float]:
-    """Write recordings as a LeRobot dataset; return its size and rate, its largest timestamp error, and what it lacks.
+    """Write recordings as a LeRobot dataset; return its size, rate, largest timestamp error and omitted frames.
 
     Parameters
     ----------
     files : folders of captures (`reskin record`), tables of ingested readings (data/indentations), tables that
-        `reskin decode` wrote, or logs of an SD card. A capture or log is one episode, a table of ingested readings has
+        `reskin decode` wrote, or logs of an SD card. A capture or log is one episode; a table of ingested readings has
         one episode per indentation. A gap of more than `GAP_S` ends an episode.
     out : folder to create
     task : what the robot does, in natural language
     fps : frames per second of the dataset; each frame is then the latest reading at its time. By default, each reading
         is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 / fps; the
-        result tells how far they are from the times of the readings.
+        result has their largest difference from the times of the readings.
     rate_hz : rate of the readings of files without times
 
     Raises
@@ -228,7 +228,7 @@ def _source(recording: Recording) -> str:
 
 
 def _known(recording: Recording) -> dict[str, list[str]]:
-    """Return the features of a recording with the names of those components that are known for some reading."""
+    """Return the features of a recording with the names of those components that are known in any reading."""
     chips_n = recording.values[FIELD].shape[1] // 3
     field = tuple(f"B{axis}{chip}_uT" for chip in range(chips_n) for axis in "xyz")
     temperature = tuple(f"T{chip}_degC" for chip in range(chips_n))

@@ -7,7 +7,7 @@ Nothing may touch the skin in the first second.
 
 | topic            | message                                   | content                                              |
 |------------------|-------------------------------------------|------------------------------------------------------|
-| `~/chip0/field`  | sensor_msgs/MagneticField                 | field at chip 0 in T, along the chip's axes; so on   |
+| `~/chip0/field`  | sensor_msgs/MagneticField                 | field in T along the chip's axes; also chip1, ...     |
 | `~/contact`      | std_msgs/Bool                             | whether the skin is touched                          |
 | `~/place`        | geometry_msgs/PoseWithCovarianceStamped   | place in m; published only in contact                |
 | `~/force`        | geometry_msgs/WrenchStamped               | force on the skin in N; zero without contact         |
@@ -22,7 +22,7 @@ default: the universal model without calibration); `external_uT` (for a board th
 
 Decisions:
 
-* A field is one MagneticField per chip, which has a stamp, a frame and SI units; Float32MultiArray has none of these.
+* The field of each chip is a MagneticField, with stamp, frame and SI units; Float32MultiArray has none of these.
   Its covariance is 0, which means unknown. The frame of chip K is `<frame_id>_chipK`.
 * Frame `frame_id` has the axes and the origin of the places x and y; its z axis points out of the skin. Only x and y
   are estimated: z is 0, the surface. The orientation is that of the frame, and its entries in the covariance are 0.
@@ -156,7 +156,7 @@ def limit_rate(contacts: Iterator[Contact], rate_hz: float) -> Iterator[Contact 
     for contact in contacts:
         now_s = time.monotonic()
         if now_s >= next_s:
-            next_s = max(next_s, now_s - period_s) + period_s  # the mean rate is exact, also if contacts are irregular
+            next_s = max(next_s, now_s - period_s) + period_s  # the mean rate is exact, even if contacts are irregular
             yield contact
         else:
             yield None

@@ -21,7 +21,7 @@ from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates, LiveSkin
 
 WAIT_S = 0.1  # longest time for which the background thread waits for data before it checks whether to stop
-READ_MS = 10_000.0  # longest time for which `read` and `zero` wait, as `read` of LeRobot's cameras
+READ_MS = 10_000.0  # longest time for which `read` and `zero` wait, as in `read` of LeRobot's cameras
 ESTIMATE = ("x_mm", "y_mm", "F_N", "sd_x_mm", "sd_y_mm", "sd_F_N", "contact")
 
 
@@ -152,7 +152,7 @@ class SkinSensor:
         Raises
         ------
         SkinConnectionError : the sensor is not connected
-        TimeoutError : no usable reading arrived within `timeout_ms`; the message tells the board's alarms
+        TimeoutError : no usable reading arrived within `timeout_ms`; the message has the board's alarms
         """
         skin = self._connected()
         with self._changed:

@@ -87,9 +87,9 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
         raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or omit the press.")
 
 
-# Presses are mistaken for field changes, or the reverse, if their distance to the wrong origin (0 or the no-load
-# reading) is below this fraction of the distance to the right one. On the boards of scene lab, medians are 0.15 to 0.22
-# for mistaken presses and 4 or more for others.
+# Values are refused as field changes passed for readings, or the reverse, if their distance to the wrong origin (0 or
+# the no-load reading) is below this fraction of the distance to the right one. On the boards of scene lab, the median
+# ratio is 0.15 to 0.22 for values of the wrong kind, and 4 or more for values of the right kind.
 NEAR_MAX = 0.5
 
 
@@ -127,10 +127,10 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-# Files of the first format do not tell which forces are known, and those of the first two do not tell how the skin is
-# mounted: it is then not turned. Files of the first three have the data of one day.
+# Files of the first format do not state which forces are known. Those of the first two do not state how the skin is
+# mounted; it is then not turned. Files of the first three have the data of one day.
 FORMAT, FORMAT_3, FORMAT_2, FORMAT_1 = "reskin-skin-4", "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
-EARLIER_DAY = "earlier_{}_"  # how names of arrays begin that are of earlier days; the first of these days has number 0
+EARLIER_DAY = "earlier_{}_"  # prefix of names of arrays of earlier days; the first of these days has number 0
 DAYS_MAX_N = 5  # a saved skin has at most this number of days
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
@@ -188,8 +188,8 @@ class CalibrationData:
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
     the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter; the sign of
-    all fields here is then opposite to that of the board's fields, as if the skin were not turned. earlier: data of
-    earlier days, in their order, without days before them. By default, there are no presses on the paper's board.
+    all fields here is then opposite to that of the board's fields, as if the skin were not turned. earlier: the
+    earlier days in order of time, each with its own data only. By default, there are no presses on the paper's board.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -217,9 +217,9 @@ class CalibrationData:
         return len(self.labels) + sum(day.labels_n for day in self.earlier)
 
     def next_day(self) -> "CalibrationData":
-        """Return the data at the beginning of another day: a day with presses becomes the last of the earlier days.
+        """Return the data at the beginning of a new day: the day before becomes an earlier day if it has presses.
 
-        There are at most `DAYS_MAX_N` - 1 earlier days; before, the first of them is omitted.
+        At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the first one is omitted.
         """
         pressed = len(self.presses_uT) + len(self.labels) > 0
         earlier = (*self.earlier, replace(self, earlier=())) if pressed else self.earlier
@@ -227,7 +227,7 @@ class CalibrationData:
         return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
 
     def joined_to(self, last: "CalibrationData") -> "CalibrationData":
-        """Return the data with the presses of the last day, on which the skin slid in the same way, before its own.
+        """Return the data with the presses of the last day, on which the skin slid in the same way, put before its own.
 
         As on a single day, presses that are all over the area are then used only if no others were made after them.
         """

@@ -150,21 +150,21 @@ static reskin_real reskin_half_square(reskin_real value, reskin_real mean, reski
     return (reskin_real)0.5 * ((value - mean) / sd) * ((value - mean) / sd);
 }
 
-/* Return the logarithm of a probability, which is not below that of the least probability. */
+/* Return the logarithm of a probability; a probability below `reskin_tiny` is replaced by it. */
 static reskin_real reskin_log(reskin_real probability)
 {
     return RESKIN_R(log)(probability < reskin_tiny ? reskin_tiny : probability);
 }
 
-/* Return exp(x) for x <= 0; smaller values of x than -`reskin_farthest` are replaced by it. */
+/* Return exp(x) for x <= 0; a value of x below -`reskin_farthest` is replaced by it. */
 static reskin_real reskin_exp(reskin_real x)
 {
     return RESKIN_R(exp)(x < -reskin_farthest ? -reskin_farthest : x);
 }
 
 /* Multiply the map's marginal probabilities of places and forces by the networks' normal distributions. `reskin_likely`
- * has the deviances, and `least` is the least of them. Write the place and its standard deviations to `result`; their
- * weights are a power of the product. Return the log force. */
+ * has the deviances, and `least` is the least of them. Write the place and its standard deviations to `result`; the
+ * standard deviations are those of a power of the product. Return the log force. */
 static reskin_real reskin_products(reskin_real least, const reskin_real *mean, const reskin_real *sd,
                                    reskin_real power, reskin_result *result)
 {

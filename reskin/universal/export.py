@@ -234,7 +234,7 @@ def _likelihoods(g: Graph, of: Gaussians, db_uT: str) -> tuple[str, str, str]:
 
 
 def _whitening(of: Gaussians) -> tuple[Float32[np.ndarray, "h ch ch"], Float32[np.ndarray, "h ch"]]:
-    """Return the whitening matrix W of each Gaussian and W m, from the rows of `Gaussians`."""
+    """Return, for each Gaussian with mean m, its whitening matrix W and W m, from the rows of `Gaussians`."""
     hypotheses_n = of.row.shape[1]
     channels_n = int((np.sqrt(9 + 8 * len(of.row)) - 3) / 2)  # rows: channels_n (channels_n + 3) / 2
     white = np.zeros((hypotheses_n, channels_n, channels_n), np.float32)

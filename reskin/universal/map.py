@@ -262,8 +262,8 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
 
 
 # How a skin slides under a press can change from day to day. These parameters describe it; the others are constant.
-# The correlations are between one day and the next, if the slide has changed: of a parameter of the slide, and of the
-# law's errors. They were chosen on simulated skins (tests/benchmarks/test_days_benchmark.py).
+# Correlations between two days if the slide has changed: the first of each parameter of the slide, the second of the
+# law's errors. Both were chosen on simulated skins (tests/benchmarks/test_days_benchmark.py).
 SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
@@ -525,7 +525,7 @@ def condition_on_labels(
 
 
 def begin_day(skin: SkinMap) -> SkinMap:
-    """Return the map for a day on which the skin slides in another way; it must not be conditioned on labels yet.
+    """Return the map for a day on which the skin slides in another way; `skin` must not be conditioned on labels.
 
     The parameters of the slide get new values, which have a correlation of `SLIDE_CORRELATION` with those of the day
     before; their prior is the same on all days. Their values on earlier days are appended to the parameters, because
@@ -572,7 +572,7 @@ def _condition(
 def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
     """Condition the Gaussian of the parameters on observations, given as information matrix and information vector.
 
-    Both may be those of the first parameters only.
+    Both may cover only the first parameters.
     """
     if more_n := len(skin.mean) - len(vector):
         matrix, vector = np.pad(matrix, (0, more_n)), np.pad(vector, (0, more_n))

@@ -95,7 +95,7 @@ EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, sing
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
 OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
-# Log odds from which presses of a new day are taken to be of a skin that slides as on the last day. Otherwise, a change
+# Least log odds, from presses of a new day, with which the skin is assumed to slide as on the last day. Below, a change
 # is assumed, because an unnoticed change costs more accuracy than a wrongly assumed one. Chosen on simulated skins.
 SAME_SLIDE_LOG_ODDS_MIN = 2.0
 UNSTORED = ("names", "area")  # fields of `Tables` that follow from the card
@@ -285,15 +285,15 @@ class PressCalibration:
 
     @property
     def spread(self) -> "PressCalibration":
-        """This or the last earlier calibration whose presses are known to be spread evenly or over the area."""
+        """The latest calibration, of this or an earlier day, whose presses are spread evenly or over the area."""
         known = len(self.data.even_uT) or len(self.data.area_uT)
         return self if known or self.earlier is None else self.earlier.spread
 
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        labels: of the days since the slide changed; those of the days before are added. few: whether the line is for
-        forces of another map, which is not conditioned on presses with known forces. By default, this is so for 1 to
+        labels: those since the slide changed; labels of the days before are added. few: whether the line corrects
+        the forces of another map, which is not conditioned on presses with known forces; by default, with 1 to
         `FEW_N` - 1 known forces, which the map and the line would otherwise use twice.
         """
         by_day = self.labels_by_day(labels)
@@ -312,7 +312,7 @@ class PressCalibration:
         return CalibratedModel(skin, self.layers, offsets_mm, few=few_forces)
 
     def labels_by_day(self, labels: LabelledPresses) -> list[tuple[LabelledPresses, Sequence[Layers]]]:
-        """Return labels since the last change of the slide, then before it, and so on, each with their networks."""
+        """Return groups of labels between changes of the slide, latest first, each with its networks."""
         earlier = self.earlier
         return [(labels, self.layers), *([] if earlier is None else earlier.labels_by_day(earlier.data.labels))]
 
@@ -330,7 +330,7 @@ class PressCalibration:
         return [*day.held_out(day.data.labels, few=few), *day.held_out_earlier(few)]
 
     def same_slide_log_odds(self, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
-        """Return, for each press of a later day, log odds that the skin slides in the same way as on this day.
+        """Return the log odds, for each press of a later day, that the skin slides in the same way as on this day.
 
         These are the press's log likelihoods (summed over places and forces) under the map of this day, minus those
         under the map for another slide. Both maps are conditioned on the labels of this day.
@@ -354,7 +354,7 @@ def calibrate_day(
     """Calibrate to one day's presses at unknown places, given the calibration to the days before, if any.
 
     If the skin slides as on the last day, the presses of both days are treated as presses of one day. Otherwise, the
-    days before only tell about the skin's constant properties.
+    presses of the days before are used only for the skin's constant properties.
     """
     if last is not None:
         pressed_uT = np.concatenate([data.presses_uT, data.labels.db_uT])
@@ -551,9 +551,9 @@ class Universal:
 
     @property
     def label_frame(self) -> LabelFrame | None:
-        """Most probable orientation of the axes of the current day's labels other than the given one.
+        """Most probable orientation of the axes of the current day's labels, unless it is the given one.
 
-        None if there are few labels on the current day. Labels of earlier days are taken as right.
+        None if there are few labels on the current day. Labels of earlier days are assumed to be right.
         """
         labels, data = self._data.labels, self._calibration.data
         if len(labels) < LABELS_MIN_N:
@@ -804,7 +804,7 @@ class Universal:
     def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
         """Write the estimate of this skin as an ONNX file, for programs without Python (docs/robots.md).
 
-        Input `db_uT` are field changes since the no-load reading, along the chips' axes [f, ch], in double precision.
+        Input `db_uT` has field changes since the no-load reading, along the chips' axes [f, ch], in double precision.
         Outputs are the attributes of `estimate`, `change_uT` (|dB|) and, if `quiet_uT` is given, `contact`. quiet_uT:
         readings without contact; their noise determines the threshold of contact, as in `reskin.open`. Requires the
         package onnx; raises SchemaError before `zero`.
@@ -904,7 +904,7 @@ def load_universal(
     new_day: set it if the skin may slide under presses in another way than when the file was saved, for example a day
     later. The presses in the file are then those of an earlier day, with which further presses are compared (see
     `Universal.slide`). Either the skin slides in the same way, and all presses are used together; or it does not, and
-    those of the earlier day only tell about the skin's constant properties. Until there are presses, a change is
+    those of the earlier day are used only for the skin's constant properties. Until there are presses, a change is
     assumed.
     file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
     external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change

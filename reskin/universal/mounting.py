@@ -67,7 +67,7 @@ class Mounting:
             sentences.append(
                 f"the skin is taken as {found}, but its no-load field fits both orientations (log odds "
                 f"{self.log_odds:.1f}). If you know the orientation, state it in Python: zero(noload_uT, turned=True "
-                "or False). Otherwise, compare errors at known places with both."
+                "or False). Otherwise, compare errors at known places in both orientations."
             )
         return sentences
 

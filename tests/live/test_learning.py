@@ -180,7 +180,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
         until(reader.waiting.is_set, session)
         until(lambda: session.skin.zeroed, session)
         place = {"x_mm": 4.0, "y_mm": 12, "force_N": 0.8, "learn": True}
-        assert "nothing would use it" in said(session, {"label": place}, "labelled")
+        assert "neither recorded nor used" in said(session, {"label": place}, "labelled")
         receive(session, '{"press": "record"}')
         for wrong, message in (
             ({"x_mm": None}, "x must be a number"), ({"y_mm": "8"}, "y must be a number"),
@@ -259,7 +259,7 @@ def test_press_whose_rest_is_not_recorded_is_refused(tmp_path, monkeypatch):
         (reader.unix_s() - 1.0, reader.unix_s()),
         (reader.unix_s() + 1.0, reader.unix_s() + 2.0),
     )
-    with pytest.raises(CaptureError, match="recording began after the rest before this press. Press again"):
+    with pytest.raises(CaptureError, match="recording has no reading without contact before this press. Press again"):
         recording.add(press)
     assert recording.end() == f"recorded {recording.folder}"
     assert recording.folder.name.endswith("-dev-board")
@@ -278,7 +278,7 @@ def feed(press, contact, seconds, rate_hz=100.0):
 
 @pytest.mark.parametrize(
     ("parts", "problem"),
-    [([(True, 1.0)], "had already begun"), ([(False, 0.3), (True, 1.0)], "no rest before"),
+    [([(True, 1.0)], "began before the label"), ([(False, 0.3), (True, 1.0)], "touched shortly before"),
      ([(False, 1.0), (True, 0.03)], "too short")],
 )  # fmt: skip
 def test_unusable_presses_are_explained_and_the_next_one_counts(parts, problem):

@@ -86,7 +86,7 @@ class Board {
     const state = this.state = next;
     this.say("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
     this.say("about", state.waiting ? "" : `${state.board.replaceAll("uT", "µT")}. ${state.places_known ? "" : "The positions of its chips are unknown; they are drawn in a row."}`);
-    this.say("model", state.model || "none, so no place or force; to load one, use --model");
+    this.say("model", state.model || "none, so no place or force is estimated; to load one, use --model");
     this.say("expected", state.expected || "–"); this.say("least_force", state.least_force || "–"); this.say("learnt", state.learnt || "nothing yet");
     this.parts.emulated.hidden = !state.true_places;
     this.parts.skinbox.hidden = this.parts.learn.parentElement.hidden = !state.adaptable;
@@ -154,7 +154,7 @@ class Board {
     const more = this.traces.map((trace, i) => trace.draw(this.rows, this.changed, i ? last.chips : 1, state.zero_bins));
     this.changed = Infinity; this.dirty = more.includes(true);
     this.parts.truth_key.hidden = !this.truthShown();
-    this.say("off", this.truthShown() ? this.truthText() : "(this board is emulated, so the true place is known; its touches do not follow the crosses of Places)");
+    this.say("off", this.truthShown() ? this.truthText() : "(this board is emulated, so the true place is known; it is not touched at the crosses that Places shows)");
     const sure = (sd) => Number.isNaN(sd) ? "" : ` ± ${sd.toFixed(1)}`, among = Number.isNaN(last.sdX) || state.adaptable ? "" : " between models";
     this.say("place", last.contact && !Number.isNaN(last.x) ? `x ${last.x.toFixed(1)}${sure(last.sdX)}, y ${last.y.toFixed(1)}${sure(last.sdY)} mm${among}` : last.contact ? "contact" : "no contact");
     this.say("force", number(last.force, 2, "N"));

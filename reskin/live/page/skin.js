@@ -6,7 +6,7 @@ const TRAIL_MS = 1500, TRAIL_GAP_MS = 200; // the trail is interrupted where no 
 const STRENGTHS = [[0x3F, 0x8F, 0xD9], [0x35, 0xB2, 0x9A], [0xE6, 0xB4, 0x00], [0xE0, 0x56, 0x2B], [0xA3, 0x12, 0x3F]], STRONG_N = 10; // colours from 0 N to STRONG_N
 const LEGEND_PX = 46;
 
-function strengthColour(force_N) { // the colour of a contact; its square root is linear in the scale, so that light touches differ
+function strengthColour(force_N) { // the colour of a contact; the colour scale is linear in the square root of the force, so that light touches have different colours
   const share = Math.sqrt(Math.min(Math.max(force_N || 0, 0) / STRONG_N, 1)) * (STRENGTHS.length - 1), i = Math.min(Math.floor(share), STRENGTHS.length - 2);
   return `rgb(${STRENGTHS[i].map((low, j) => Math.round(low + (share - i) * (STRENGTHS[i + 1][j] - low))).join()})`;
 }
@@ -84,7 +84,7 @@ function drawCross(pen, px, py, size) { // where to press next
   pen.stroke(); pen.lineWidth = 2;
 }
 
-function drawTruth(pen, px, py, text) { // an empty square on its corner with text: unlike an estimate, which is a filled circle
+function drawTruth(pen, px, py, text) { // an empty square that stands on a corner, with a text; it differs from an estimate, which is a filled circle
   const size = 15;
   pen.strokeStyle = pen.fillStyle = colour("--truth"); pen.lineWidth = 3; pen.setLineDash([5, 3]);
   pen.beginPath(); pen.moveTo(px - size, py); pen.lineTo(px, py - size); pen.lineTo(px + size, py); pen.lineTo(px, py + size); pen.closePath(); pen.stroke();

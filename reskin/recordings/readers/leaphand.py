@@ -5,8 +5,8 @@ one pad, a board of five chips; option `pad` selects it. The file contains neith
 choosing this layout, the user states that nothing touches the pads, so places are NaN and the normal force is 0. The
 recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
 
-The no-load field is the mean over the first rows between which the hand hardly moves. Joint positions are not part of
-`Readings`; `read_motion` returns them.
+The no-load field is the mean over the first successive rows in which the hand hardly moves. Joint positions are not part
+of `Readings`; `read_motion` returns them.
 """
 
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ JOINTS_N = 4  # joints of a finger; each finger has one pad
 PADS_MAX_N = 4
 COUNTS_PER_TURN = 4096  # joint positions of the hand's servos are whole numbers from 0 to 4095
 NOLOAD_ROWS_N = 5
-# During the no-load rows, each joint moves by at most this much, 4.4 degrees. In recordings of four pads, the hand
+# In the no-load rows, each joint moves by at most this many counts: 4.4 degrees. In recordings of four pads, the hand
 # rests in the first five rows. In recordings of two pads, the first row is in another pose, and the next five rows span
 # 39 counts. Turning by 4.4 degrees changes the earth's field along an axis by at most 5 uT, which is about the noise.
 STILL_COUNTS = 50
@@ -41,7 +41,7 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of all joints in the rows of `read`, and the single rows of which the no-load field is the mean."""
+    """Positions of all joints in the rows of `read`, and the fields of the no-load rows."""
 
     joint_counts: Int64[np.ndarray, "f j"]
     noload_uT: Float64[np.ndarray, "n ch"]
