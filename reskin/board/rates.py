@@ -16,7 +16,7 @@ from reskin.board.faults import SILENCE_S, clock_jumps, find_reading_faults, mis
 from reskin.board.wire import Frames
 from reskin.physics.chip import CONVERSION_S, DIG_FILT_MAX, OSR_MAX, conversion_s
 
-# Repeated readings are reported above this share. In 30 public recordings of real boards, it is at most 0.024;
+# Repeated readings are reported above this share. In 30 public recordings of real boards, it is up to 0.024;
 # the values of a chip with a coarse LSB are sometimes equal by chance.
 REPEATED_MAX = 0.05
 ALL_REPEATED = 0.99  # above this share, the board sends the same reading again and again

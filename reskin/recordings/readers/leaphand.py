@@ -5,8 +5,8 @@ one pad, a board of five chips; option `pad` selects it. The file contains neith
 choosing this layout, the user states that nothing touches the pads, so places are NaN and the normal force is 0. The
 recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
 
-The no-load field is the mean over the first successive rows in which the hand hardly moves. Joint positions are not part
-of `Readings`; `read_motion` returns them.
+The no-load field is the mean over the first successive rows in which the hand hardly moves. Joint positions are not
+part of `Readings`; `read_motion` returns them.
 """
 
 from collections.abc import Mapping
