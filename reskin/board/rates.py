@@ -26,8 +26,8 @@ CLOCK_FRAMES_N = 400  # number of frames from which the usual step of the board'
 CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of resolution to step
 
 # Bits on the I2C bus for one chip: 9 per byte, including the acknowledge bit, and one for each start, repeated start
-# and stop. Each command takes 4 bytes: address, command, address again, and status. Command RM (read the measurement) takes
-# 8 more bytes, for T, X, Y and Z.
+# and stop. Each command takes 4 bytes: address, command, address again, and status. Command RM (read the measurement)
+# takes 8 more bytes, for T, X, Y and Z.
 START_BITS_N = 9 * 4 + 3  # command SM: start a single conversion
 READ_BITS_N = 9 * (4 + 8) + 3
 I2C_HZ = (100e3, 400e3, 1e6)  # Arduino's default, the rate in the ReSkin and AnySkin firmware, and the chip's maximum
