@@ -195,7 +195,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
         reader.resume()
         # The skin had too short a rest before the first press, so the label still waits.
         until(reader.waiting.is_set, session)
-        assert session.state()["labelling"].endswith("lift for a second, then press again")
+        until(lambda: session.state()["labelling"].endswith("lift for a second, then press again"), session)
         receive(session, json.dumps({"label": place | {"force_N": None, "x_mm": 12, "y_mm": 4}}))
         reader.resume()
         until(lambda: session.state()["recording_n"] == 1, session)
