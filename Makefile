@@ -2,7 +2,7 @@
 # make test    lint, types, layers, tests
 # make test-processors   checks that training gives the same bits on emulated Intel and AMD processors (needs qemu-user)
 # make ui      the MLflow UI on the embedded store
-# make bench   benchmarks at full size (the tests run each at a tiny size)
+# make bench   benchmarks at full size (the tests run each at a tiny size), and slow tests
 # make faults   injects every fault for real (Linux; mounts need root) -> docs/faults.md
 # make time-repro   times `make repro` in a fresh clone (three runs of its stages) -> reports/time.json
 # make constraints   finds the newest compatible versions -> constraints.txt; then run make test, and commit
@@ -69,7 +69,7 @@ ui: $(STAMP)
 	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks -s -q -p no:xdist
+	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/test_numerics.py -s -q -p no:xdist
 
 # Kills, full disks, truncated files, dead servers: each fault is injected into a copy of a small finished checkout.
 faults: $(STAMP)

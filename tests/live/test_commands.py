@@ -50,7 +50,8 @@ def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
         commands.record(port=name, seconds=3.0, out=tmp_path / "run1", **NO_OPTIONS)
     rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
     assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
-    assert (rate.method, rate.repeated_frames) == ("arrivals", 0.0)
+    assert rate.method == "arrivals"
+    assert rate.repeated_frames < 0.01  # when the script begins again, a whole frame may repeat
     assert rate.repeated_readings == pytest.approx(2 / 3, abs=0.01)
     output = capsys.readouterr().out
     assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output

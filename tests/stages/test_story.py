@@ -29,6 +29,7 @@ from pipeline.report.tables import table_2_summary
 from pipeline.scenes import ANALYSES
 from reskin import io
 from reskin.models.inputs import Scaler
+from tests.benchmarks import FULL
 from tests.compiled import compile_kernels
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
@@ -52,6 +53,7 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
 OUTPUT = "output.txt"  # file with the output of the first run
 # time limit for tests that hang; long, because a busy machine needs four times as long
 pytestmark = pytest.mark.timeout(1800)
+slow = pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 
 
 @pytest.fixture(scope="module")
@@ -334,6 +336,7 @@ def test_mlflow_model_predicts_like_the_saved_model(story, monkeypatch):
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
+@slow
 def test_repeated_training_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
@@ -403,6 +406,7 @@ def test_missing_tracking_server_is_reported_quickly(story):
     assert time.monotonic() - start_s < 100  # without our time limit, MLflow would retry for minutes
 
 
+@slow
 def test_removed_experiment_leaves_no_files(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
