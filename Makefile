@@ -69,7 +69,7 @@ ui: $(STAMP)
 	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/test_numerics.py -s -q -p no:xdist
+	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py -s -q -p no:xdist
 
 # Kills, full disks, truncated files, dead servers: each fault is injected into a copy of a small finished checkout.
 faults: $(STAMP)

@@ -1,12 +1,14 @@
 """Tests of domain-adversarial training: gradient reversal, control, effect on features."""
 
 import numpy as np
+import pytest
 import torch
 
 from reskin.models.adversarial import Domains, ramp, reverse_gradient, train_adversarial
 from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Schedule
 from reskin.seeds import rng_for
+from tests.benchmarks import FULL
 from tests.models.example_jobs import some_rows
 
 SCHEDULE = Schedule(steps_n=600, batch_n=32, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0)
@@ -41,6 +43,7 @@ def test_weight_of_the_reversed_gradient_rises_from_0_to_1():
     assert abs(ramp(1.0) - 1) < 1e-4
 
 
+@pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_features_of_both_skins_converge():
     # Over 12 seeds, the ratio is 0.30 with a standard deviation of 0.12: the mean of three seeds is four standard
     # errors (0.068 each) below 0.6. After only 150 steps, the ratio would be 1.05 +- 0.45, which is inconclusive.

@@ -27,6 +27,7 @@ from reskin.simulation.defaults import nominal
 from reskin.universal import law
 from reskin.universal import law as fit
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, memory, pool
+from tests.benchmarks import FULL
 from tests.data.tables import readings
 from tests.recordings.test_recordings import LAB, ingest
 
@@ -228,6 +229,7 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
     return {board: pool(recordings) for board, recordings in captures.items()}
 
 
+@pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
     # A third of the places: 22 of 65 in each of three recordings. Parameters fitted there must agree with those of all
     # places.
