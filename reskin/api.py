@@ -453,7 +453,7 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
     Parameters
     ----------
     path : path
-        One of these recordings, which are told apart by their content:
+        One of these recordings; the function finds out which kind it is:
 
         - a capture's folder, as `reskin record` and `reskin add` write it
         - the log of an SD card

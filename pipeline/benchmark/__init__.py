@@ -1,6 +1,6 @@
 """A benchmark that other people can enter: frozen folds, a file format for predictions, scores, a table of entries.
 
-docs/benchmark.md says what is asked, how to enter, and which rules hold.
+docs/benchmark.md describes the task, how to enter a method, and the rules.
 
     >>> from pipeline import benchmark
     >>> task = benchmark.tasks("simulated")[0]

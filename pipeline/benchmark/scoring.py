@@ -15,7 +15,7 @@ from pipeline.report.formatting import rounded, show, tabulate
 from pipeline.statistics import statistic
 from reskin import io
 from reskin.config import Strict
-from reskin.metrics import TRUTH, coverage_pct, interval_score, median_error_mm, score
+from reskin.metrics import coverage_pct, interval_score, median_error_mm, score
 
 FORMAT: Literal["reskin-benchmark-scores-1"] = "reskin-benchmark-scores-1"
 METRICS = {
@@ -116,7 +116,7 @@ def score_folds(predictions: Predictions, dataset: Dataset) -> pd.DataFrame:
         lines.append(
             {"labels_n": labels_n, "board": draw.board, "draw": draw.draw} | scores | _uncertainty(true, limits)
         )
-    table = pd.DataFrame(lines).drop(columns=list(TRUTH), errors="ignore")
+    table = pd.DataFrame(lines)
     return table[[name for name in ("labels_n", "board", "draw", *METRICS) if name in table]]
 
 
