@@ -27,6 +27,7 @@ from reskin.errors import DISK_REMEDIES, SchemaError
 from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
 
+PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file
 COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # key in the metadata of a safetensors file
 HEADER_AT = 8  # byte at which the header of a safetensors file starts; the bytes before are its length
@@ -209,6 +210,12 @@ def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
 def write_table(path: Path, table: pa.Table) -> None:
     with replacing(path) as temporary:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
+
+
+def is_parquet(path: Path) -> bool:
+    """Return whether a file begins as a Parquet file does."""
+    with path.open("rb") as stream:
+        return stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
 
 
 def read_table(path: Path) -> pa.Table:

@@ -23,7 +23,6 @@ from reskin.schema import LABELS, UNITS, Readings, unit_of
 if TYPE_CHECKING:
     import pandas as pd
 
-PARQUET_MAGIC = b"PAR1"
 EXTRA = "learn"  # the extra of pyproject.toml that installs pandas
 
 
@@ -34,9 +33,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
     if not 0 < rate_hz <= RATE_MAX_HZ:
         raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
     if log.is_file():
-        with log.open("rb") as stream:
-            is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-        if is_parquet:
+        if io.is_parquet(log):
             return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
     return sd_card.read_log(log)
 
@@ -110,7 +107,7 @@ def _kind_of(file: Path) -> str:
         raise CaptureError(f"{file}: file not found. Check the path.")
     with file.open("rb") as stream:
         head = stream.read(sd_card.HEADER_CHARACTERS_MAX)
-    if head.startswith(PARQUET_MAGIC):
+    if head.startswith(io.PARQUET_MAGIC):
         names = io.read_column_names(file)
     else:
         names = [name.strip() for name in head.decode("utf-8-sig", errors="replace").partition("\n")[0].split(",")]

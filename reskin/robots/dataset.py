@@ -29,7 +29,7 @@ from reskin.recordings import clocks, probe
 from reskin.recordings.decode import read_frames
 from reskin.recordings.header import PROBE_FILE, Header
 from reskin.recordings.ingest import read_header
-from reskin.recordings.loading import PARQUET_MAGIC, read_any_log
+from reskin.recordings.loading import read_any_log
 from reskin.recordings.readers import sd_card
 from reskin.schema import from_table
 
@@ -132,9 +132,7 @@ def read_recording(file: Path, rate_hz: float | None) -> Recording:
         return _of_capture(file)
     if not file.is_file():
         raise SchemaError(f"{file}: file not found. Check the path.")
-    with file.open("rb") as stream:
-        is_parquet = stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-    if not is_parquet:
+    if not io.is_parquet(file):
         return _of_log(str(file), {}, read_any_log(file, 1.0))
     table = io.read_table(file)
     if "indentation" in table.column_names:
