@@ -332,7 +332,7 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 # displaced by 0.5 mm changes every cosine by less than 0.1.
 PENALTY = 0.1
 AXES = "xyz"
-AS_SAID = "Labels, chips and skin lie as {} says."
+AS_SAID = "Labels, chips and skin are oriented as {} states."
 ASSUMED_N = 1.0  # force of presses of unknown force, in simulations that are only compared in direction
 
 

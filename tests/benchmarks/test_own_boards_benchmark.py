@@ -90,7 +90,7 @@ def test_three_commands_lead_to_scores_and_a_model(tmp_path):
     print({row: scores["accuracy_pct"]["mean"] for row, scores in numbers["table2"].items()})
     assert set(numbers["table2"]) == {"single", "multi", "triplet", "adapted"}
     sentences = {board["frames"]["sentence"] for board in numbers["compare"]["by_board"].values()}
-    assert sentences == {"Labels, chips and skin lie as layout mine says."}
+    assert sentences == {"Labels, chips and skin are oriented as layout mine states."}
     table = pd.read_csv(root / files[0])
     lifted, touched = table[table.phase == "noload"], table[table.phase == "contact"]
     model = reskin.load_model(root / numbers["final_model"]["file"]).zero(lifted[FIELDS].to_numpy())

@@ -132,7 +132,9 @@ def test_boards_without_forces_have_only_frames(monkeypatch):
     section = square_section()
     boards = pool_skins([square_recording(section)], with_force=False)
     numbers, plot_data = compare_boards(boards, section, DESIGN, 0)
-    assert numbers["by_board"]["b"]["frames"]["sentence"] == "Labels, chips and skin lie as layout square says."
+    assert (
+        numbers["by_board"]["b"]["frames"]["sentence"] == "Labels, chips and skin are oriented as layout square states."
+    )
     assert (numbers["by_board"]["b"]["pokes_n"], numbers["by_board"]["b"]["fitted_n"]) == (25, 22)
     assert set(tables(numbers, "recorded")) == {"compare_frames"}
     assert figures(numbers, plot_data, "recorded") == {}

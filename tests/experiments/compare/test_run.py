@@ -84,7 +84,7 @@ def test_refit_for_a_board_changes_only_its_parameters(recorded):
 
 
 def test_agreeing_recording_has_no_departure(recorded):
-    assert sentence(recorded) == "Labels, chips and skin lie as the scene says."
+    assert sentence(recorded) == "Labels, chips and skin are oriented as the scene states."
 
 
 def test_swapped_chips_are_named(recorded):
@@ -245,7 +245,7 @@ def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
         assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
     for board, of_board in numbers["by_board"].items():
         assert 0.6 < of_board["nominal"]["cosine_mean"] < 0.82
-        assert of_board["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
+        assert of_board["frames"]["sentence"] == "Labels, chips and skin are oriented as the scene states."
         assert of_board["pokes_n"] == 66
         assert len(figure_data["boards"][board]["arrows_uT"]["recorded"]) == len(
             figure_data["boards"][board]["places_mm"]
