@@ -50,7 +50,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     network_ : Network
         The trained network, with its scaler.
     loss_curve_ : list of float
-        Mean squared error in each block of training steps, for scaled targets.
+        Mean squared error for scaled targets, at 50 evenly spaced points (fewer for a training with fewer steps).
     n_features_in_, feature_names_in_
         Number of channels, and their names if X was a DataFrame.
 

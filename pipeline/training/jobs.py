@@ -23,7 +23,7 @@ from reskin.data.splits import Fold, parse_folds
 from reskin.errors import SchemaError
 from reskin.metrics import score_groups
 from reskin.models.inputs import Scaler
-from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult
+from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult, curve_steps
 from reskin.models.recipe import AdaptationWithBase
 from reskin.models.runner import run_jobs
 from reskin.models.trained import FORMAT
@@ -86,6 +86,7 @@ class ModelCard(TypedDict):
     test_boards: list[str]
     test_skins: list[str]
     curve: list[float]
+    curve_steps: list[int]
     tuning: NotRequired[dict[str, Any]]
     scores: NotRequired[dict[str, Any]]
     git: NotRequired[str]
@@ -99,6 +100,8 @@ class _HasName(Protocol):
 class _HasTimes(Protocol):
     @property
     def seconds(self) -> float: ...
+    @property
+    def started_s(self) -> float: ...
     @property
     def one_reading_s(self) -> float: ...
 
@@ -282,6 +285,7 @@ def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str)
         test_boards=np.unique(rows.board[job.test]).tolist(),
         test_skins=np.unique(rows.skin[job.test]).tolist(),
         curve=[round(value, 9) for value in result.curve],
+        curve_steps=curve_steps(job.schedule.steps_n)[: len(result.curve)],
     )
     if job.tuning is not None:
         card["tuning"] = _tuning_record(job.tuning, rows)
@@ -326,9 +330,14 @@ def collapse_record(result: TrainingResult) -> dict[str, Any]:
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
-    """Write the seconds of each training run and of one prediction to a file that is not an output of a stage."""
+    """Write start, duration and prediction time of each training run to a file that is no output of the stage."""
     seconds = [
-        {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
+        {
+            "name": job.name,
+            "started_s": result.started_s,
+            "train_s": result.seconds,
+            "one_reading_s": result.one_reading_s,
+        }
         for job, result in zip(jobs, results, strict=True)
     ]
     io.write_json(SECONDS / scene / f"{stage}.json", seconds)

@@ -311,6 +311,7 @@ class ClassicalResult:
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
     seconds: float  # time of the fit
+    started_s: float  # Unix time at which the fit started
     one_reading_s: float  # median time of a prediction for a single reading
 
 
@@ -349,8 +350,8 @@ def _rows_of(job: ClassicalJob, data: TrainingData) -> _JobRows:
 
 
 def _fit(method: Classical, name: str, seed: int, rows: _JobRows) -> ClassicalResult:
-    start_s = time.monotonic()
+    started_s, start_s = time.time(), time.monotonic()
     fitted = fit(method, rows.train, rows.target, rng_for(seed, "baseline", name), weight=rows.weight)
     seconds = time.monotonic() - start_s
     one_reading_s = median_call_s(partial(fitted.predict, rows.test[:1]))
-    return ClassicalResult(fitted.predict(rows.test), fitted.rows_n, seconds, one_reading_s)
+    return ClassicalResult(fitted.predict(rows.test), fitted.rows_n, seconds, started_s, one_reading_s)

@@ -30,6 +30,7 @@ CODE_MODULES = (
 )
 LIBRARIES = ("torch", "numpy", "scipy")
 REPEATS_N = 25
+CURVE_POINTS_N = 50  # points of a loss curve; a training with fewer steps has one point per step
 
 Weights = Mapping[str, np.ndarray]
 
@@ -63,12 +64,13 @@ class TrainingData:
 class TrainingResult:
     """The result of a training run.
 
-    key: name of the result in the cache. curve: mean squared error in each block of steps. predicted: x, y in mm and
-    F in N for the test rows. stopped_step: step at which training diverged; None if it did not. If training diverged,
-    `weights` are those before the divergence. explained_min: explained variance (R2) of the worst target on training
-    rows; None for a short training run. seconds: training time of the stack, divided by its number of networks.
-    one_reading_s: median time of a prediction for one reading. reused: whether the result is from the cache.
-    collapsed_before_n: number of earlier training runs of this job, all of which collapsed.
+    key: name of the result in the cache. curve: mean squared error (scaled units) of the steps between two entries of
+    `curve_steps`. predicted: x, y in mm and F in N for the test rows. stopped_step: step at which training diverged;
+    None if it did not. If training diverged, `weights` are those before the divergence, and the curve ends there.
+    explained_min: explained variance (R2) of the worst target on training rows; None for a short training run.
+    seconds: training time of the stack, divided by its number of networks. started_s: Unix time at which the training
+    of the stack started. one_reading_s: median time of a prediction for one reading. reused: whether the result is
+    from the cache. collapsed_before_n: number of earlier training runs of this job, all of which collapsed.
     """
 
     key: str
@@ -79,6 +81,7 @@ class TrainingResult:
     stopped_step: int | None
     explained_min: float | None
     seconds: float
+    started_s: float
     one_reading_s: float
     reused: bool = False
     collapsed_before_n: int = 0
@@ -204,6 +207,16 @@ def _digest(*arrays: np.ndarray) -> str:
         found.update(f"{array.dtype}{array.shape}".encode())
         found.update(np.ascontiguousarray(array).data)
     return found.hexdigest()[:32]
+
+
+def curve_steps(steps_n: int) -> list[int]:
+    """Return the steps at which the points of the loss curve of a training of `steps_n` steps end.
+
+    >>> curve_steps(3), curve_steps(800)[:3], len(curve_steps(800))
+    ([1, 2, 3], [16, 32, 48], 50)
+    """
+    points_n = min(CURVE_POINTS_N, steps_n)
+    return [round(steps_n * (i + 1) / points_n) for i in range(points_n)]
 
 
 def median_call_s(call: Callable[[], object]) -> float:

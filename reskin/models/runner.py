@@ -56,7 +56,8 @@ def run_jobs(
         retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
         for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
             seconds = results[i].seconds + result.seconds
-            results[i] = replace(result, collapsed_before_n=attempt_i, seconds=seconds)
+            started_s = results[i].started_s
+            results[i] = replace(result, collapsed_before_n=attempt_i, seconds=seconds, started_s=started_s)
     return results
 
 
@@ -146,8 +147,8 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     for job, file, result in zip(jobs, files, results, strict=True):
         tensors = {f"weights.{name}": value for name, value in result.weights.items()} | result.scaler.arrays()
         tensors |= {"curve": np.array(result.curve), "predicted": result.predicted}
-        metadata = {"seconds": f"{result.seconds:.3f}", "one_reading_s": f"{result.one_reading_s:.3g}"}
-        metadata["job"] = job.name
+        metadata = {"seconds": f"{result.seconds:.3f}", "started_s": f"{result.started_s:.3f}"}
+        metadata |= {"one_reading_s": f"{result.one_reading_s:.3g}", "job": job.name}
         optional = {"stopped_step": result.stopped_step, "explained_min": result.explained_min}
         metadata |= {name: repr(value) for name, value in optional.items() if value is not None}
         io.write_tensors(file, tensors, metadata)
@@ -188,5 +189,6 @@ def _read_result(file: Path) -> TrainingResult:
         stopped_step=int(metadata["stopped_step"]) if "stopped_step" in metadata else None,
         explained_min=float(metadata["explained_min"]) if "explained_min" in metadata else None,
         seconds=float(metadata["seconds"]),
+        started_s=float(metadata["started_s"]),
         one_reading_s=float(metadata["one_reading_s"]),
     )

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -14,7 +15,15 @@ from torch.optim.adamw import adamw
 from reskin.errors import TrainingError
 from reskin.models.batches import BatchSampler, PreparedJob, prepare
 from reskin.models.inputs import VIEW, Scaler
-from reskin.models.job import LossWeights, TrainingData, TrainingJob, TrainingResult, Weights, median_call_s
+from reskin.models.job import (
+    LossWeights,
+    TrainingData,
+    TrainingJob,
+    TrainingResult,
+    Weights,
+    curve_steps,
+    median_call_s,
+)
 from reskin.models.losses import squared_error, triplet_loss
 from reskin.models.network import LAYERS, Predictor, Stack
 from reskin.models.recipe import Schedule
@@ -36,10 +45,12 @@ BETA2, EPS = 0.999, 1e-8
 
 @dataclass(frozen=True)
 class Outcome:
-    """The weights of a trained network, and the mean squared error of each block of steps (scaled units).
+    """The weights of a trained network, and its loss curve: the mean squared error between points (scaled units).
 
-    If a loss or a weight was not finite in some block, or if the loss exceeded `DIVERGED`, `stopped_step` is the last
-    step of that block, and the weights are those after the previous block. Otherwise, `stopped_step` is None.
+    Point i of the curve is the mean error of the steps up to `curve_steps(steps_n)[i]`, after those of the previous
+    point. If a loss or a weight was not finite in some block of steps, or if the loss exceeded `DIVERGED`,
+    `stopped_step` is the last step of that block; the weights are those after the previous block, where the curve
+    ends. Otherwise, `stopped_step` is None.
     """
 
     weights: Weights
@@ -50,7 +61,7 @@ class Outcome:
 def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[TrainingResult]:
     """Train jobs with equal settings together, and predict for their test rows."""
     torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
-    start_s, on, first = time.monotonic(), device(), jobs[0]
+    started_s, start_s, on, first = time.time(), time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
         raise TrainingError("RESKIN_DEVICE=cuda, but torch finds no CUDA device. Unset it to train on the CPU.")
     prepared, scalers = zip(*(prepare(job, data) for job in jobs), strict=True)
@@ -64,6 +75,7 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
             TrainingResult(
                 key="", weights=outcome.weights, scaler=scaler, curve=outcome.curve,
                 predicted=_predict(network, scaler, view), stopped_step=outcome.stopped_step, seconds=seconds,
+                started_s=started_s,
                 explained_min=_explained_min(job, data, network, scaler),
                 one_reading_s=median_call_s(partial(_predict, network, scaler, view[:1])),
             )
@@ -85,7 +97,7 @@ def train(
     batches, monitor = BatchSampler(jobs, schedule.batch_n, device), Monitor(net)
     for first_step in range(0, schedule.steps_n, BLOCK_STEPS_N):
         steps_n = min(BLOCK_STEPS_N, schedule.steps_n - first_step)
-        total = torch.zeros(len(jobs), device=device)
+        errors = torch.empty((steps_n, len(jobs)), device=device)
         for step_i, batch in enumerate(batches.sample(steps_n), first_step):
             features = net.features(batch["inputs"])  # [m b 40]
             error = loss = squared_error(net.head(features), batch["targets"])  # [m]
@@ -104,10 +116,10 @@ def train(
             loss.sum().backward()  # each network's gradient depends only on the network's own loss
             clip_gradients(net, schedule.gradient_norm_max)  # a single large step can make all ReLUs of a layer dead
             optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
-            total += error.detach()
-        if not monitor.check(total / steps_n, first_step + steps_n):
+            errors[step_i - first_step] = error.detach()
+        if not monitor.check(errors, first_step + steps_n):
             break
-    return monitor.outcomes()
+    return monitor.outcomes(schedule.steps_n)
 
 
 def clip_gradients(net: Stack, norm_max: float) -> None:
@@ -168,28 +180,36 @@ class AdamW:
 
 
 class Monitor:
-    """Records the loss curve of each network of a stack, and the weights after the last block without divergence."""
+    """Records the errors of each network of a stack, and the weights after the last block without divergence."""
 
     def __init__(self, net: Stack) -> None:
         self.net = net
         self.weights = [net.weights_of(i) for i in range(net.members_n)]
-        self.curves: list[list[float]] = [[] for _ in self.weights]
+        self.sound_steps_n = [0 for _ in self.weights]
+        self.errors: list[torch.Tensor] = []
         self.stopped_step: dict[int, int] = {}
 
-    def check(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Record the mean errors of a block that ends at `step`; return False if all networks have diverged."""
-        is_sound = (self.net.is_finite() & (error <= DIVERGED)).tolist()  # False for NaN
+    def check(self, errors: Float[torch.Tensor, "s m"], step: int) -> bool:
+        """Record the errors of a block of steps that ends at `step`; return False if all networks have diverged."""
+        self.errors.append(errors)
+        is_sound = (self.net.is_finite() & (errors.mean(dim=0) <= DIVERGED)).tolist()  # False for NaN
         for i in set(range(len(is_sound))) - set(self.stopped_step):
             if is_sound[i]:
-                self.curves[i].append(float(error[i]))
+                self.sound_steps_n[i] = step
                 self.weights[i] = self.net.weights_of(i)
             else:
                 self.stopped_step[i] = step
         return len(self.stopped_step) < len(is_sound)
 
-    def outcomes(self) -> list[Outcome]:
-        parts = zip(self.weights, self.curves, strict=True)
-        return [Outcome(weights, curve, self.stopped_step.get(i)) for i, (weights, curve) in enumerate(parts)]
+    def outcomes(self, steps_n: int) -> list[Outcome]:
+        """Return the outcome of each network of a training that was to take `steps_n` steps."""
+        errors = torch.cat(self.errors).double().cpu().numpy()
+        outcomes = []
+        for i, (weights, sound_n) in enumerate(zip(self.weights, self.sound_steps_n, strict=True)):
+            edges = [0, *(step for step in curve_steps(steps_n) if step <= sound_n)]
+            curve = [float(errors[start:end, i].mean()) for start, end in pairwise(edges)]
+            outcomes.append(Outcome(weights, curve, self.stopped_step.get(i)))
+        return outcomes
 
 
 def _explained_min(

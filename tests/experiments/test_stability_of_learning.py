@@ -71,9 +71,10 @@ def test_sampler_that_accepts_ties_is_detected(monkeypatch):
 
 
 def test_unchecked_loss_is_detected(monkeypatch):
-    def unchecked(self, error, step):
-        for i in range(len(error)):
-            self.curves[i].append(float(error[i]))
+    def unchecked(self, errors, step):
+        self.errors.append(errors)
+        for i in range(errors.shape[1]):
+            self.sound_steps_n[i] = step
             self.weights[i] = self.net.weights_of(i)
         return True
 

@@ -1,13 +1,15 @@
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import nn
 
 from reskin.models.batches import BatchSampler, LabelledRows, PreparedJob
-from reskin.models.job import LossWeights, Weights
+from reskin.models.job import LossWeights, Weights, curve_steps
 from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Recipe
 from reskin.models.train import BLOCK_STEPS_N, Monitor, Outcome, clip_gradients, train
@@ -156,15 +158,25 @@ def test_unlabelled_pokes_train_the_feature_layers_only():
 
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
-def test_curve_is_the_mean_loss_of_each_block(steps_n):
+def test_curve_is_the_mean_loss_between_its_points(steps_n):
     schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # a rate with which the weights hardly change
     job = some_job()
     (outcome,) = run([job], schedule)
-    feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
+    feed, net, losses = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
     for n in block_sizes(steps_n):
-        losses = [nn.functional.mse_loss(net(b["inputs"][0]), b["targets"][0]).item() for b in feed.sample(n)]
-        blocks.append(sum(losses) / n)
-    assert outcome.curve == pytest.approx(blocks, rel=1e-5)  # rounding of float32 sums
+        losses += [nn.functional.mse_loss(net(b["inputs"][0]), b["targets"][0]).item() for b in feed.sample(n)]
+    means = [sum(losses[start:end]) / (end - start) for start, end in pairwise([0, *curve_steps(steps_n)])]
+    assert outcome.curve == pytest.approx(means, rel=1e-5)  # rounding of float32 sums
+
+
+@given(st.integers(1, 100_000))
+def test_points_of_a_curve_are_evenly_spaced_and_end_with_the_training(steps_n):
+    ends = curve_steps(steps_n)
+    assert len(ends) == min(50, steps_n)
+    assert ends[-1] == steps_n
+    lengths = [end - start for start, end in pairwise([0, *ends])]
+    assert 1 <= min(lengths)
+    assert max(lengths) - min(lengths) <= 2
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 1), (1, 16), (3, 16), (17, 1), (32, 100)])
@@ -180,7 +192,8 @@ def test_diverging_training_keeps_its_last_finite_weights(times, rate_max):
     (outcome,) = run([job], recipe(steps_n=500, rate_max=rate_max))
     assert outcome.stopped_step is not None
     assert outcome.stopped_step % BLOCK_STEPS_N == 0
-    assert len(outcome.curve) == outcome.stopped_step // BLOCK_STEPS_N - 1
+    sound_n = outcome.stopped_step - BLOCK_STEPS_N
+    assert len(outcome.curve) == sum(step <= sound_n for step in curve_steps(500))
     assert all(np.isfinite(values).all() for values in outcome.weights.values())
     assert np.isfinite(outcome.curve).all()
     if outcome.stopped_step == BLOCK_STEPS_N:
@@ -221,7 +234,7 @@ def test_divergence_restores_the_weights_of_the_previous_block(monkeypatch):
     (outcome,) = run([broken], schedule)
     assert len(checks) == len(block_sizes(170)) + 2  # no network is left to train after the second check
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
-    assert outcome.curve == whole.curve[:1]
+    assert outcome.curve == whole.curve[: sum(step <= BLOCK_STEPS_N for step in curve_steps(170))]
     assert all((outcome.weights[name] == checks[0][name]).all() for name in checks[0])
     assert any((outcome.weights[name] != broken.initial_weights[name]).any() for name in checks[0])
 
@@ -245,7 +258,7 @@ def test_diverging_network_does_not_affect_others_of_the_stack():
     assert same(last, well[2])
     assert ill.stopped_step == BLOCK_STEPS_N
     assert ill.curve == []
-    assert len(first.curve) == 3
+    assert len(first.curve) == len(curve_steps(120))
 
 
 def test_initial_weights_and_rows_are_not_modified():

@@ -81,8 +81,9 @@ def initial_result(job: TrainingJob) -> TrainingResult:
         np.zeros((0, 3), np.float32),
         None,
         None,
-        0.0,
-        0.0,
+        seconds=0.0,
+        started_s=0.0,
+        one_reading_s=0.0,
     )
 
 

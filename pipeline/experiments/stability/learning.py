@@ -11,7 +11,7 @@ from pipeline.experiments.stability.cases import Case, condition_case, error_cas
 from reskin.data.rows import Rows
 from reskin.data.splits import Split, draw_folds
 from reskin.metrics import METRICS, score
-from reskin.models.job import FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult
+from reskin.models.job import FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult, curve_steps
 from reskin.models.recipe import FineTuningRecipe, Recipe
 from reskin.models.train import BLOCK_STEPS_N, CHECKED_STEPS_N, train_stack
 from reskin.seeds import rng_for
@@ -132,7 +132,7 @@ def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
 def _exploding_weights(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
     start, steps_n = _start(job, rows, 1e3), 3 * STEPS_N
     trained = _train(_tuned(job, start, steps_n=steps_n, rate_max=rate), rows)
-    kept_step = STEPS_N * len(trained.curve)
+    kept_step = curve_steps(steps_n)[len(trained.curve) - 1] if trained.curve else 0
     stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
     losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
     sound = all(np.isfinite(value).all() for value in trained.weights.values())

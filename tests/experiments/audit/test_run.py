@@ -120,7 +120,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
     prepared, scaler = prepare(job, TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin))
     predicted = np.zeros((len(job.test), 3), np.float32)
     weights = prepared.initial_weights
-    return TrainingResult(f"key of {job.name}", weights, scaler, [1.0], predicted, None, None, 0.0, 0.0)
+    return TrainingResult(f"key of {job.name}", weights, scaler, [1.0], predicted, None, None, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture(autouse=True)
