@@ -270,9 +270,8 @@ def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str,
     nearest = cKDTree(features[0]).query(features[1])[1]
     error_mm = labels.place_mm[nearest] - tested.place_mm
     constant = np.full(len(tested), labels.force_N.mean())
-    return place_scores(error_mm) | {
-        "r2_f": r2(labels.force_N[nearest], tested.force_N), "r2_line_f": r2(constant, tested.force_N),
-    }  # fmt: skip
+    scores = place_scores(error_mm) | force_scores(labels.force_N[nearest], tested.force_N)
+    return scores | {"r2_line_f": r2(constant, tested.force_N)}
 
 
 def place_scores(error_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
@@ -284,12 +283,22 @@ def place_scores(error_mm: Float[np.ndarray, "t 2"]) -> dict[str, float]:
     }
 
 
+def force_scores(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t"]) -> dict[str, float]:
+    """Return scores of forces."""
+    error_N = force_N - true_N
+    return {
+        "r2_f": r2(force_N, true_N),
+        "mse_f_N2": float((error_N**2).mean()),
+        "median_error_N": float(np.median(np.abs(error_N))),
+    }
+
+
 def score_estimate(estimate: Estimate, tested: LabelledPresses) -> dict[str, float]:
     """Score estimates of tested readings, and coverage and score of their 90 % intervals."""
     error_mm, half_width_mm = estimate.place_mm - tested.place_mm, NORMAL_90 * estimate.sd_mm
     error_log = np.log(estimate.force_N / tested.force_N)
-    return place_scores(error_mm) | {
-        "r2_f": r2(estimate.force_N, tested.force_N),
+    scores = place_scores(error_mm) | force_scores(estimate.force_N, tested.force_N)
+    return scores | {
         "coverage_pct": 100 * coverage(estimate, tested.place_mm),
         "interval_score_mm": interval_score(error_mm, -half_width_mm, half_width_mm),
         "half_width_mm": NORMAL_90 * float(np.median(estimate.sd_mm)),
@@ -322,6 +331,7 @@ def summarise_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 TITLES = {
     "accuracy_pct": "within 1 mm, %", "median_mm": "median error, mm", "mse_xy_mm2": "MSE_xy, mm²", "r2_f": "R² of F",
+    "mse_f_N2": "MSE_F, N²", "median_error_N": "median error of force, N",
     "coverage_pct": "place in 90 % interval, %", "half_width_mm": "half-width, mm",
     "interval_score_mm": "interval score, mm", "coverage_f_pct": "force in 90 % interval, %",
     "half_width_f_factor": "half-width of force, factor", "r2_line_f": "R² of F, line",

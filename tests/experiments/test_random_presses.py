@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sklearn.metrics import mean_squared_error, median_absolute_error, r2_score
 
 from pipeline.experiments.random_presses import (
     CHECKERBOARD,
@@ -15,6 +16,7 @@ from pipeline.experiments.random_presses import (
     BoardPresses,
     RandomPresses,
     draw_presses,
+    force_scores,
     label_sets,
     score_draw,
     score_nearest,
@@ -44,6 +46,15 @@ def make_board(seed: int = 0) -> BoardPresses:
     presses = LabelledPresses(place_mm, force_N, poked_uT(place_mm, force_N, np.array([0.5, -0.5, 0.3])))
     press_i = np.repeat(np.arange(len(place_mm)), READINGS_N)
     return BoardPresses("b1", np.zeros(15), presses, presses[press_i], press_i)
+
+
+def test_force_scores_agree_with_scikit_learn():
+    rng = np.random.default_rng(5)
+    true_N, force_N = rng.uniform(0, 3, (2, 40))
+    scores = force_scores(force_N, true_N)
+    assert scores["mse_f_N2"] == pytest.approx(mean_squared_error(true_N, force_N))
+    assert scores["median_error_N"] == pytest.approx(median_absolute_error(true_N, force_N))
+    assert scores["r2_f"] == pytest.approx(r2_score(true_N, force_N))
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +100,7 @@ def test_nearest_label_is_exact_for_its_own_reading(board):
     scores = score_nearest(board.presses, board.presses)
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1
+    assert scores["mse_f_N2"] == scores["median_error_N"] == 0
     assert scores["r2_line_f"] == pytest.approx(0)  # score of a constant estimate, the mean force
 
 
