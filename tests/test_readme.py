@@ -88,3 +88,33 @@ def test_readme_is_short_and_links_are_valid():
             if "://" not in link and not (page.parent / link).exists():
                 broken.append(f"{page.name}: {link}")
     assert broken == []
+
+
+def test_recorded_block_shows_the_scores_of_presses_at_random_places():
+    """Compares cells of the table with the committed results of scene lab."""
+    quick, lab = (
+        join(*(io.read_json(ROOT / f"reports/{scene}/{name}.json") for name in ("numbers", "provenance")))
+        for scene in ("quick", "lab")
+    )
+    block = blocks_of([quick], [lab], {}, None)["recorded"]
+    (row,) = (
+        row
+        for row in lab["random_presses"]["rows"]
+        if (row["tested"], row["presses_n"], row["method"], row["labels"])
+        == ("other colour of a checkerboard", 65, "universal, simulated alone", "40")
+    )
+    mean, values = row["accuracy_pct"]["mean"], row["accuracy_pct"]["values"]
+    line = next(line for line in block.splitlines() if "we ship" in line and "within 1 mm" in line)
+    assert line.endswith(f"| {mean:.0f} ({values[0]:.0f}; {values[1]:.0f}) |")
+
+
+def test_simulated_block_shows_ours_next_to_the_paper():
+    results = [
+        join(*(io.read_json(ROOT / f"reports/{scene}/{name}.json") for name in ("numbers", "provenance")))
+        for scene in ("paper", "quick")
+    ]
+    block = blocks_of(results, [], {}, None)["headline"]
+    line = next(line for line in block.splitlines() if line.startswith("| Multi-sensor with triplet loss |"))
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    ours = [result["table2"]["triplet"]["accuracy_pct"]["mean"] for result in reversed(results)]
+    assert [cell.split()[0] for cell in cells[1:4]] == [f"{ours[0]:.0f}", f"{ours[1]:.0f}", "81"]
