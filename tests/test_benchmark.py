@@ -214,7 +214,7 @@ def test_parquet_has_the_scores_of_csv(tiny, tmp_path):
     assert score_file(tmp_path / "mine.parquet", ABOUT).tasks == score_file(csv, ABOUT).tasks
 
 
-def test_all_folds_with_some_number_of_labels_may_be_left_out(tiny, tmp_path):
+def test_all_folds_of_one_label_count_may_be_omitted(tiny, tmp_path):
     entry = score_file(write_rows(tmp_path, ROWS[4:]), ABOUT)
     assert [task.labels_n for task in entry.tasks] == [1]
 

@@ -129,7 +129,7 @@ def test_saved_network_is_loaded_as_a_model(tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {"mine.safetensors", "mine.json"}
 
 
-def test_failed_training_is_not_silent(monkeypatch):
+def test_failed_training_raises_or_warns(monkeypatch):
     X, y = poke_rows()
     with pytest.raises(TrainingError, match="diverged by step 4. Lower rate_max"):
         reskin.ContactRegressor(**SHORT | {"rate_max": 1e30, "gradient_norm_max": 1e30}).fit(X, y)
@@ -162,7 +162,7 @@ def with_unknown(y: np.ndarray) -> np.ndarray:
     return known
 
 
-def test_universal_regressor_is_the_universal_model(pressed):
+def test_universal_regressor_equals_the_universal_model(pressed):
     noload_uT, X, y = pressed
     known = with_unknown(y).astype(np.float32)
     model = reskin.load_universal().zero(noload_uT)

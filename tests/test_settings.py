@@ -67,7 +67,7 @@ MODELS = {stage: section_of(getattr(module_of(stage), stage)) for stage in FLOW 
 NEW_SCENE = YAML(typ="safe").load(scene_text("mine", ["b1", "b2"], 60, 2, "reskin"))
 
 
-def test_stages_with_a_section_are_those_with_scene_settings():
+def test_settings_of_all_stages_with_a_section_are_tested():
     assert {stage for stage, model in MODELS.items() if model} == SECTIONS | {"split"}
 
 

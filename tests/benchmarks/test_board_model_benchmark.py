@@ -82,7 +82,7 @@ def by_ridge(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray,
 
 
 def by_mean(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
-    """Predict the mean of the labels for all presses: what an estimate must be better than."""
+    """Predict the mean of the labels for all presses; any useful estimate must be better."""
     target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].mean(axis=0)
     return np.tile(target, (len(tested.db_uT), 1))
 
@@ -212,7 +212,7 @@ def test_field_changes_of_the_first_pass() -> None:
     recorded_uT = (readings.b_uT - readings.noload_uT).astype(float)[pressed]
     place_mm = np.column_stack([readings.x_mm, readings.y_mm])[pressed] - layout.centre_mm
     for turn_deg in (0, 90, 180, 270):
-        # To rotate the board is to rotate the places backwards: the skin and its magnets are symmetric.
+        # Skin and magnets are symmetric, so rotating the places backwards is equivalent to rotating the board.
         turned_mm = place_mm @ Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()[:2, :2]
         db_uT = simulate_uT(layout.law, layout.setup(), turned_mm, np.full(len(place_mm), 3.0))
         chips_uT = layout.to_chips(db_uT.reshape(len(db_uT), -1)).reshape(db_uT.shape)
@@ -277,10 +277,8 @@ def test_recorded_boards_with_fewer_chips(omitted: int | None) -> None:
     for board in ("board1", "board2"):
         parts = [read(file, "lab", {})[0] for file in sorted(folder.glob(f"{board}_depth*.csv"))]
         recorded = pool_captures(parts)
-        place_mm = recorded.place_mm * (1, -1) + (
-            0,
-            2 * layout.centre_mm[1],
-        )  # y of the labels is opposite to the board's
+        # the y axis of the labels is opposite to that of the board
+        place_mm = recorded.place_mm * (1, -1) + (0, 2 * layout.centre_mm[1])
         channels = (len(place_mm), 3 * len(kept))
         all_presses = Presses(
             recorded.db_uT[:, kept].reshape(channels), place_mm, recorded.force_N,

@@ -1,9 +1,9 @@
-"""Accuracy on a later day, on which the skin slides in another way, with presses of an earlier day and new ones.
+"""Accuracy on a later day on which the skin slides differently, with presses of both days.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_days_benchmark.py` prints the tables of docs/learning.md. All
-skins are simulated: parameters and errors of the law are those of training, with other seeds. On the later day, the
-parameters of the slide are those of the first day, or drawn again from the prior; with them, the law's errors are the
-same or drawn again. No recorded press is used.
+skins are simulated: parameters and errors of the law are drawn as in training, with other seeds. On the later day,
+either nothing has changed, or the parameters of the slide are drawn again from the prior, or these parameters and the
+errors of the law are drawn again. No recorded press is used.
 """
 
 from collections.abc import Callable, Iterator
@@ -47,7 +47,7 @@ FULL_ONLY = pytest.mark.skipif(not FULL, reason="at a tiny size, this repeats th
 class SkinOnTwoDays:
     """Presses on one skin, with the same places and forces on both days; the first `PLACES_N` are for calibration.
 
-    first_uT: field changes on the first day. later_uT: those on the later day, by what happened to the slide.
+    first_uT: field changes on the first day. later_uT: field changes on the later day, for each kind of change.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -127,10 +127,10 @@ class TwoDays:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_choice_of_correlations_and_of_the_limit(monkeypatch):
-    """Choose the settings in two steps; skins with the same and with other errors of the law count equally."""
+def test_correlations_and_limit_in_use_are_nearly_the_best(monkeypatch):
+    """Choose the correlations, then the limit; unchanged and changed errors of the law have equal weight."""
     skins = list(draw_skins(CHOICE_SKINS_N, CHOICE_SEED))
-    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)  # a change is assumed
+    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)  # always assume that the slide has changed
     by_pair = {}
     for pair in CORRELATIONS:
         with monkeypatch.context() as settings:
@@ -173,7 +173,7 @@ def test_accuracy_on_a_later_day():
             for labels_n, days in by_labels_n.items():
                 together = days.score(change, n, TOGETHER)
                 same = days.log_odds(change, n) >= model.SAME_SLIDE_LOG_ODDS_MIN
-                by_day = together if same else days.score(change, n, BY_DAY)  # saves time: they are equal
+                by_day = together if same else days.score(change, n, BY_DAY)  # with the same slide, both are equal
                 scores.setdefault((change, labels_n, n), []).append((together, alone, by_day))
     for change, of_skins in cosines.items():
         print(f"cosine of equal presses, slide {change}: 5, 50, 95 % quantiles {np.percentile(of_skins, [5, 50, 95])}")
@@ -242,8 +242,8 @@ def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
-    """Use recordings of one depth in place of the first day, and of another depth in place of the later day.
+def test_recorded_depths_used_as_days(shared_data, tmp_path):
+    """Use recordings at one depth as the first day, and recordings at another depth as the later day.
 
     They were not recorded on different days, so this does not test the change from day to day. Labels are at tested
     places. No setting was chosen on these recordings.
@@ -257,7 +257,9 @@ def test_recorded_depths_in_place_of_days(shared_data, tmp_path):
         depths, place_mm = [presses[order] for presses in depths], depths[0].place_mm[order]
         np.testing.assert_allclose([presses.place_mm for presses in depths], [place_mm] * len(depths), atol=1e-9)
         new_n = max(RECORDED_PRESSES_N)
-        presses_i = np.concatenate([np.arange(PLACES_N), np.arange(PLACES_N - new_n)])  # the last new_n are not tested
+        presses_i = np.concatenate(
+            [np.arange(PLACES_N), np.arange(PLACES_N - new_n)]
+        )  # the last new_n presses are not tested on the later day
         for first, later in permutations([presses[presses_i] for presses in depths], 2):
             skin = SkinOnTwoDays(
                 np.mean(rests_uT, axis=0), first.place_mm, first.force_N, first.db_uT, {CHANGED: later.db_uT}

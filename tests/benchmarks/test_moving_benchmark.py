@@ -1,4 +1,4 @@
-"""Choices of the universal model in external fields, on simulated skins: networks, distance of magnets, coverage.
+"""Design choices of the universal model in external fields, compared on simulated skins.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_moving_benchmark.py`, a minute of processor time. Experiment
 `moving_hand` measures the results of these choices, also on recordings.
@@ -43,7 +43,7 @@ NETWORKS = ("reading as it is", "mean over chips removed", "left out", "expected
 
 
 def with_networks(model: CalibratedModel, found: Evaluation, db_uT: np.ndarray, networks: str) -> Evaluation:
-    """Replace the networks' estimates by those of one of the ways `NETWORKS`."""
+    """Replace the networks' estimates as one of the options `NETWORKS` states."""
     own = found.network
     if networks == "left out":
         nothing = np.full_like(own.sd_mm, 1e6)
@@ -57,7 +57,7 @@ def with_networks(model: CalibratedModel, found: Evaluation, db_uT: np.ndarray, 
 
 
 def test_networks_and_distance_on_simulated_skins():
-    """Compare what the networks receive, and distances of the assumed magnets; this decided both."""
+    """Compare inputs of the networks and assumed distances of magnets; both choices follow from these results."""
     skins_n, shipped = size(24, 1), load_universal()
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
     skins = draw_prior_skins(prior, skins_n, SEED, "external fields", law_error())

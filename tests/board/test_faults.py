@@ -137,7 +137,7 @@ class TestStuck:
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
     def test_stuck_chips_equal_naive_loop(self, stretches, chips_n):
-        """In each stretch of frames, bit 0 changes chip 0, bit 1 changes the last chip; other chips stay constant."""
+        """In each run of frames, chip 0 changes if bit 0 is set, the last chip if bit 1 is set; others are constant."""
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Tests of measured frame rates, of computed limits, and of the sentence that compares them, on emulated boards."""
+"""Tests of measured frame rates, computed rate limits, and the sentence that explains the rate by a limit."""
 
 import re
 from dataclasses import astuple
@@ -18,7 +18,7 @@ from tests.live.boards import make_script
 
 
 def play(script):
-    """Return the board that is recognised if each frame of a script arrives at its due time."""
+    """Return the board recognised from a script whose frames all arrive at their due times."""
     return find.recognise("port", [(piece, t_s) for piece, t_s in zip(script.pieces, script.t_s, strict=True) if piece])
 
 
@@ -61,7 +61,7 @@ def test_measurement_does_not_depend_on_portions(lengths):
     assert (parts.frames_n, *astuple(parts)[3:]) == (whole.frames_n, *astuple(whole)[3:])
 
 
-def test_a_silence_and_bytes_that_were_waiting_do_not_change_the_rate():
+def test_silence_and_buffered_bytes_do_not_change_the_rate():
     script = make_script(pokes_n=0)
     chunks = list(zip(script.pieces, script.t_s.tolist(), strict=True))
     waiting = [(b"".join(script.pieces[:200]), 0.0), *((piece, t_s - 0.4975) for piece, t_s in chunks[200:])]
@@ -73,7 +73,7 @@ def test_a_silence_and_bytes_that_were_waiting_do_not_change_the_rate():
 @pytest.mark.parametrize(("every_n", "stuck", "frames"), [(1, False, 0.0), (2, False, 0.0), (5, False, 0.0),
                                                          (5, True, 0.2), (10, False, 0.5)])  # fmt: skip
 def test_repeats_are_counted_per_chip(every_n, stuck, frames):
-    """A chip converts in every n-th frame; a single stuck chip has no effect."""
+    """Each chip converts once in n frames; a single stuck chip has no effect on the median."""
     frame_i, chip_i = np.indices((1000, 5))
     values = rng_for(every_n, "values").normal(size=(1000, 5, 3))
     b_uT = values[frame_i - (frame_i - chip_i) % every_n, chip_i]
@@ -86,8 +86,8 @@ def test_repeats_are_counted_per_chip(every_n, stuck, frames):
     assert counter.frames == pytest.approx(frames, abs=0.002)
 
 
-def test_limits_of_the_paper_board():
-    """Numbers of bits counted byte by byte: 9 bits each, and start, repeated start and stop."""
+def test_rate_limits_of_the_papers_board():
+    """Reference: the I2C bits are counted here, 9 per byte plus start, repeated start and stop."""
     read = ["address", "RM", "address", "status", *"TTXXYYZZ"]
     start = ["address", "SM", "address", "status"]
     read_s, start_s = ((9 * len(part) + 3) / 400e3 for part in (read, start))
@@ -110,7 +110,7 @@ def test_limits_of_the_paper_board():
 
 
 @given(st.integers(1, 64), st.floats(18, 2000), st.floats(1e-4, 0.3))
-def test_limits_fall_with_chips_bytes_and_conversion_time(chips_n, frame_bytes_n, conversion_time_s):
+def test_rate_limits_fall_with_chips_frame_length_and_conversion_time(chips_n, frame_bytes_n, conversion_time_s):
     def rates(*arguments):
         limits = find_limits(arguments[0], arguments[1], baud=115200, conversion_time_s=arguments[2])
         return np.array([limit.hz for limit in limits if "together" not in limit.cause])
@@ -139,7 +139,7 @@ def test_limits_fall_with_chips_bytes_and_conversion_time(chips_n, frame_bytes_n
         (with_fault("torn", wire="binary-clock"), "^321 Hz arrive of 400 Hz .*: 20 % of the frames are lost "),
     ],
 )  # fmt: skip
-def test_emulated_board_is_explained(script, sentence):
+def test_rate_of_an_emulated_board_is_explained(script, sentence):
     """In fault `torn`, each cut frame is lost together with the frame that follows it: two of ten."""
     board = play(script)
     assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=find.BAUD)))

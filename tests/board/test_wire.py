@@ -58,7 +58,7 @@ def test_values_without_tab_are_split_after_two_decimals():
     assert frames.b_uT[0].tolist() == [1.0, 2.0, np.float32(-56.78), -3.0, -4.0, np.float32(0.05)]
 
 
-def test_signals_contain_the_terminator():
+def test_synthetic_signals_contain_the_terminator():
     for value in (signals.CRLF_TEMPERATURE_degC, *signals.CRLF_B_uT):
         assert b"\r\n" in struct.pack("<f", value)
 

@@ -50,7 +50,7 @@ def test_test_units_are_tested_once_and_never_trained_on(sizes):
 def test_windows_end_with_the_shortest_capture():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    # units of the longer capture after the last window, which ends with the shorter capture
+    # The last window ends with the shorter capture; these are later units of the longer one.
     assert windows.left_out_units_n == 24 - 15
 
 
@@ -122,7 +122,7 @@ def test_unselected_rows_are_counted_once():
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
-def test_parts_with_policy_each_equal_gathered_rows(train_n, test_n, more_n):
+def test_parts_under_policy_each_equal_gathered_rows(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
     windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)

@@ -39,7 +39,7 @@ def board() -> BoardPresses:
     return BoardPresses("b1", rest_uT, presses, presses, np.arange(len(place_mm)))
 
 
-def test_changed_fields_of_a_skin():
+def test_changed_mounting_changes_the_fields_as_stated():
     skin = SKINS[0]
     np.testing.assert_array_equal(skin.changed(AS_RECORDED).db_uT, skin.db_uT)
     np.testing.assert_array_equal(skin.changed(TURNED).rest_uT, -skin.rest_uT)
@@ -57,16 +57,16 @@ def test_turned_skins_are_found():
     assert as_recorded["skins_n"] == 3
 
 
-def test_wrong_axes_of_labels_are_warned_about():
+def test_wrong_axes_of_labels_raise_a_warning():
     rows = label_rows("simulated", SKINS, SECTION, 0, draws_n=2)
     warned = {row["axes"]: row["warned_pct"] for row in rows}
     assert len(warned) == 8
     assert {row["trials_n"] for row in rows} == {6}
     assert warned.pop("as given") == 0
-    assert np.mean([*warned.values()]) > 60  # chance would be a warning in few trials
+    assert np.mean([*warned.values()]) > 60  # by chance, few trials would raise a warning
 
 
-def test_turned_skin_is_as_accurate_as_it_was_only_with_the_check(board):
+def test_turned_skin_keeps_its_accuracy_only_with_the_check(board):
     rows = accuracy_rows(board, SECTION, 0)
     scores = {(row["change"], row["check"]): row["accuracy_pct"] for row in rows if not row["labels_n"]}
     assert scores[TURNED, WITH_CHECK] == scores[AS_RECORDED, WITH_CHECK] == scores[AS_RECORDED, WITHOUT_CHECK]

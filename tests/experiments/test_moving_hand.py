@@ -39,7 +39,7 @@ def pad_of(db_uT: np.ndarray, joint_counts: np.ndarray | None = None) -> Pad:
 # --- External fields ---
 
 
-def test_source_of_drawn_fields_is_found():
+def test_distance_and_size_of_drawn_fields_are_estimated():
     cov = external.covariance(np.array(CHIPS_MM), 100.0, 60.0)
     rng = rng_for(0, "moving hand", "source")
     db_uT = rng.multivariate_normal(np.zeros(15), cov, 2000, method="eigh") + NOISE_uT * rng.standard_normal((2000, 15))
@@ -50,14 +50,14 @@ def test_turned_field_is_uniform_and_keeps_its_length():
     changes_uT = to_board(hand.turn(50.0, 3000, rng_for(0, "turn"))).reshape(-1, 5, 3)
     np.testing.assert_allclose(changes_uT, np.repeat(changes_uT[:, :1], 5, axis=1), atol=1e-9)
     start_uT = -changes_uT[:, 0].mean(axis=0)  # fields after the turn have random directions
-    assert np.linalg.norm(start_uT) == pytest.approx(50, abs=3)  # sd of the mean: 50 / sqrt(3 x 3000) = 0.5 uT an axis
+    assert np.linalg.norm(start_uT) == pytest.approx(50, abs=3)  # standard error per axis: 50 / sqrt(3 x 3000) = 0.5 uT
     np.testing.assert_allclose(np.linalg.norm(changes_uT[:, 0] + start_uT, axis=1), 50, atol=3)
 
 
 def test_moved_magnet_has_the_stated_field_at_the_board():
     changes_uT = to_board(hand.move_magnet(140.0, (40.0, 40.0), 20_000, rng_for(0, "magnet"))).reshape(-1, 5, 3)
     sd_uT = changes_uT.std(axis=0)  # the field before is the same for all, and the mean of the fields is 0
-    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # at the middle; sd of a standard deviation: below 1 %
+    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # chip at the centre; the standard error is below 1 %
     assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()  # outer chips come nearer to the magnet
 
 
@@ -65,16 +65,18 @@ def test_moved_magnet_has_the_stated_field_at_the_board():
 
 
 @pytest.mark.parametrize("external_uT", [0.0, 100.0])
-def test_threshold_is_that_of_live(external_uT):
+def test_contact_threshold_equals_that_of_the_live_page(external_uT):
     readings_uT = NOISE_uT * rng_for(0, "live").standard_normal((4000, 15))
     matrix = load_universal(external_uT=external_uT).suppressor(NOISE_uT)
     live_uT = np.median(magnitudes_uT(readings_uT, matrix)) + CONTACT_SDS * NOISE_uT
-    assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(live_uT, rel=0.02)  # medians are up to 1.5 % smaller
+    assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(
+        live_uT, rel=0.02
+    )  # a median is up to 1.5 % below the root mean square
 
 
 @pytest.mark.parametrize("learner", ["ridge", "boosting"])
 @pytest.mark.parametrize("trained_on", [OTHER, FIRST_HALF])
-def test_compensation_removes_what_joints_explain(learner, trained_on):
+def test_compensation_removes_fields_that_depend_on_the_joints(learner, trained_on):
     rng = rng_for(0, "moving hand", learner)
     slopes = rng.normal(size=15)
     pads = []
@@ -88,7 +90,7 @@ def test_compensation_removes_what_joints_explain(learner, trained_on):
     assert rms_uT < (1.1 if learner == "ridge" else 3) * NOISE_uT < pads[1].db_uT.std() / 3
 
 
-def test_option_reduces_false_contacts_but_not_detection():
+def test_option_for_external_fields_reduces_false_contacts_but_not_detection():
     rng = rng_for(0, "moving hand", "contacts")
     cov = external.covariance(np.array(CHIPS_MM), 100.0)
     pairs = [
@@ -101,7 +103,7 @@ def test_option_reduces_false_contacts_but_not_detection():
     for row in (off, on):
         for part, scale in zip(row["thresholds"], SECTION.touch_scales, strict=True):
             assert part["touch_scale"] == scale
-            # detection on other changes: 99 % up to the errors of two quantiles of 500 (0.45 % each)
+            # tolerance: four standard errors of a 99 % quantile of 500 values (0.45 % each)
             assert part["detected_pct"] == pytest.approx(99, abs=1.8)
     still = [(pad_of(np.zeros((300, 15))), pad_of(np.zeros((300, 15))))]
     assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_pct"] == 0
@@ -147,7 +149,7 @@ def write_pad(folder: Path, pad: int) -> None:
     (folder / HEADER_FILE).write_text(render(header))
 
 
-def test_stage_runs_on_made_up_recordings(tmp_path):
+def test_stage_runs_on_synthetic_recordings(tmp_path):
     settings = read_settings("hand", ROOT)
     presses = SECTION.presses
     frame = Frame(chip_rotations(presses), presses.labels_middle_mm, presses.labels_mirrored)
@@ -166,7 +168,9 @@ def test_stage_runs_on_made_up_recordings(tmp_path):
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [row["capture"] for row in numbers["recordings"]] == ["first", "second"]
     assert [row["rows_n"] for row in numbers["recordings"]] == [24, 24]
-    assert len(numbers["contacts"]) == 2 + 2 * 2  # values of the option, and learners by data for training
+    assert (
+        len(numbers["contacts"]) == 2 + 2 * 2
+    )  # values of the option; two learners, each trained on two kinds of data
     by_field = {
         (row["field"], row["external_uT"], row["labels_n"]): row["mse_xy_mm2"]["mean"]
         for row in numbers["superposed_places"]

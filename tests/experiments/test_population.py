@@ -199,7 +199,7 @@ def test_weight_is_estimated_last(model, skins):
     assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
-def test_weight_share_belongs_to_the_calibrated_power(skins, monkeypatch):
+def test_weight_share_is_computed_at_the_calibrated_power(skins, monkeypatch):
     # In this test, force errors grow with the power, and only one power has intervals that cover 90 %.
     def fake_estimate(model, skin, size, powers):
         found = []

@@ -77,7 +77,7 @@ def test_tested_presses_are_not_drawn_and_far_from_labels(split, draw_i, presses
     assert np.linalg.norm(tested_mm - board.presses.place_mm[draw.weight], axis=1).min() >= 2 - 1e-9
 
 
-def test_parts_alternate_from_draw_to_draw(board):
+def test_halves_and_colours_swap_roles_in_every_second_draw(board):
     for split in (CHECKERBOARD, HALVES):
         np.testing.assert_array_equal(board.part(split, 0), -board.part(split, 1))
     assert len({tuple(board.part(HALVES, i)) for i in range(4)}) == 4

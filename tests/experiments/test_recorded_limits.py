@@ -61,7 +61,7 @@ def make_board() -> BoardPresses:
 
 
 @given(st.floats(-179, 179), st.floats(-5, 5), st.floats(-5, 5), st.integers(0, 99))
-def test_a_rigid_motion_is_recovered_and_never_reflects(angle_deg, x_mm, y_mm, seed):
+def test_rigid_motion_is_recovered_without_a_reflection(angle_deg, x_mm, y_mm, seed):
     rng = np.random.default_rng(seed)
     from_mm = rng.uniform(-8, 8, (5, 2))
     to_mm = from_mm @ rotation(angle_deg).T + [x_mm, y_mm]
@@ -73,7 +73,7 @@ def test_a_rigid_motion_is_recovered_and_never_reflects(angle_deg, x_mm, y_mm, s
     assert np.linalg.det(mirrored.rotation) == pytest.approx(1)
 
 
-def test_no_other_rotation_has_smaller_squared_distances():
+def test_fitted_rotation_has_the_smallest_squared_distances():
     rng = np.random.default_rng(0)
     from_mm, to_mm = rng.uniform(-8, 8, (2, 5, 2))
 
@@ -87,7 +87,7 @@ def test_no_other_rotation_has_smaller_squared_distances():
     assert fitted == pytest.approx(searched, rel=1e-4)  # the grid of angles has steps of 0.1 degrees
 
 
-def test_a_shift_is_the_mean_difference():
+def test_fitted_shift_is_the_mean_difference():
     motion = limits.fit_shift(np.array([[0.0, 0.0], [2.0, 1.0]]), np.array([[1.0, 0.0], [2.0, 3.0]]))
     np.testing.assert_allclose(motion.apply(np.array([[5.0, 5.0]])), [[5.5, 6.0]])
     assert motion.angle_deg == 0
@@ -104,7 +104,7 @@ def test_tested_readings_are_at_other_places_and_unlabelled_presses_are_not_test
     assert distance_mm.min() >= 2 - 1e-9  # the spacing of the grid
     assert not set(tested) & set(draw.unlabelled)
     between_mm = np.linalg.norm(known_mm[:, None] - known_mm, axis=2)[np.triu_indices(5, 1)]
-    assert between_mm.min() >= 4  # far apart; five random places of the grid are often neighbours, 2 mm apart
+    assert between_mm.min() >= 4  # five places drawn at random would often be neighbours, 2 mm apart
 
 
 def test_too_few_places_are_an_error():
@@ -121,7 +121,7 @@ def make_variant() -> Variant:
 
 @pytest.fixture(scope="module")
 def scores() -> list[dict]:
-    """Return the scores of a regressor whose errors are a rigid motion, and of both variants of an untrained model."""
+    """Return scores of a regressor that is wrong by a rigid motion, and of two variants of an untrained model."""
     board = make_board()
     variant = make_variant()
     moved_mm = board.readings.place_mm @ rotation(10).T + [2, -1]
@@ -145,8 +145,8 @@ def test_registration_removes_a_rigid_error(scores):
         assert row["shift_mm"] == pytest.approx(np.sqrt(5))
 
 
-def test_a_registration_on_tested_readings_bounds_all_others(scores):
-    """No rigid motion has a smaller squared error than the one that is fitted to the tested readings."""
+def test_registration_fitted_to_tested_readings_has_the_smallest_error(scores):
+    """The rigid motion fitted to the tested readings themselves is a lower bound for the squared error."""
     for row in scores:
         if row["known"] in (limits.SHIFT, limits.RIGID):
             keys = {name: row[name] for name in ("method", "presses_n", "draw_i")} | {"known": limits.UNCHANGED}
@@ -154,7 +154,7 @@ def test_a_registration_on_tested_readings_bounds_all_others(scores):
             assert bound["rigid_limit_mm2"] <= row["mse_xy_mm2"] + 1e-12
 
 
-def test_universal_model_is_scored_with_all_uses_of_the_known_presses(scores):
+def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
     uses = {limits.UNCHANGED, limits.SHIFT, limits.RIGID, limits.LABELS}
     for presses_n in (0, 20):
         for method in ("universal, boards of the rig", "universal, simulated alone"):
@@ -177,14 +177,14 @@ def test_mean_by_group_is_the_mean_of_its_rows(values, numbers):
     np.testing.assert_allclose(limits.mean_by(group, values), expected, atol=1e-9)
 
 
-def test_explained_is_r2():
+def test_explained_fraction_equals_r2():
     rng = np.random.default_rng(1)
     true, predicted = rng.standard_normal((2, 30))
     group = np.repeat([0, 1, 2], 10)
     assert limits.explained(true, predicted, 0 * group) == pytest.approx(r2_score(true, predicted))
     shifted = predicted + np.array([5.0, -3.0, 1.0])[group]
     within = limits.explained(true, predicted, group)
-    assert limits.explained(true, shifted, group) == pytest.approx(within)  # means of groups do not count
+    assert limits.explained(true, shifted, group) == pytest.approx(within)  # an offset of a whole group has no effect
     centred = [values - np.repeat(values.reshape(3, 10).mean(axis=1), 10) for values in (true, predicted)]
     assert within == pytest.approx(r2_score(*centred))
 
@@ -212,11 +212,13 @@ def make_rows(shear_in_field: bool) -> Rows:
     )  # fmt: skip
 
 
-def test_shear_is_found_only_if_the_field_contains_it():
+def test_shear_is_predicted_only_if_the_field_depends_on_it():
     by_field = {}
     for shear_in_field in (True, False):
         rows = limits.evaluate_shear(make_rows(shear_in_field), SECTION, 2021)["rows"]
-        assert len(rows) == 2 * 3  # two kinds of training presses; constant, field, place and normal force
+        assert (
+            len(rows) == 2 * 3
+        )  # two kinds of training presses; three kinds of inputs: none, the field, and place with normal force
         for row in rows:
             if row["inputs"] == limits.FIELD:
                 by_field[shear_in_field, row["trained_on"]] = row
@@ -262,7 +264,7 @@ def test_presses_at_one_place_are_in_the_same_fold():
 
 @settings(deadline=None)
 @given(st.integers(0, 99), st.floats(5, 60))
-def test_needed_changes_are_where_readings_cross_the_threshold(seed, threshold_uT):
+def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold_uT):
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((4, 15))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -275,7 +277,7 @@ def test_needed_changes_are_where_readings_cross_the_threshold(seed, threshold_u
     assert (np.linalg.norm(just_below, axis=2)[needed_uT > 0] <= threshold_uT).all()
 
 
-def test_without_noise_the_threshold_is_needed():
+def test_needed_field_change_without_noise_is_the_threshold():
     needed_uT = limits.needed_changes_uT(np.eye(15)[:2], np.zeros((1, 15)), 24.0)
     np.testing.assert_allclose(needed_uT, 24.0)
 
@@ -426,7 +428,7 @@ def write_capture(folder: Path, frame: Frame, board: str, force_N: float) -> Non
     (folder / HEADER_FILE).write_text(render(header))
 
 
-def test_stage_runs_on_two_made_up_boards(tmp_path, monkeypatch):
+def test_stage_runs_on_two_synthetic_boards(tmp_path, monkeypatch):
     settings = read_settings("lab", ROOT)
     content = {name: settings.of_scene[name] for name in ("seed", "selection", "compare", "recorded_limits")}
     changed = {"draws_n": 2, "presses_n": 12, "methods": "tiny", "false_alarm_fraction": 0.01}

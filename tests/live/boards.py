@@ -123,7 +123,10 @@ def play_to_skin(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Es
 
 
 def zero_requests(monkeypatch) -> list[LiveSkin]:
-    """Return a list to which each call of `LiveSkin.zero` appends its skin; the page may show zeroing too briefly."""
+    """Return a list to which each call of `LiveSkin.zero` appends its skin.
+
+    Tests use it because the page may show "zeroing" too briefly to be seen.
+    """
     zeroed, zero = [], LiveSkin.zero
     monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), zeroed.append(skin)))
     return zeroed

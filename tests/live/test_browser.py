@@ -190,7 +190,7 @@ CLICK = """((x, y) => { const {frame, parts: {board}} = boards[0], [px, py] = fr
   board.dispatchEvent(new MouseEvent("click", {clientX: at.left + px, clientY: at.top + py, bubbles: true})); })"""
 
 
-def test_page_saves_loads_and_undoes_what_it_learnt_and_shows_true_places(tmp_path, random_pokes):  # noqa: F811
+def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path, random_pokes):  # noqa: F811
     quiet = make_poke_script(random_pokes)
     place_mm, force_N = random_pokes[2:]
     poke_i = np.minimum(np.maximum(np.arange(len(quiet)) - QUIET_N, 0) // (2 * POKED_N), len(place_mm) - 1)

@@ -25,7 +25,7 @@ def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generato
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
     faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
-    # Frames near damage must be finite: after damage, the decoder takes a non-finite frame for a damaged one.
+    # Frames near damage must be finite, because the decoder counts non-finite frames after damage as damaged.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
     finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)

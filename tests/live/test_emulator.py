@@ -267,7 +267,7 @@ def test_true_contacts_of_a_capture_are_unknown(tmp_path):
     assert read_script(str(write_script(POKE_SCRIPT, tmp_path / "c0"))).true_contacts is None
 
 
-def test_true_contact_is_that_of_the_frame_sent_last(times):
+def test_true_contact_belongs_to_the_last_frame_sent(times):
     true = np.arange(3.0 * len(SCRIPT)).reshape(-1, 3)
     script, found = replace(SCRIPT, true_contacts=true), []
     board = EmulatedBoard(script, SimpleNamespace(name="port"))

@@ -1,4 +1,4 @@
-"""Tests of what the page teaches a model and records: save, load and undo of calibrations, and labelled presses."""
+"""Tests of calibrating a model from the page (save, load, undo), and of recording labelled presses."""
 
 import json
 import math
@@ -31,7 +31,7 @@ LONG_S = 20.0
 
 
 class PausingReader(ScriptReader):
-    """A reader that waits at some times of the script until `resume` is called, and writes to a recording.
+    """A reader that pauses at given times of the script until `resume` is called, and can write a recording.
 
     Its clock is the script's time plus the unix time at the start, like that of a real reader.
     """
@@ -65,7 +65,7 @@ class PausingReader(ScriptReader):
 
 
 def until(condition, session=None):
-    """Wait until a condition is true; a session must go on estimating."""
+    """Wait until a condition is true; fail if the session's thread ends."""
     end_s = time.monotonic() + LONG_S
     while not condition():
         assert session is None or session._thread.is_alive(), session.state()["alarms"]
@@ -81,8 +81,8 @@ def running(script, models, *, pauses_s=(), **options):
     return session, reader
 
 
-def said(session, message, key="adapted"):
-    """Send a message as the page does; return the new text under `key` of the state."""
+def text_after(session, message, key="adapted"):
+    """Send a message as the page does; return the text that then appears under `key` in the state."""
     setattr(session, f"_{key}", "")
     receive(session, json.dumps(message))
     until(lambda: session.state()[key], session)
@@ -98,8 +98,8 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
     try:
         until(reader.waiting.is_set, session)
         until(lambda: session.skin.zeroed, session)
-        assert "learnt nothing about this skin" in said(session, {"save": "s1"})
-        assert "nothing to undo" in said(session, {"press": "undo"})
+        assert "learnt nothing about this skin" in text_after(session, {"save": "s1"})
+        assert "nothing to undo" in text_after(session, {"press": "undo"})
         assert not folder.exists()
         before = session.skin.estimator(db_uT).target
         assert session.state()["expected"].endswith("before calibration)")
@@ -114,28 +114,31 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         assert state["expected"].endswith(f"after {PRESSES_N} presses and 0 labels)")
 
         for name in ("", "../s1", "a b", "x" * 65, ".s1", 3, None, ["s1"], "s1.safetensors"):
-            assert "is not a name. Use 1 to 64 letters" in said(session, {"save": name})
-        assert said(session, {"save": "s1"}) == f"saved {folder / 's1.safetensors'} (presses: 12, of which labelled: 0)"
+            assert "is not a name. Use 1 to 64 letters" in text_after(session, {"save": name})
+        assert (
+            text_after(session, {"save": "s1"})
+            == f"saved {folder / 's1.safetensors'} (presses: 12, of which labelled: 0)"
+        )
         content = (folder / "s1.safetensors").read_bytes()
-        assert "s1.safetensors exists already. Choose another name." in said(session, {"save": "s1"})
+        assert "s1.safetensors exists already. Choose another name." in text_after(session, {"save": "s1"})
         assert (folder / "s1.safetensors").read_bytes() == content
         assert session.state()["skins"] == ["s1"]
 
-        assert said(session, {"press": "undo"}) == f"undone: the {PRESSES_N} presses"
+        assert text_after(session, {"press": "undo"}) == f"undone: the {PRESSES_N} presses"
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
-        assert "the file does not exist" in said(session, {"load": "s2"})
+        assert "the file does not exist" in text_after(session, {"load": "s2"})
         (folder / "s3.safetensors").write_text("no calibration")
-        assert "s3.safetensors" in said(session, {"load": "s3"})
+        assert "s3.safetensors" in text_after(session, {"load": "s3"})
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
-        assert "loaded" in said(session, {"load": "s1"})
+        assert "loaded" in text_after(session, {"load": "s1"})
         off_skin = {"label": {"x_mm": 1, "y_mm": 99, "force_N": 1, "learn": True}}
-        assert "y must be a number above -2 and below 18 mm; got 99" in said(session, off_skin, "labelled")
-        # 0.02 mm and N: the file holds the presses of the same readings in single precision
+        assert "y must be a number above -2 and below 18 mm; got 99" in text_after(session, off_skin, "labelled")
+        # tolerance in mm and N: the file stores presses in single precision
         np.testing.assert_allclose(session.skin.estimator(db_uT).target, adapted, atol=0.02)
         state = session.state()
         assert state["model"] == "universal model, shipped with reskin, with the saved skin s1"
         assert state["learnt"] == f"{PRESSES_N} presses in s1"
-        assert said(session, {"press": "undo"}) == "undone: the loading of s1"
+        assert text_after(session, {"press": "undo"}) == "undone: the loading of s1"
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
     finally:
         session.stop()
@@ -148,7 +151,7 @@ def test_skin_folder_must_not_be_a_file(tmp_path):
         SkinFolder(tmp_path / "skins")
 
 
-def test_labelled_presses_are_learnt(random_pokes):  # noqa: F811
+def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     noload_uT, b_uT, place_mm, force_N = random_pokes
     db_uT = b_uT - noload_uT.mean(axis=0)
     estimator = UniversalEstimator(load_universal())
@@ -173,27 +176,27 @@ def test_labelled_presses_are_learnt(random_pokes):  # noqa: F811
 
 def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    second_s = QUIET_S + POKE_S + 1.0  # in the pause before the second of the script's presses
+    second_s = QUIET_S + POKE_S + 1.0  # in the pause before the script's second press
     script = make_script(pokes_n=3)
     session, reader = running(script, [], pauses_s=[QUIET_S - 0.2, second_s])
     try:
         until(reader.waiting.is_set, session)
         until(lambda: session.skin.zeroed, session)
         place = {"x_mm": 4.0, "y_mm": 12, "force_N": 0.8, "learn": True}
-        assert "neither recorded nor used" in said(session, {"label": place}, "labelled")
+        assert "neither recorded nor used" in text_after(session, {"label": place}, "labelled")
         receive(session, '{"press": "record"}')
         for wrong, message in (
             ({"x_mm": None}, "x must be a number"), ({"y_mm": "8"}, "y must be a number"),
             ({"force_N": -1}, "the force must be a number above 0"), ({"x_mm": 1e9}, "below 1000 mm; got 10000"),
             ({"y_mm": True}, "y must be a number"),
         ):  # fmt: skip
-            assert message in said(session, {"label": place | wrong}, "labelled")
-        assert "Enter x and y" in said(session, {"label": "here"}, "labelled")
+            assert message in text_after(session, {"label": place | wrong}, "labelled")
+        assert "Enter x and y" in text_after(session, {"label": "here"}, "labelled")
         receive(session, json.dumps({"label": place}))
         assert session.state()["labelling"] == "press at x 4 mm, y 12 mm with 0.8 N."
         assert session.state()["label_mm"] == [4.0, 12.0]
         reader.resume()
-        # The skin had too short a rest before the first press, so the label still waits.
+        # The pause before the first press was too short, so that press is not used for the label.
         until(reader.waiting.is_set, session)
         until(lambda: session.state()["labelling"].endswith("lift for a second, then press again"), session)
         receive(session, json.dumps({"label": place | {"force_N": None, "x_mm": 12, "y_mm": 4}}))
@@ -218,7 +221,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     assert np.linalg.norm(changes_uT, axis=1).min() > 300  # uT; the field changes of the presses are above 600 uT
 
 
-def test_presses_at_crosses_are_labels_of_the_recording(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
+def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.chdir(tmp_path)
     script = make_poke_script(guided_pokes)
     step_uT = np.tile([0.15, 0.15, 0.242], 5)  # `reskin add` checks the steps of the chips
@@ -251,7 +254,7 @@ def test_presses_at_crosses_are_labels_of_the_recording(guided_pokes, tmp_path, 
     np.testing.assert_allclose(changes_uT, poked_uT[press_i], atol=30)
 
 
-def test_press_whose_rest_is_not_recorded_is_refused(tmp_path, monkeypatch):
+def test_press_without_recorded_no_load_readings_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     press, reader = LabelledPress(Label(True, 1.0, 2.0), learn=False), PausingReader(make_script(pokes_n=0))
     recording = PageRecording(find.DetectedBoard("/dev/board", None, "binary", 5), reader, port_in_name=True)
@@ -267,7 +270,7 @@ def test_press_whose_rest_is_not_recorded_is_refused(tmp_path, monkeypatch):
 
 
 def feed(press, contact, seconds, rate_hz=100.0):
-    """Add readings to a press: contact yes or no for some time, with a field change of 100 uT in contact."""
+    """Add readings with or without contact to a press; in contact, every channel changes by 100 uT."""
     start_s = feed.t_s
     t_s = start_s + np.arange(round(seconds * rate_hz)) / rate_hz
     feed.t_s = start_s + seconds
@@ -281,7 +284,7 @@ def feed(press, contact, seconds, rate_hz=100.0):
     [([(True, 1.0)], "began before the label"), ([(False, 0.3), (True, 1.0)], "touched shortly before"),
      ([(False, 1.0), (True, 0.03)], "too short")],
 )  # fmt: skip
-def test_unusable_presses_are_explained_and_the_next_one_counts(parts, problem):
+def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
     press, feed.t_s = LabelledPress(Label(True, 1.0, 2.0), learn=False), 0.0
     for contact, seconds in [*parts, (False, 0.1)]:
         feed(press, contact, seconds)
@@ -294,7 +297,7 @@ def test_unusable_presses_are_explained_and_the_next_one_counts(parts, problem):
     np.testing.assert_allclose(press.db_uT, 100.0)
 
 
-def test_described_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
+def test_page_describes_the_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
     measured = read_measured(MEASURED_FILE)
     noload_uT, b_uT, place_mm, force_N = random_pokes
     shipped = UniversalEstimator(load_universal())
@@ -304,7 +307,7 @@ def test_described_model_and_its_expected_accuracy(random_pokes, tmp_path):  # n
         assert f"{each:.1f}" in texts["expected"]
     assert all(f"{each:.2g}" in texts["least_force"] for each in measured.detection.lightest_N)
     assert f"{shipped.model.tables.force_N[0]:.2g} N" in texts["least_force"]
-    # A number of presses or labels that was not measured has the result of the next smaller number.
+    # For numbers of presses or labels that were not measured, the next smaller measured number is shown.
     many = load_universal().zero(noload_uT).see(np.tile(b_uT, (6, 1))[:65]).label(place_mm, force_N, b_uT)
     texts = describe(UniversalEstimator(many), many, "s1.safetensors")
     assert texts["model"] == "universal model, file s1.safetensors"
@@ -322,7 +325,7 @@ def test_described_model_and_its_expected_accuracy(random_pokes, tmp_path):  # n
     assert texts["least_force"].startswith("not measured; trained with simulated forces from ")
 
 
-def test_described_networks_have_the_scores_of_their_cards(tmp_path):
+def test_page_describes_networks_by_the_scores_in_their_cards(tmp_path):
     network = read_network(write_model(tmp_path))
     scores = {"all": {"accuracy_pct": 71.4, "mse_xy_mm2": 0.512}}
     scored = replace(network, card=network.card | {"scores": scores, "test_boards": ["b0", "b1"]})

@@ -85,7 +85,7 @@ def test_chips_without_noise_have_no_lsb():
     ],
     ids=["live", "record", "gauge", "emulated port", "emulated source", "live --emulate", "skins"],
 )
-def test_file_in_place_of_a_port_is_one_sentence(tmp_path, monkeypatch, command):
+def test_file_instead_of_a_port_is_an_error_of_one_sentence(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "notes.txt"
     file.write_text("not a port")
@@ -96,7 +96,7 @@ def test_file_in_place_of_a_port_is_one_sentence(tmp_path, monkeypatch, command)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_busy_port_is_one_sentence():
+def test_busy_port_is_an_error_of_one_sentence():
     with plugged_in(make_script(pokes_n=0), loop=True) as name, find.open_port(name, find.BAUD):
         busy = f"{name}: cannot open the port: another program uses it"
         with pytest.raises(CaptureError, match=busy) as error:
@@ -114,7 +114,7 @@ def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
-    with monkeypatch.context() as listened:  # to all ports once, because listening takes 1.5 s
+    with monkeypatch.context() as listened:  # reuse the scan above, because listening to a port takes 1.5 s
         listened.setattr(find, "detect_board", lambda port, _: found[port])
         assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):

@@ -164,7 +164,7 @@ def test_unplugging_ends_a_complete_recording(shell, tmp_path):
     assert (tmp_path / "run1" / HEADER_FILE).is_file()
 
 
-def test_invalid_options_print_one_sentence(shell):
+def test_invalid_options_are_errors_of_one_sentence(shell):
     process = shell.start("live", "--port", "x", "--replay", "y")
     _, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 2

@@ -155,7 +155,7 @@ def test_incomplete_stream_of_a_periodic_protocol_is_refused(part: slice) -> Non
     lost=st.floats(0, 0.3),
     indentations_n=st.integers(15, 60),
 )
-def test_offset_is_right_or_refused(
+def test_offset_is_either_correct_or_refused(
     faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
 ) -> None:
     log, truth = log_of(indentations_n, 0.25, travel_s), clock_map(7.0)

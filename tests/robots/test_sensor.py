@@ -1,4 +1,4 @@
-"""Tests of the LeRobot-style sensor, on a pseudo-terminal and with a reader that returns frames when a test allows."""
+"""Tests of the LeRobot-style sensor, on a pseudo-terminal and with a reader whose frames a test releases."""
 
 import math
 import os

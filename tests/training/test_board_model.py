@@ -89,7 +89,7 @@ def test_simulated_presses_of_the_board_are_placed_within_1_mm(made, labels_n, l
     assert np.mean(within) > least
 
 
-def test_presses_of_the_simulator_of_boards_are_placed_within_1_mm(made):
+def test_presses_simulated_by_independent_code_are_placed_within_1_mm(made):
     # This simulator has its own code for positions and turns of chips. With a wrong turn of one chip, places are wrong.
     model = load_universal(file=made)
     layout, rng, within, with_wrong_turn = model.layout, rng_for(0, "square"), [], []

@@ -149,7 +149,7 @@ def test_labels_are_whole_indentations_of_the_pool():
         assert not {*labelled} & {*ROWS.indentation[one.test]}
 
 
-def test_entries_without_labels_have_none():
+def test_entries_for_zero_labels_contain_no_labels():
     for entry, one in all_tried(STUDY, NETWORKS):
         if not entry.labels_n:
             assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
@@ -200,7 +200,7 @@ def with_unknown_targets(what: np.ndarray, rows: Rows = ROWS) -> Rows:
     return replace(rows, target=target)
 
 
-def test_labels_of_the_new_board_do_not_change_the_scaler():
+def test_scaler_ignores_labels_of_the_new_board():
     pooled = {(entry.method, entry.fold.name): one.scaler for entry, job, one in NETWORKS if job.tuning is None}
     for entry, job in LABELLED:
         changed = training_data(ROWS).db_uT.copy()

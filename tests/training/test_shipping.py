@@ -79,7 +79,7 @@ def test_powers_are_calibrated_for_all_presses_and_labels(model, monkeypatch):
     assert found == LikelihoodPowers.from_card(found.to_card())
 
 
-def test_shipped_model_has_the_settings_of_scene_lab(model):
+def test_settings_of_the_shipped_model_equal_those_of_scene_lab(model):
     inputs, card = read_inputs(), model.card
     assert inputs.prior.setup.design == DESIGN.model_copy(update={"tip_radius_mm": inputs.prior.setup.tip_radius_mm})
     assert inputs.training.model_dump() | {"seed": inputs.seed} == card["training"]

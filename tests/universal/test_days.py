@@ -32,7 +32,11 @@ from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import grid
 from tests.universal.skins import REST_SLOPE_uT, make_tables, poked_uT
 
-NAMES = ("label_x_mm", "label_y_mm", "away_um_mm")  # of the parameters in tests of the algebra; the third is the slide
+NAMES = (
+    "label_x_mm",
+    "label_y_mm",
+    "away_um_mm",
+)  # for three parameters in tests of the algebra; the third is the slide
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,7 @@ def labelled_presses(presses_n=9):
     return place_mm, force_N, db_uT, np.arange(presses_n) % 3
 
 
-def test_labels_of_three_days_equal_a_dense_gaussian(skin_map, monkeypatch):
+def test_conditioning_on_three_days_equals_a_dense_gaussian(skin_map, monkeypatch):
     monkeypatch.setattr(map, "SLIDE_CORRELATION", 0.4)
     place_mm, force_N, db_uT, days_ago = labelled_presses()
     rest_uT = rng_for(1, "rest").normal(0, 300, 15)
@@ -99,7 +103,7 @@ def test_days_without_change_equal_one_day(skin_map, monkeypatch):
     np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # deviances are in single precision
 
 
-def test_a_new_day_forgets_the_slide_alone(skin_map):
+def test_new_day_resets_only_the_slide(skin_map):
     known = condition_on_labels(skin_map, *labelled_presses()[:3])
     after, (mean, cov) = replace(known, labelled=None), begin_day(known).current
     np.testing.assert_array_equal(mean[:2], after.mean[:2])
@@ -132,7 +136,7 @@ def first_day(skin, tmp_path):
     return rest_uT, file
 
 
-def test_presses_tell_whether_the_slide_has_changed(skin, first_day):
+def test_presses_of_a_new_day_show_whether_the_slide_has_changed(skin, first_day):
     rest_uT, file = first_day
     same_uT, changed_uT = pokes(skin)[:5] + rest_uT, pokes(skin, OTHER_SLIDE)[:5] + rest_uT
     assert load_universal(file).slide is None
@@ -199,7 +203,7 @@ def test_saved_days_are_loaded_again(skin, first_day, tmp_path):
     assert third.slide is None
 
 
-def test_files_of_the_third_format_hold_one_day(skin, first_day):
+def test_files_in_the_third_format_are_read_as_one_day(skin, first_day):
     rest_uT, file = first_day
     tensors, header = io.read_tensors(file)
     assert header["format"] == "reskin-skin-4"
@@ -252,7 +256,7 @@ def test_full_days_of_a_large_board_fit_a_file(tmp_path):
 
 
 def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
-    """The labels of the first day, whose axes are right, must not hide them."""
+    """Correct labels of the first day must not hide wrong axes on the later day."""
     rest_uT, file = first_day
     axis_mm = skin.tables.axis_mm[[4, 9, 14, 19]] + 8
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)[[0, 3, 6, 9, 12]]
@@ -268,7 +272,7 @@ def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
 
 
 @pytest.mark.parametrize("external_uT", [0.0, 30.0])
-def test_days_of_a_turned_skin_equal_those_of_one_that_is_not_turned(skin, tmp_path, external_uT):
+def test_turned_skin_has_the_same_estimates_on_a_new_day(skin, tmp_path, external_uT):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     changed_uT, found = pokes(skin, OTHER_SLIDE) + rest_uT, []
     for turned in (False, True):
@@ -285,11 +289,14 @@ def test_days_of_a_turned_skin_equal_those_of_one_that_is_not_turned(skin, tmp_p
         np.testing.assert_array_equal(one, other)
 
 
-def test_middle_of_the_skin_is_carried_over(skin, tmp_path):
+def test_middle_of_the_skin_is_kept_on_a_new_day(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
     found_mm = []
-    for even in (False, True):  # presses on one side, whose mean place would be the middle
+    for even in (
+        False,
+        True,
+    ):  # Presses on one side only. With `even`, their mean place is taken as the middle of the skin.
         skin.zero(rest_uT).see(np.tile(pokes(skin)[[2, 3, 6, 7]] + rest_uT, (3, 1)), even=even).save(file)
         later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(changed_uT)
         assert not later.slide.same
@@ -299,7 +306,7 @@ def test_middle_of_the_skin_is_carried_over(skin, tmp_path):
     np.testing.assert_allclose(later_mm, first_mm, atol=0.5 * np.linalg.norm(first_mm))
 
 
-def test_commands_begin_a_day(first_day):
+def test_option_new_day_of_the_commands_begins_a_day(first_day):
     _, file = first_day
     assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
     with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):

@@ -126,9 +126,9 @@ def run_onnx(file: Path, db_uT: np.ndarray) -> dict[str, np.ndarray]:
 def check_equal(model: Universal, found: dict[str, np.ndarray], changes: dict[str, np.ndarray]) -> None:
     """Compare exported estimates with Python's.
 
-    Python sums chi^2 in single precision, and its rounding errors grow with chi^2. They matter only where chi^2 of two
-    distant hypotheses is large and nearly equal, which single readings that are no presses may show. There, 90 % of the
-    estimates must be equal, and all of them closely.
+    Python sums chi^2 in single precision, so its rounding errors grow with chi^2. They matter only if two distant
+    hypotheses have large, nearly equal chi^2, as can happen for readings that are not presses. For such readings, 90 %
+    of the estimates must agree to the usual tolerance, and the others to a larger one.
     """
     expected = model.estimate(np.concatenate(list(changes.values())) + model.noload_uT)
     kind_of = np.repeat(list(changes), [len(rows) for rows in changes.values()])
@@ -188,7 +188,7 @@ def test_shipped_model_is_exported_whole(tmp_path):
         np.testing.assert_allclose(found[name], getattr(expected, name), atol=EXACT, rtol=0, err_msg=name)
 
 
-def test_errors(tmp_path, monkeypatch):
+def test_failed_export_is_explained_and_writes_no_file(tmp_path, monkeypatch):
     with pytest.raises(SchemaError, match="no no-load reading: call zero"):
         load_universal().export_c(tmp_path / "skin.h")
     model = coarse("unlabelled")

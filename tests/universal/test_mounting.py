@@ -95,7 +95,7 @@ def test_turned_skin_has_the_same_estimates():
     np.testing.assert_array_equal(turned.noload_uT, -own.noload_uT)
 
 
-def test_given_orientation_is_used_and_kept():
+def test_orientation_stated_by_the_user_is_used_and_kept():
     rest_uT, b_uT, *_ = skin(0)
     model = load_universal().zero(rest_uT, turned=True).see(b_uT[:12])
     assert model.mounting.turned
@@ -106,7 +106,7 @@ def test_given_orientation_is_used_and_kept():
     assert not model.zero(rest_uT).mounting.turned  # without `keep`, the orientation is found again
 
 
-def test_orientation_without_presses_is_found_again_unless_it_was_given():
+def test_orientation_is_found_again_for_each_no_load_reading_unless_the_user_states_it():
     rest_uT, *_ = skin(0)
     assert not load_universal().zero(-rest_uT).zero(rest_uT, keep=True).mounting.turned  # perhaps another skin
     assert load_universal().zero(-rest_uT, turned=True).zero(rest_uT, keep=True).mounting.turned

@@ -48,7 +48,7 @@ def test_inflation_from_few_residuals_is_shrunk_to_the_prior():
     )
 
 
-def test_each_power_has_its_inflation():
+def test_each_likelihood_power_has_its_variance_inflation():
     at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
     parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
     assert variance_inflations(2, parts) == pytest.approx(
@@ -57,7 +57,7 @@ def test_each_power_has_its_inflation():
     assert variance_inflations(2, []) == [1, 1]
 
 
-def test_powers_are_at_most_one():
+def test_likelihood_powers_are_at_most_one():
     assert [lower_by_misfit(0.5, misfit) for misfit in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
     assert [lower_by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
 

@@ -45,7 +45,7 @@ def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
     return to_chips(tables.mean_uT[lattice_i[:, 0], lattice_i[:, 1], force_i])
 
 
-def test_estimates_on_the_nominal_skin_are_within_a_step_of_the_lattice(skin):
+def test_error_on_the_nominal_skin_is_at_most_one_lattice_step(skin):
     tables, rest_uT = skin.tables, to_chips(skin.tables.rest_uT[None])
     found = skin.zero(rest_uT).predict(pokes(skin) + rest_uT)
     lattice_mm = tables.axis_mm[np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)] + 8
@@ -172,7 +172,7 @@ def test_adapting_to_presses_singly_or_together_is_equivalent(skin):
     assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
-def test_surprising_labels_raise_uncertainty_and_labels_are_replaced(skin):
+def test_inconsistent_labels_raise_uncertainty_and_new_labels_replace_earlier_ones(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
@@ -231,7 +231,7 @@ def test_changed_model_is_refused(skin, tmp_path):
             load_universal(file=file)
 
 
-def test_model_with_the_format_before_still_loads(skin, tmp_path):
+def test_model_in_the_previous_file_format_is_read(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE, file)
     card = dict(skin.card)

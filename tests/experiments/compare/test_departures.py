@@ -127,7 +127,7 @@ def test_presses_outside_the_skin_are_named_instead_of_orientations():
     assert check_frames(aligned, make_setup(section, DESIGN), section)["sentence"] == sentence
 
 
-def test_boards_without_forces_have_only_frames(monkeypatch):
+def test_boards_without_forces_have_only_the_table_of_axes(monkeypatch):
     monkeypatch.setattr(compare, "FITTED_MAX_N", 22)
     section = square_section()
     boards = pool_skins([square_recording(section)], with_force=False)

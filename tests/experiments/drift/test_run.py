@@ -78,8 +78,8 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
-    # No-load readings before each contact remove the drift. The initial reading removes none, regular ones all but the
-    # drift of up to 20 contacts.
+    # No-load readings before each contact remove the drift. The initial reading removes none of it; regular readings
+    # leave the drift of at most 20 contacts.
     off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
     assert off_uT["each"] == 0
     assert off_uT["initial"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(np.arange(300, 330) ** 2.0)), rel=1e-3)

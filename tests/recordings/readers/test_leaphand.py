@@ -91,18 +91,18 @@ def with_joints(change: object, row_i: int = 4) -> np.ndarray:
         (numbers() * np.r_[np.full(30, 1e5), np.ones(8)], "field must be below the full scale"),
     ],
 )  # fmt: skip
-def test_rows_that_do_not_fit_are_refused(tmp_path, rows, expected):
+def test_invalid_rows_of_a_hand_are_refused(tmp_path, rows, expected):
     with pytest.raises(CaptureError, match=f"{leaphand.READINGS}: {expected}"):
         leaphand.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
 
 
 @pytest.mark.parametrize(("options", "got"), [({}, "none"), ({"pad": "0"}, "0"), ({"pad": "3"}, "3")])
-def test_pad_must_be_in_the_file(tmp_path, options, got):
+def test_pad_that_is_not_in_the_file_is_refused(tmp_path, options, got):
     header = make_header(layout="leaphand", options=options)
     assert f"option pad must be 1 to 2, the number of pads in the file; got {got}" in error_of(write(tmp_path), header)
 
 
-def test_recording_is_one_file(tmp_path):
+def test_folder_instead_of_a_file_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="not a file. A recording of layout leaphand is one text file"):
         leaphand.collect(tmp_path)
     write(tmp_path)

@@ -165,7 +165,7 @@ def test_error_names_the_line_or_column(tmp_path, what):
         read(tmp_path, change(table()))
 
 
-def test_conversion_script_of_the_docs_reads_like_eflesh(tmp_path, shared_data, monkeypatch):
+def test_table_converted_by_the_script_in_the_docs_equals_layout_eflesh(tmp_path, shared_data, monkeypatch):
     recording = shared_data / "eflesh/normal_force/20250401_014340_probe"
     script = re.search(r"```python\n(import pandas as pd.*?)```", (ROOT / "data/README.md").read_text(), re.DOTALL)
     for file in recording.glob("*.csv"):
