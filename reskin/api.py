@@ -571,7 +571,7 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
 
 
 def lifted() -> Label:
-    """Return a label that tells `record`: nothing touches the skin. One such label must come before each touch."""
+    """Return the label "nothing touches the skin" for `record`. One such label must come before each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
@@ -587,7 +587,7 @@ def touch(
     Fz_N: float = math.nan,
     pass_i: int = 0,
 ) -> Label:
-    """Return a label that tells `record`: the robot touches the skin at this place and does not move.
+    """Return the label "the robot touches the skin at this place and does not move" for `record`.
 
     Parameters
     ----------

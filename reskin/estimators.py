@@ -34,7 +34,7 @@ TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "
 
 
 class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The paper's network, trained by the code of the pipeline: equal data and settings give identical weights.
+    """The paper's network, trained by the code of the pipeline; equal data and settings give the pipeline's weights.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ def predict(
     -------
     A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
     of readings in contact (with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range), whether
-    the skin is turned by a quarter, and the model's warnings.
+    the skin is turned by 90 degrees, and the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT, new_day=new_day)
@@ -89,7 +89,7 @@ class _UniversalOfLog:
     def count_suspects(self, estimates: LogEstimates) -> dict[str, Any]:
         """Count readings in contact with a large misfit, and those at a limit of the model's force range.
 
-        The result also tells whether the skin is turned by a quarter, and contains the model's warnings.
+        The result also states whether the skin is turned by 90 degrees, and contains the model's warnings.
         """
         force_N = estimates.targets[0, estimates.contact, 2]
         lowest_N, highest_N = self._model.tables.force_N[[0, -1]]

@@ -51,8 +51,8 @@ class RateMeasurement:
     arrived_hz : frames per second that arrived; NaN if unknown
     sent_hz : frames per second that the board sent
     method : source of `sent_hz`: the board's clock, or the arrivals if the wire format has no usable clock
-    repeated_frames : share of frames whose fields equal those of the frame before
-    repeated_readings : share of a chip's readings that equal its reading before; median over chips, so that a single
+    repeated_frames : share of frames whose fields equal those of the previous frame
+    repeated_readings : share of a chip's readings that equal its previous one; median over chips, so that a single
         stuck chip has no effect
     """
 
@@ -99,12 +99,12 @@ class RepeatCounter:
 
     @property
     def frames(self) -> float:
-        """Share of frames that repeat the frame before."""
+        """Share of frames that repeat the previous frame."""
         return self._same_frames_n / self.frames_n if self.frames_n else 0.0
 
     @property
     def readings(self) -> float:
-        """Share of a chip's readings that repeat its reading before: the lower median over chips."""
+        """Share of a chip's readings that repeat its previous reading: the lower median over chips."""
         same_n = np.sort(self._same_readings_n)
         return float(same_n[(len(same_n) - 1) // 2] / self.frames_n) if self.frames_n else 0.0
 
@@ -164,7 +164,7 @@ class RateMeter:
         clock_s = np.concatenate(self._clock_s) if self._clock_s else np.zeros(0)
         self._clock_s, self._clocked_n = [clock_s[-1:]], 0
         step_s = np.diff(clock_s)
-        # A frame with the same time as the frame before was sent once but arrived twice.
+        # A frame with the same time as the previous frame was sent once but arrived twice.
         step_s = step_s[~clock_jumps(step_s) & (step_s > 0)]
         if not len(step_s) or np.spacing(np.float32(clock_s[-1])) > CLOCK_STEP_RESOLUTION_MAX * np.median(step_s):
             return

@@ -126,7 +126,7 @@ class Health:
             self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
-        """Raise an alarm if single readings repeat the one before; whole frames that repeat have their own alarm."""
+        """Raise an alarm if single readings repeat the previous one; repeated whole frames have another alarm."""
         self._repeats.feed(batch.b_uT)
         self._frames_repeat |= bool(faults.repeated.any())
         if self._repeats.frames_n >= REPEATS_FRAMES_N:

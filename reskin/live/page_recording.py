@@ -27,7 +27,7 @@ PRESS_READINGS_MAX_N = 20_000  # most readings that are kept of one press, to li
 
 
 class LabelledPress:
-    """Finds the next press in a stream of estimates: the time in which it is held, and the rest before it.
+    """Finds the next press in a stream of estimates: the time in which it is held, and the no-load time before it.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class LabelledPress:
 
     def __init__(self, label: Label, *, learn: bool) -> None:
         self.label, self.learn = label, learn
-        self.problem = ""  # why the latest press did not count
+        self.problem = ""  # why the latest press was not accepted
         self.rest_s: tuple[float, float] | None = None  # start and end of the no-load dwell before the press
         self.held_s: tuple[float, float] | None = None  # start and end of the time in which the press was held
         self.db_uT: Float64[np.ndarray, " ch"] | None = None  # mean field change while the press was held

@@ -239,7 +239,7 @@ class Session:
         self._error = ""
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
-        self._guided_press: LabelledPress | None = None  # the current press at a cross, for the recording
+        self._guided_press: LabelledPress | None = None  # the current guided press, whose label is recorded
         self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
@@ -423,8 +423,8 @@ class Session:
     def request(self, message: Mapping[str, Any]) -> None:
         """Handle a message from a page.
 
-        Its keys are `press` (name of a button), `seen` (number of drawn data), `save` and `load` (name of a skin), or
-        `label` (place and force of the next press; null to cancel). Unknown keys are ignored.
+        Its keys are `press` (name of a button), `seen` (number of the last drawn message), `save` and `load` (name of a
+        skin), or `label` (place and force of the next press; null to cancel). Unknown keys are ignored.
         """
         self.press(message.get("press"))
         self.confirm(message.get("seen"))

@@ -111,7 +111,7 @@ class Labels(NamedTuple):
 
 
 class LearningState(NamedTuple):
-    """What a `UniversalEstimator` is calibrated with, besides the no-load reading.
+    """The calibration data of a `UniversalEstimator`, except for the no-load reading.
 
     `origin` is the model that was passed or loaded, and `origin_name` the name of a loaded skin. `presses_uT` are field
     changes of presses at unknown places. `guided` are presses at the places that the page showed, and `typed` those
@@ -150,7 +150,7 @@ class UniversalEstimator:
         self.channels_n, self.board = model.channels_n, model.layout
         # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
-        self._states = [LearningState.start(model)]  # the last one is in use, the ones before are for `undo`
+        self._states = [LearningState.start(model)]  # the last one is in use, earlier ones are for `undo`
         self._use(self._states[0])
 
     @property
@@ -180,7 +180,7 @@ class UniversalEstimator:
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
         """Set the no-load field to the mean of f readings without contact, and recalibrate.
 
-        The no-load field also tells whether the skin is turned by a quarter (`Universal.mounting`).
+        The no-load field also shows whether the skin is turned by 90 degrees (`Universal.mounting`).
         """
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._use(self.learnt)
@@ -292,7 +292,7 @@ class UniversalEstimator:
         return self._model.estimate(db_uT + self._noload_uT)
 
     def _learn(self, state: LearningState) -> None:
-        """Calibrate with a new state, and keep the one before for `undo`; if this fails, nothing changes."""
+        """Calibrate with a new state, and keep the previous one for `undo`; if this fails, nothing changes."""
         self._use(state)
         self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
 

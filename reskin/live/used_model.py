@@ -1,4 +1,4 @@
-"""What the page says about the model in use: its name, what it has learnt, its expected accuracy and its least force.
+"""Texts of the page about the model in use: name, calibration data, expected accuracy, smallest detected force.
 
 Expected accuracies are results of the pipeline: for networks, those in the card; for the shipped universal model, those
 in `reskin/universal/measured.json`. That file is not part of the card, because the results depend on the card. Other

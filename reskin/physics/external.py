@@ -8,8 +8,8 @@ uniform over the board; how much they vary depends on the distance.
 import numpy as np
 from jaxtyping import Float
 
-# Distance of the dipole, chosen on recordings of a moving hand whose fingers have skins (data/leaphand), where 40 mm is
-# most likely, and on simulated skins, where a larger distance makes the map more accurate if sources are farther away.
+# Distance of the dipole. It was chosen on recordings of a moving hand whose fingers have skins (data/leaphand; 40 mm is
+# most likely there) and on simulated skins (a larger distance is more accurate if sources are farther away).
 DISTANCE_MM = 50.0
 CHIP_RATIO = 3.0  # least distance of the dipole, in units of the distance of the farthest chip; assumed
 NOISE_MIN_uT = 0.1  # least noise for the suppressor; a log may begin with equal readings
@@ -35,8 +35,8 @@ def covariance(
 def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
     """Return a symmetric matrix that shrinks external fields in a reading to the size of its noise.
 
-    It is the whitening matrix of external field and noise, times the standard deviation of the noise. The part of a
-    reading that no external field explains is unchanged.
+    It is the whitening matrix of external field plus noise, multiplied by the standard deviation of the noise. The
+    part of a reading that no external field can explain is unchanged.
     """
     noise_uT = max(noise_uT, NOISE_MIN_uT)
     variances, axes = np.linalg.eigh(external_cov)

@@ -114,7 +114,7 @@ class ClockMap:
     """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
     `residual_s` is the largest misfit of the sync marks (or of the windows) to which the line was fitted. `explained`
-    tells how well the dwells coincide with contacts in the field: 1 if all of them do, 0 on average for a random
+    states how well the dwells coincide with contacts in the field: 1 if all of them do, 0 on average for a random
     offset. It is 1 if marks were given.
     """
 

@@ -1,9 +1,9 @@
 """Find captures whose places are rotated, mirrored or swapped, by comparing them with other captures of the scene.
 
-Boards of one scene give similar readings for similar presses, so the place of a press can be looked up among the
-presses of other captures. If the looked-up places agree with the labels only after the labels are rotated or mirrored,
-the labels of this capture or of the others are probably wrong. Nothing is assumed about the board, so a single capture
-cannot be checked.
+Boards of one scene give similar readings for similar presses, so the place of a press can be estimated from the most
+similar presses of other captures. If these estimates agree with the labels only after the labels are rotated or
+mirrored, the labels of this capture or of the others are probably wrong. Nothing is assumed about the board, so a
+single capture cannot be checked.
 """
 
 from collections.abc import Iterable

@@ -49,7 +49,7 @@ class SkinSensorConfig:
 
 
 class SkinSensor:
-    """A skin that a background thread reads continuously. May be used in a `with` statement, which connects it.
+    """A skin that a background thread reads continuously. Use it in a `with` statement, or call `connect`.
 
     A reading is a dict of numbers: the field of each chip (Bx0_uT, By0_uT, Bz0_uT, Bx1_uT, ...) and, if the model is
     for this board, the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are

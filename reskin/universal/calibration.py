@@ -217,7 +217,7 @@ class CalibrationData:
         return len(self.labels) + sum(day.labels_n for day in self.earlier)
 
     def next_day(self) -> "CalibrationData":
-        """Return the data at the beginning of a new day: the day before becomes an earlier day if it has presses.
+        """Return the data at the beginning of a new day; the previous day is kept as an earlier day if it has presses.
 
         At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the first one is omitted.
         """
@@ -227,9 +227,9 @@ class CalibrationData:
         return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
 
     def joined_to(self, last: "CalibrationData") -> "CalibrationData":
-        """Return the data with the presses of the last day, on which the skin slid in the same way, put before its own.
+        """Return the data preceded by the presses of the last day, on which the skin slid in the same way.
 
-        As on a single day, presses that are all over the area are then used only if no others were made after them.
+        As on a single day, presses spread all over the area are then used only if no other presses followed them.
         """
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
         even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT

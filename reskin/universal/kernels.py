@@ -235,7 +235,9 @@ def _clear(value):
         value[lane] = np.float32(0)
 
 
-CELL_SD_MM = 0.2  # least standard deviation of a place: positions within a cell of the lattice are not distinguished
+CELL_SD_MM = (
+    0.2  # smallest standard deviation of a place, because positions within a lattice cell are not distinguished
+)
 TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
 LEAST = math.log(TINY)
 FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one

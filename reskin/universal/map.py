@@ -217,7 +217,7 @@ class Hypotheses:
 
     @cached_property
     def noise_cov(self) -> Float[np.ndarray, "ch ch"]:
-        """Covariance of everything in a reading that is not the skin's: noise, and the external field if any."""
+        """Covariance of the parts of a reading that the skin does not cause: noise, and the external field if any."""
         noise = NOISE_uT**2 * np.eye(len(self.error_cov))
         return noise if self.external_cov is None else noise + self.external_cov
 
@@ -525,7 +525,7 @@ def condition_on_labels(
 
 
 def begin_day(skin: SkinMap) -> SkinMap:
-    """Return the map for a day on which the skin slides in another way; `skin` must not be conditioned on labels.
+    """Return the map for a day on which the skin slides differently; `skin` must not be conditioned on labels.
 
     The parameters of the slide get new values, which have a correlation of `SLIDE_CORRELATION` with those of the day
     before; their prior is the same on all days. Their values on earlier days are appended to the parameters, because

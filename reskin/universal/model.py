@@ -76,8 +76,9 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
-# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map is too
-# sure of forces. The best of four values on simulated skins (tests/benchmarks/test_force_benchmark.py).
+# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map
+# underestimates the uncertainty of forces. It is the best of four values on simulated skins
+# (tests/benchmarks/test_force_benchmark.py).
 FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
@@ -515,8 +516,8 @@ class Universal:
     def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
         """Return a matrix that shrinks external fields in readings to the size of their noise; None without the option.
 
-        Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result tells
-        contacts from external fields, which |dB| does not.
+        Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result
+        distinguishes contacts from external fields, which |dB| does not.
         """
         cov = self.external_cov
         return (
@@ -646,7 +647,7 @@ class Universal:
         """Set the no-load field to the mean of readings without contact, and condition the map on it.
 
         Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
-        already calibrated to. The no-load field also tells whether the skin is turned by a quarter (see `mounting`);
+        already calibrated to. The no-load field also shows whether the skin is turned by 90° (see `mounting`);
         set `turned` if you know it. The model is changed in place and returned.
 
         Raises
@@ -927,7 +928,7 @@ def load_universal(
 
 
 def is_model(file: Path) -> bool:
-    """Return whether a file is a universal model, which its card tells; False if there is no card."""
+    """Return whether the card of a file states that it is a universal model; False if there is no card."""
     card_file = file.with_suffix(".json")
     if file.suffix != FILE.suffix or not card_file.is_file():
         return False

@@ -1,4 +1,4 @@
-"""How a skin and its labels are oriented, found from the no-load field and from presses at known places.
+"""Find the orientation of a skin from its no-load field, and that of its labels from presses at known places.
 
 The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after a quarter turn
 (or three), every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
@@ -19,10 +19,12 @@ from scipy.linalg import cho_factor, cho_solve
 from reskin.universal.map import Estimate, OFFSET_uT, Tables
 
 LOG_ODDS_MIN = 2.0  # a smaller log odds of the found orientation is reported as uncertain (odds of 7 to 1)
-NOLOAD_MISFIT_MAX = 12.0  # chi^2 per channel of the no-load field from which it is reported; few skins exceed it
+NOLOAD_MISFIT_MAX = (
+    12.0  # a no-load field with a larger chi^2 per channel is reported as unusual; few skins exceed this
+)
 LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
-FRAME_LOG_ODDS_MIN = 5.0  # log odds from which other axes of the labels are reported (odds of 150 to 1)
-FRAME_SD_MM = 1.0  # standard deviation of errors of places that the estimate does not know of
+FRAME_LOG_ODDS_MIN = 5.0  # other axes of the labels are reported if their log odds are at least this (odds of 150 to 1)
+FRAME_SD_MM = 1.0  # standard deviation of place errors that the estimated uncertainty does not include
 OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0  # share of presses whose estimates are useless; they may be anywhere on this area
 
 TURNED = "turned by a quarter"
