@@ -275,7 +275,8 @@ def verify_reports(
         list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
     ] = None,
     against: Annotated[
-        Path | None, Option(help="Do not rerun: compare committed reports with those of an earlier rerun here.")
+        Path | None,
+        Option(help="Folder with reports of an earlier rerun, to compare instead of running the scenes again."),
     ] = None,
 ) -> None:
     """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""

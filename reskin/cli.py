@@ -53,17 +53,16 @@ SCAN = (
 )
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
 SIMULATED = (
-    "Mark the capture as simulated. Needed for a port of `reskin emulate` that sends a simulation: it looks like a "
-    "board."
+    "Mark the capture as simulated. Use it for a port of `reskin emulate`, which looks like that of a real board."
 )
 FAULT = (
-    "NAME[@START_S[+SECONDS]], such as stuck@8+2; default: 1 s, after 3 s. May be repeated. Names: failed-read, "
-    "zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, "
-    "dropped, torn, wrong-baud, stall, unplug."
+    "NAME[@START_S[+SECONDS]], such as stuck@8+2. Default: begins after 3 s, lasts 1 s. May be repeated. Names: "
+    "failed-read, zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, "
+    "repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = (
-    "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or the last "
-    "two. Default: the universal model for the paper's board."
+    "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or, if the "
+    "option is given twice, a model and its calibration. Default: the universal model for the paper's board."
 )
 EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
 NEW_DAY = "The calibration was made on an earlier day, so the skin may now slide differently (docs/live.md)."
@@ -123,7 +122,9 @@ def find_ports(
     rate: Annotated[bool, Option("--rate", help="Measure frame rates, and explain what limits them.")] = False,
     seconds: Annotated[float, Option(help="With --rate: duration of the measurement.", min=0.5)] = 5.0,
     osr: Annotated[int, Option(help="With --rate: setting OSR of the chips.", min=0, max=3)] = 0,
-    dig_filt: Annotated[int, Option("--dig-filt", help="With --rate: their setting DIG_FILT.", min=0, max=7)] = 2,
+    dig_filt: Annotated[
+        int, Option("--dig-filt", help="With --rate: setting DIG_FILT of the chips.", min=0, max=7)
+    ] = 2,
 ) -> None:
     """Find connected boards, and print the port, wire format, number of chips, frame rate and scale of each."""
     from reskin.board import find
@@ -250,9 +251,7 @@ def live(
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
     new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
-    skins: Annotated[Path, Option(help="Folder in which the page saves what it has learnt about skins.")] = Path(
-        "skins"
-    ),
+    skins: Annotated[Path, Option(help="Folder in which the page saves calibrations of skins.")] = Path("skins"),
 ) -> None:
     """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
