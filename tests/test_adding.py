@@ -380,10 +380,10 @@ def output_of(arguments: list[str]) -> str:
 def test_options_of_another_layout_are_refused(root, lab_file, monkeypatch, layout, option, used):
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", layout, "--board", "b", "--skin", "s", "--scene", "small", option]
-    assert_refused(root, lambda: app_raising(arguments), f"{option.partition('=')[0]} is only for --layout .*{used}")
+    assert_refused(root, lambda: run_and_raise(arguments), f"{option.partition('=')[0]} is only for --layout .*{used}")
 
 
-def app_raising(arguments: list[str]) -> None:
+def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 

@@ -113,7 +113,7 @@ def test_recorded_scene_without_captures_is_an_error():
         make_plan({"lab": scene()}, Registry(captures={}))
 
 
-def test_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
+def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     text = scene_text("mine", ["b1", "b2"], 60, 1, "reskin")
     captures = Registry(captures={"mine": {"c0": ENTRY}})
     generated = make_plan({"mine": parse_scene(YAML(typ="safe").load(text), "mine.yaml")}, captures)["stages"]

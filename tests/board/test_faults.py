@@ -80,7 +80,7 @@ class TestScale:
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 
     @given(st.integers(0, 1000))
-    def test_values_without_grid_have_no_lsb(self, seed):
+    def test_values_without_a_common_step_have_no_lsb(self, seed):
         field_uT = 5.0 * seeds.rng_for(seed, "smooth").standard_normal((400, 6))
         assert np.isnan(faults.find_lsb(field_uT)).all()
         assert not faults.reset_chips(field_uT, None).any()

@@ -17,7 +17,7 @@ from reskin.seeds import rng_for
 from tests.live.boards import make_script
 
 
-def play(script):
+def recognise_at_due_times(script):
     """Return the board recognised from a script whose frames all arrive at their due times."""
     return find.recognise("port", [(piece, t_s) for piece, t_s in zip(script.pieces, script.t_s, strict=True) if piece])
 
@@ -40,7 +40,7 @@ def measured(**changed):
 @pytest.mark.parametrize("rate_hz", [15.0, 83.0, 400.0])
 def test_rate_of_the_emulator_is_measured(wire, rate_hz):
     script = make_script(pokes_n=0, wire=wire, rate_hz=rate_hz, quiet_s=5.0)
-    board = play(script)
+    board = recognise_at_due_times(script)
     rate = board.rate
     assert rate.arrived_hz == pytest.approx(rate_hz, rel=1e-6)
     assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)  # the board's clock is a float32
@@ -141,7 +141,7 @@ def test_rate_limits_fall_with_chips_frame_length_and_conversion_time(chips_n, f
 )  # fmt: skip
 def test_rate_of_an_emulated_board_is_explained(script, sentence):
     """In fault `torn`, each cut frame is lost together with the frame that follows it: two of ten."""
-    board = play(script)
+    board = recognise_at_due_times(script)
     assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=find.BAUD)))
 
 
@@ -159,7 +159,10 @@ def test_command_prints_rate_sentence_and_limits(monkeypatch, capsys):
 
     def scan(names, *, listening_s):
         listened_s.append((names, listening_s))
-        return [play(with_fault("slow-chips", wire="binary-clock")), find.DetectedBoard("/dev/x", "no bytes arrived")]
+        return [
+            recognise_at_due_times(with_fault("slow-chips", wire="binary-clock")),
+            find.DetectedBoard("/dev/x", "no bytes arrived"),
+        ]
 
     monkeypatch.setattr(find, "scan_ports", scan)
     cli.find_ports(["/dev/y"], hunt=False, rate=True, seconds=3.0, osr=3, dig_filt=7)

@@ -33,7 +33,7 @@ def fillings(fillings_n=40, readings_n=5, noise_uT=NOISE_uT, name="glass"):
     return (GAIN_uT_PER_N * WEIGHT_N[:, None, None] * ALONG + noise).astype(np.float32)
 
 
-def test_fractions_in_the_right_order_equal_a_loop_over_pairs():
+def test_fractions_of_correctly_ordered_pairs_equal_a_loop():
     response = rng_for(0, "pairs").integers(0, 4, size=(2, 5, 3)).astype(float)
     for steps_n in range(1, 5):
         right = [
@@ -46,7 +46,7 @@ def test_fractions_in_the_right_order_equal_a_loop_over_pairs():
         assert ordered_share(response)[steps_n - 1] == pytest.approx(np.mean(right))
 
 
-def test_fractions_in_the_right_order_equal_the_normal_distribution():
+def test_fractions_of_correctly_ordered_pairs_follow_the_normal_distribution():
     shares = analyse_levels(fillings(), WEIGHT_N)[1]["by_direction"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
     # sampling error of 12,500 dependent pairs

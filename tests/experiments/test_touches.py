@@ -45,7 +45,7 @@ def pad(rows_n=40):
 
 
 @pytest.fixture(scope="module")
-def cut():
+def split_pad():
     single, double = pad()
     return [split_by_time(one, SECTION) for one in single], double
 
@@ -68,8 +68,8 @@ def test_residual_equals_bounded_least_squares():
     np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)  # two least-squares solvers
 
 
-def test_residual_of_the_touched_pair_is_noise(cut):
-    blocks, double = cut
+def test_residual_of_the_touched_pair_is_noise(split_pad):
+    blocks, double = split_pad
     numbers = evaluate_superposition(blocks, double)
     assert len(numbers["pairs"]) == 6
     for pair in numbers["pairs"]:
@@ -78,16 +78,16 @@ def test_residual_of_the_touched_pair_is_noise(cut):
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_an_unknown_place_is_mistaken_for_two(cut):
-    result = evaluate_detection(*cut, SECTION, 0)
+def test_single_touch_at_an_unknown_place_is_mistaken_for_two(split_pad):
+    result = evaluate_detection(*split_pad, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
     assert result["detected_pct"]["direction above noise"] > 90
     assert result["sums_called_two_pct"]["direction above noise"] > 90
 
 
-def test_places_and_forces_are_predicted(cut):
-    blocks, double = cut
+def test_places_and_forces_are_predicted(split_pad):
+    blocks, double = split_pad
     place, force = evaluate_places(blocks, double), evaluate_forces(blocks, rng_for(0, "touches", "force"))
     assert place["by_time"]["mean"] == 100
     assert place["by_time"]["chance_pct"] == 25
@@ -136,8 +136,8 @@ def test_fractions_that_leave_no_test_rows_are_an_error():
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 
-def test_table_shows_only_touched_pairs(cut):
-    blocks, double = cut
+def test_table_shows_only_touched_pairs(split_pad):
+    blocks, double = split_pad
     for pairs in (double, []):
         numbers = {
             "force_min_N": 0.5, "single": {"recordings_n": 4, "rows_n": 160},

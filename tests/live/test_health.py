@@ -134,12 +134,12 @@ def test_frames_with_a_fault_are_invalid():
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         assert script.pieces[0] != SCRIPT.pieces[0]
-        assert not feed_once(changed_frames(script, BATCH_FRAMES_N))[:20].any(), name
-        assert feed_once(changed_frames(script, BATCH_FRAMES_N))[20:].all(), name
+        assert not feed_once(decode_first_frames(script, BATCH_FRAMES_N))[:20].any(), name
+        assert feed_once(decode_first_frames(script, BATCH_FRAMES_N))[20:].all(), name
     assert feed_once(frames).all()
 
 
-def changed_frames(script, frames_n):
+def decode_first_frames(script, frames_n):
     from reskin.board.stream import decode_all
 
     return decode_all(b"".join(script.pieces[:frames_n]), "binary", 5, "script")[0]
@@ -149,7 +149,7 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_equal_change_on_all_chips_is_an_outside_field():
+def test_equal_change_on_all_chips_is_an_external_field():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
     health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to be judged
@@ -162,7 +162,7 @@ def test_equal_change_on_all_chips_is_an_outside_field():
 def test_fault_policy_decides_which_frames_are_valid():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
-        frames = changed_frames(script, BATCH_FRAMES_N)
+        frames = decode_first_frames(script, BATCH_FRAMES_N)
         for action, used in (("drop", False), ("flag", True), ("refuse", False)):
             health = Health(5, override(LIVE_POLICY, [f"{fault}={action}"], "test"))
             assert health.feed(frames, 1.0)[:20].all() == used, name

@@ -132,7 +132,7 @@ def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
     assert {"bytes lost between frames", "no frames in the data: wrong baud rate?"} <= set(skin.health.alarms)
 
 
-def test_magnet_raises_only_the_outside_field_alarm(tmp_path):
+def test_magnet_raises_only_the_alarm_external_field(tmp_path):
     skin, _ = play_to_skin(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 

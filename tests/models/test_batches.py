@@ -45,7 +45,7 @@ def test_targets_belong_to_their_rows():
             rows_of(step["unlabelled"][i], job.unlabelled.inputs)
 
 
-def test_labelled_triplets_are_near_and_far():
+def test_positive_is_nearer_than_the_negative_in_labelled_triplets():
     job = some_job(terms=True)
     place, group = job.labelled.points.place, job.labelled.points.group
     for step in batches([job]):

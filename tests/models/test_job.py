@@ -270,7 +270,7 @@ def test_restart_after_collapse_has_other_weights_and_batches():
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
-def test_last_bias_starts_at_the_mean_target(scaling):
+def test_initial_output_bias_is_the_mean_target(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = with_values(example_data(), "target", np.arange(3), np.nan)
     prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))

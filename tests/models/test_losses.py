@@ -22,7 +22,7 @@ def features(name: str, seed: int = 0) -> torch.Tensor:
     return torch.from_numpy(rng_for(seed, "features", name).normal(size=(M, B, D)).astype(np.float32))
 
 
-def three(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def random_triplet(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     return features("anchor", seed), features("positive", seed), features("negative", seed)
 
 
@@ -82,7 +82,7 @@ def test_shift_invariance_of_l2(shift):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_triplet_loss_equals_nested_loops(seed):
-    anchor, positive, negative = three(seed)
+    anchor, positive, negative = random_triplet(seed)
     assert any(0 < one for one in looped_triplet(anchor, positive, negative))
     np.testing.assert_allclose(
         triplet_loss(anchor, positive, negative), looped_triplet(anchor, positive, negative), rtol=SUM_RTOL
@@ -113,7 +113,7 @@ def test_identical_points_have_no_gradient():
 
 
 def test_networks_of_a_stack_have_separate_losses():
-    anchor, positive, negative = three()
+    anchor, positive, negative = random_triplet()
     before = triplet_loss(anchor, positive, negative)
     positive[1] += 10
     after = triplet_loss(anchor, positive, negative)
@@ -123,22 +123,22 @@ def test_networks_of_a_stack_have_separate_losses():
 @given(st.integers(0, 1000), st.floats(-5, 5))
 def test_triplet_loss_is_invariant_under_rotation_and_shift(seed, shift):
     turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
-    moved = [one @ turn + shift for one in three()]
+    moved = [one @ turn + shift for one in random_triplet()]
     # tolerance: differences of sums of about 80, from float32 numbers of up to 10
-    torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*three()), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*random_triplet()), rtol=1e-4, atol=1e-4)
 
 
 @given(st.floats(0.01, 100))
 def test_triplet_loss_scales_with_the_square(k):
-    stretched = [one * k for one in three()]
+    stretched = [one * k for one in random_triplet()]
     torch.testing.assert_close(
-        triplet_loss(*stretched), triplet_loss(*three()) * k**2, rtol=1e-4, atol=0
+        triplet_loss(*stretched), triplet_loss(*random_triplet()) * k**2, rtol=1e-4, atol=0
     )  # tolerance of float32
 
 
 @given(st.integers(0, 1000))
 def test_swapping_positive_and_negative_changes_the_sign(seed):
-    anchor, positive, negative = three(seed)
+    anchor, positive, negative = random_triplet(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
     torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # tolerance: float32 sums of about 80

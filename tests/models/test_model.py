@@ -24,7 +24,7 @@ def stack(members_n: int, architecture: str = "paper") -> Stack:
     return Stack(LAYERS[architecture](15), [draw_parameters(architecture, i) for i in range(members_n)])
 
 
-def descend(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+def output_and_gradients(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
     output = net(inputs)
     (output**2).sum().backward()
     return output.detach(), [one.grad for one in net.parameters()]
@@ -34,10 +34,10 @@ def descend(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[to
 @pytest.mark.parametrize("members_n", [1, 3])
 def test_stacked_networks_equal_plain_networks(architecture, members_n):
     net, inputs = stack(members_n, architecture), batch(members_n)
-    outputs, _ = descend(net, inputs)
+    outputs, _ = output_and_gradients(net, inputs)
     for i in range(members_n):
         alone = plain_net(architecture, draw_parameters(architecture, i))
-        output, _ = descend(alone, inputs[i])
+        output, _ = output_and_gradients(alone, inputs[i])
         torch.testing.assert_close(outputs[i], output, **CLOSE)
         features = features_of(alone)(inputs[i])
         torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
@@ -48,18 +48,18 @@ def test_stacked_networks_equal_plain_networks(architecture, members_n):
 
 
 def _with_gradients_for_weights(net: Stack) -> Stack:
-    twin = Stack(LAYERS["paper"](15), [net.weights_of(i) for i in range(net.members_n)])
-    for own, one in zip(twin.parameters(), net.parameters(), strict=True):
+    copied = Stack(LAYERS["paper"](15), [net.weights_of(i) for i in range(net.members_n)])
+    for own, one in zip(copied.parameters(), net.parameters(), strict=True):
         own.data = one.grad
-    return twin
+    return copied
 
 
 def test_stacked_networks_are_independent():
     inputs = batch(3)
-    outputs, gradients = descend(stack(3), inputs)
+    outputs, gradients = output_and_gradients(stack(3), inputs)
     others = Stack(LAYERS["paper"](15), [draw_parameters(name=0), draw_parameters(name=9), draw_parameters(name=2)])
     inputs[1] = 1e3 * inputs[1] + 5
-    again, again_gradients = descend(others, inputs)
+    again, again_gradients = output_and_gradients(others, inputs)
     for i, same in enumerate([True, False, True]):
         assert torch.equal(again[i], outputs[i]) == same
         assert all(torch.equal(a[i], b[i]) == same for a, b in zip(again_gradients, gradients, strict=True))
@@ -67,9 +67,9 @@ def test_stacked_networks_are_independent():
 
 def test_nan_input_affects_its_network_only():
     inputs = batch(3)
-    _, gradients = descend(stack(3), inputs)
+    _, gradients = output_and_gradients(stack(3), inputs)
     inputs[1] = torch.nan
-    outputs, poisoned = descend(stack(3), inputs)
+    outputs, poisoned = output_and_gradients(stack(3), inputs)
     assert torch.isfinite(outputs).flatten(1).all(1).tolist() == [True, False, True]
     assert all(torch.equal(a[[0, 2]], b[[0, 2]]) for a, b in zip(poisoned, gradients, strict=True))
 

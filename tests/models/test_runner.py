@@ -54,8 +54,8 @@ def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
 def run(
     selected: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
 ) -> list[TrainingResult]:
-    tell = (lambda line: None) if log is None else log.append
-    return run_jobs(selected, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
+    print_line = (lambda line: None) if log is None else log.append
+    return run_jobs(selected, example_data(), executor=executor or InlineExecutor(), cache=cache, log=print_line)
 
 
 def trainings_n(selected: list[TrainingJob], cache: Path) -> int:

@@ -63,6 +63,7 @@ def test_clipping_prevents_dead_networks():
 
 
 def jobs_of(jobs: list[PreparedJob]) -> list[PreparedJob]:
+    """Return the jobs with new random generators, because training advances them."""
     return [replace(job, rng=some_job(i).rng) for i, job in enumerate(jobs)]
 
 

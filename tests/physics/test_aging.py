@@ -32,7 +32,7 @@ changes = st.floats(-10, 10)
 
 
 @given(st.floats(1e3, 1e8), st.floats(1e-16, 1e8))
-def test_one_step_equals_50_digits(ratio, dt_over_fastest):
+def test_one_step_equals_50_digit_arithmetic(ratio, dt_over_fastest):
     assert signals.step_error(1e-3 * dt_over_fastest, signals.stiff(ratio)) <= signals.ROUNDING
 
 

@@ -16,11 +16,11 @@ paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st
 frictions = st.floats(0, 2)
 
 
-def straight(end_m, steps_n, towards_rad=0.7):
+def straight_path_m(end_m, steps_n, towards_rad=0.7):
     return np.linspace(0, end_m, steps_n + 1)[:, None] * [np.cos(towards_rad), np.sin(towards_rad)]
 
 
-def normals(path_m, force_N=1.0):
+def constant_force_N(path_m, force_N=1.0):
     return np.full(len(path_m), force_N)
 
 
@@ -36,7 +36,7 @@ def test_force_of_a_straight_drag_is_that_of_spring_or_friction(end_m, normal_N,
 
 @given(paths_m)
 def test_force_is_zero_without_friction(path_m):
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.0)
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=0.0)
     assert not found.force_N.any()
     assert not found.elastic_m.any()
     moves = np.hypot(*np.diff(path_m, axis=0).T) > 0
@@ -45,7 +45,7 @@ def test_force_is_zero_without_friction(path_m):
 
 @given(paths_m)
 def test_infinite_friction_is_a_spring(path_m):
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=1e6)
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=1e6)
     np.testing.assert_allclose(found.force_N, K * (path_m - path_m[0]), atol=ROUNDING * K * 1e-2)
     assert not found.sliding.any()
 
@@ -67,7 +67,7 @@ def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
     ahead = np.array([0.6, -0.8])
     fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
     ends = [
-        drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu).force_N[-1]
+        drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu).force_N[-1]
         for path_m in (fine_m, fine_m[[0, -1]])
     ]
     np.testing.assert_allclose(*ends, atol=ROUNDING)
@@ -81,7 +81,7 @@ def test_loop_dissipates_friction_times_length():
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
     )
     path_m = np.append(along_m, reach_m)[:, None] * [0.8, 0.6]
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
     # In a loop of length 4 reaches, the spring reverses twice, over twice its length each; elsewhere the tip slides.
@@ -96,7 +96,7 @@ def test_loop_dissipates_friction_times_length():
 
 @given(paths_m, frictions)
 def test_friction_opposes_slip(path_m, mu):
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
     slip_m = slipped_m(path_m, found)
     power = (found.force_N[1:] * slip_m).sum(axis=1)
     np.testing.assert_allclose(power, mu * np.hypot(*slip_m.T) * found.sliding[1:], atol=1e-15)
@@ -107,15 +107,15 @@ def test_friction_opposes_slip(path_m, mu):
 def test_rotating_the_path_rotates_the_force(path_m, mu, angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
     unrotated, rotated = (
-        drag_force(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
+        drag_force(p, constant_force_N(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
     )
     # rounding of 40 steps of up to 30 N (before limiting by friction)
     np.testing.assert_allclose(rotated, unrotated @ turn.T, atol=1e-10)
 
 
 def test_force_turns_within_a_few_spring_lengths():
-    path_m = np.vstack([straight(4e-3, 400, 0.0), straight(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
+    path_m = np.vstack([straight_path_m(4e-3, 400, 0.0), straight_path_m(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
     # The spring follows a tractrix: its angle f to the new line obeys tan(f / 2) = exp(-distance / length).
     angle_rad = 2 * np.arctan(np.exp(-past_m / 0.8e-3))
@@ -138,8 +138,8 @@ def test_lifting_resets_the_spring():
 
 
 def test_skin_without_stiffness_has_no_drag():
-    path_m = straight(5e-3, 10)
-    found = drag_force(path_m, normals(path_m), stiffness_N_per_m=0.0, friction=0.8)
+    path_m = straight_path_m(5e-3, 10)
+    found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=0.0, friction=0.8)
     assert not found.force_N.any()
 
 

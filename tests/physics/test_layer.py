@@ -32,7 +32,7 @@ def field(r_m, z_m, depth_m=1.2e-3):
 
 
 @given(waves_kh)
-def test_compliance_equals_50_digits(kh):
+def test_compliance_equals_50_digit_arithmetic(kh):
     assert mechanics.bonded_compliance(np.array([kh])).holds
 
 
@@ -46,7 +46,7 @@ def test_compliance_limits():
 
 
 @given(st.floats(0.01, 30), st.floats(0, 1))
-def test_displacement_over_depth_equals_50_digits(kh, share):
+def test_displacement_over_depth_equals_50_digit_arithmetic(kh, share):
     with mpmath.workdps(50):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh) * mpmath.mpf(share)
         ratio = (mpmath.cosh(a) + a * mpmath.sinh(a)) / (a * mpmath.cosh(a))

@@ -57,7 +57,7 @@ def gradients(traction, places_m, step_m=2e-6):
     return np.stack(pairs, axis=-1) / (2 * step_m)
 
 
-def some_places_m(places_n=40, top=0.95):
+def random_places_m(places_n=40, top=0.95):
     rng = np.random.default_rng(5)
     r_m, f = 4e-3 * np.sqrt(rng.uniform(0, 1, places_n)), rng.uniform(0, 2 * np.pi, places_n)
     return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
@@ -72,7 +72,7 @@ def displace(
 
 
 @given(st.floats(0.01, 200), st.floats(0, 1))
-def test_response_of_the_layer_equals_50_digits(kh, share):
+def test_response_of_the_layer_equals_50_digit_arithmetic(kh, share):
     with mpmath.workdps(250):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh * share)
         size = mpmath.cosh(a) ** 2 + a**2
@@ -184,7 +184,7 @@ def test_every_horizontal_plane_carries_the_force(traction):
 
 
 def test_volume_is_conserved_and_rotation_is_half_the_curl():
-    traction, places_m = sliding(), some_places_m()
+    traction, places_m = sliding(), random_places_m()
     grad = gradients(traction, places_m)
     size = np.abs(grad).max()
     np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # error of central differences
@@ -198,7 +198,7 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
 def test_table_equals_direct_integration(force):
-    traction, places_m = sliding(), some_places_m(top=1.0)
+    traction, places_m = sliding(), random_places_m(top=1.0)
     found = displace(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
     truth_m = displacement_m(traction, places_m @ turn) @ turn.T
@@ -270,7 +270,7 @@ def test_sliding_is_19_to_20_percent_softer_than_sticking():
 
 @given(forces_N, forces_N, st.floats(-3, 3))
 def test_displacement_is_linear(one_N, other_N, times):
-    nodes_m = some_places_m(30)
+    nodes_m = random_places_m(30)
     both = displace(one_N + times * other_N, nodes_m)
     first, second = displace(one_N, nodes_m), displace(other_N, nodes_m)
     for name in ("displacement_m", "half_curl"):
@@ -280,7 +280,7 @@ def test_displacement_is_linear(one_N, other_N, times):
 
 @given(forces_N, st.floats(-np.pi, np.pi))
 def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
-    nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
+    nodes_m, (c, s) = random_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     unrotated, rotated = (
         displace(force_N, nodes_m, centre_m=(0, 0)),
@@ -292,7 +292,7 @@ def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
 
 
 def test_mirror_symmetry_along_the_force():
-    nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
+    nodes_m, mirror = random_places_m(), np.array([1, -1, 1])
     here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
     np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)  # the curl is an axial vector
@@ -309,7 +309,7 @@ def test_skin_moves_with_the_tip_and_rotates_forward():
 
 
 def test_base_and_far_nodes_do_not_move():
-    base = displace([0.5, 0.3], some_places_m() * [1, 1, 0])
+    base = displace([0.5, 0.3], random_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
     assert base.half_curl.any()  # the material at the base shears and therefore rotates
     away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
@@ -326,7 +326,7 @@ def test_displacement_beyond_the_reach_is_below_half_a_percent():
 @settings(max_examples=10, deadline=None)  # each example computes a table in 20 ms
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
 def test_displacement_scales_with_size_and_stiffness(size, hardness):
-    nodes_m = some_places_m(30)
+    nodes_m = random_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
     here = displace([0.5, 0.2], nodes_m, centre_m=(0, 0))
     scaled = displace(
@@ -375,7 +375,7 @@ def shear_in_many_steps(force_N, nodes_m, table, steps_n):
 
 
 def test_midpoint_steps_equal_many_small_steps():
-    nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
+    nodes_m, over = [0.5, 0.5, 1] * random_places_m(200), []
     # friction coefficients 0.8, 0.4, 0.8; the code takes 1, 1, 2 steps
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):
         table = shear.tabulate_depth(depth_m, **SKIN)
@@ -392,7 +392,7 @@ def test_midpoint_steps_equal_many_small_steps():
 
 
 def test_small_force_needs_no_midpoint_step():
-    nodes_m = some_places_m()
+    nodes_m = random_places_m()
     once, half_way = (
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
     )
@@ -402,7 +402,7 @@ def test_small_force_needs_no_midpoint_step():
 
 
 def test_displacement_of_moved_nodes_rotates_with_the_force():
-    nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    nodes_m, turn = random_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     here = displace([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
     rotated = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
     np.testing.assert_allclose(rotated.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
@@ -463,8 +463,8 @@ def test_midpoint_steps_conserve_volume(depth_m, force_N, loss):
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, np.nan]]))),
-        ("half of the curl", lambda: displace([3, 0], some_places_m(), by=shear.shear_in_steps)),
-        ("half of the curl", lambda: displace([0, np.nan], some_places_m(), by=shear.shear_in_steps)),
+        ("half of the curl", lambda: displace([3, 0], random_places_m(), by=shear.shear_in_steps)),
+        ("half of the curl", lambda: displace([0, np.nan], random_places_m(), by=shear.shear_in_steps)),
         ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
     ],
 )

@@ -145,7 +145,7 @@ def test_change_equals_difference_of_sums():
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_extreme_skins_and_pokes(base):
+def test_stability_cases_hold_for_extreme_skins_and_pokes(base):
     usual, again, renamed = (skin(UNEVEN, name, base=base) for name in ("s7", "s7", "s8"))
     soft, hard = (skin(UNEVEN, "s7", base=base, modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))
     bare, strong = (skin(UNEVEN, "s7", base=base, saturation_T=times * 0.11) for times in (0, 5))

@@ -17,7 +17,7 @@ NO_SLIDE = {"give_m": (0.0, 0.0), "away": 0.0}
 HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
-def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
+def motion_of(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
     found = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), sides_m)
     return found.move_m[0], float(found.spin_rad[0])
 
@@ -41,32 +41,32 @@ def test_motion_minimises_the_drag(sides_m):
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
     equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
-    move_m, found_rad = one(place_m, taken_m, sides_m)
+    move_m, found_rad = motion_of(place_m, taken_m, sides_m)
     np.testing.assert_allclose(move_m, expected, rtol=1e-3)
     np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
 
 
 def test_pull_at_the_edge_of_a_square():
     # p = (L/2, 0), D along y: f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, theta = 6 f (L/2) / L^2 = 3 f / L.
-    move_m, spin_rad = one((SIDE_M / 2, 0.0), (0.0, 1e-4))
+    move_m, spin_rad = motion_of((SIDE_M / 2, 0.0), (0.0, 1e-4))
     np.testing.assert_allclose(move_m, (0.0, 1e-4 / 2.5), rtol=1e-12)
     assert spin_rad == pytest.approx(3 * 1e-4 / 2.5 / SIDE_M, rel=1e-12)
 
 
 @given(places_m, displacements_m)
 def test_place_moves_by_the_given_displacement(place_m, taken_m):
-    move_m, spin_rad = one(place_m, taken_m)
+    move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
 @given(places_m, displacements_m)
 def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
-    (move_m, spin_rad), quarter = one(place_m, taken_m), np.array([[0, -1], [1, 0]])
-    turned_m, turned_rad = one(quarter @ place_m, quarter @ taken_m)
+    (move_m, spin_rad), quarter = motion_of(place_m, taken_m), np.array([[0, -1], [1, 0]])
+    turned_m, turned_rad = motion_of(quarter @ place_m, quarter @ taken_m)
     np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
     assert turned_rad == pytest.approx(spin_rad, rel=1e-12, abs=1e-18)
-    assert one(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
+    assert motion_of(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
 
 
 def test_displacement_follows_force_and_distance():
@@ -82,7 +82,7 @@ def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
     # Uniform springs of stiffness k: a force moves the skin by f / k and rotates the skin by moment / (k rho^2).
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
     taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
-    move_m, spin_rad = one(place_m, taken_m)
+    move_m, spin_rad = motion_of(place_m, taken_m)
     np.testing.assert_allclose(move_m, force_N / springs_N_per_m, atol=1e-15)
     moment_m = (x * force_N[1] - y * force_N[0]) / springs_N_per_m
     np.testing.assert_allclose(spin_rad, moment_m / (2 * SIDE_M**2 / 12), rtol=1e-9, atol=1e-15)

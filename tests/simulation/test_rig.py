@@ -50,7 +50,7 @@ def test_timeline_of_a_dragged_line():
 
 
 @given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
-def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jitter_s, seed):
+def test_chunks_contain_every_frame_once_and_never_arrive_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
     settings_of_rig = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
     arrived_n, arrived_s = draw_arrivals(frame_s, settings_of_rig, rng_for(seed, "chunks"))

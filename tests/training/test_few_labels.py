@@ -102,7 +102,7 @@ ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
 LABELLED = [(entry, job) for entry, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(
+def all_entries(
     tested_study: few.Study, networks: list[few.TrainedEntry]
 ) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
     return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(tested_study)]
@@ -111,17 +111,17 @@ def all_tried(
 def test_there_is_one_entry_per_method_fold_and_number_of_labels():
     folds = [f"b{board}-draw{draw}" for board in range(3) for draw in range(2)]
     assert [fold.name for fold in STUDY.folds] == folds
-    entry = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_tried(STUDY, NETWORKS))
+    entry = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_entries(STUDY, NETWORKS))
     assert entry == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
 
 
 def test_names_of_jobs_are_unique():
-    names = [one.name for _, one in all_tried(STUDY, NETWORKS)]
+    names = [one.name for _, one in all_entries(STUDY, NETWORKS)]
     assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
 
 
 def test_entries_of_a_fold_have_the_same_test_and_training_rows():
-    for entry, one in all_tried(STUDY, NETWORKS):
+    for entry, one in all_entries(STUDY, NETWORKS):
         assert (one.test == entry.fold.test).all()
         assert (one.train == entry.fold.train).all()
         assert {*ROWS.board[one.test]} == {entry.fold.name[:2]}
@@ -135,7 +135,7 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
 def with_labels(
     tested_study: few.Study, networks: list[few.TrainedEntry]
 ) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [(entry, one) for entry, one in all_tried(tested_study, networks) if entry.labels_n]
+    return [(entry, one) for entry, one in all_entries(tested_study, networks) if entry.labels_n]
 
 
 def test_labels_are_whole_indentations_of_the_pool():
@@ -150,7 +150,7 @@ def test_labels_are_whole_indentations_of_the_pool():
 
 
 def test_entries_for_zero_labels_contain_no_labels():
-    for entry, one in all_tried(STUDY, NETWORKS):
+    for entry, one in all_entries(STUDY, NETWORKS):
         if not entry.labels_n:
             assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
 
@@ -226,10 +226,10 @@ def test_only_listed_networks_are_adapted():
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
         # all pool rows are on a line: each of 8 places on a 3 x 3 grid has a neighbour
         assert {*job.tuning.lines.row} == {*fold.pool}
-    assert few.adaptation_jobs(study(adapted=[]), networks_of_no_labels(study(adapted=[]))) == []
+    assert few.adaptation_jobs(study(adapted=[]), untrained_networks(study(adapted=[]))) == []
 
 
-def networks_of_no_labels(tested_study: few.Study) -> list[few.TrainedEntry]:
+def untrained_networks(tested_study: few.Study) -> list[few.TrainedEntry]:
     return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(tested_study, [])]
 
 
@@ -248,7 +248,7 @@ def test_adaptation_does_not_use_labels_of_the_new_board():
 
 def test_adaptation_uses_only_the_order_along_lines():
     stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
-    done = networks_of_no_labels(STUDY)
+    done = untrained_networks(STUDY)
     pairs = zip(few.adaptation_jobs(STUDY, done), few.adaptation_jobs(study(rows=stretched), done), strict=True)
     for (_, job), (_, other) in pairs:
         for name, values in vars(job.tuning.lines).items():

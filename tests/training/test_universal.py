@@ -103,7 +103,7 @@ def scaled_channels(skins, rng):
     return skins.db_uT * np.exp(0.5 * rng.standard_normal((len(skins), 1, 15)))
 
 
-def calibrate_to_errors(nominal: Variant, error) -> tuple[PoolCalibration, LabelledPresses]:
+def calibrate_to_skin_with(nominal: Variant, error) -> tuple[PoolCalibration, LabelledPresses]:
     return calibrate_to_simulated(nominal.model, draw_prior_skins(nominal.prior, 1, 0, "asked", error), 0, 0)
 
 
@@ -113,7 +113,9 @@ def test_best_powers_cover_90_percent():
 
 
 def test_larger_misfit_widens_intervals_without_changing_estimates(nominal):
-    (fitting, _), (misfitting, tested) = (calibrate_to_errors(nominal, error) for error in (unchanged, scaled_channels))
+    (fitting, _), (misfitting, tested) = (
+        calibrate_to_skin_with(nominal, error) for error in (unchanged, scaled_channels)
+    )
     assert misfitting.misfit > 2 * fitting.misfit
     powers = misfitting.nominal_powers(Powers(0.2, 0.1))
     assert powers.map == pytest.approx(min(1.0, 0.2 / misfitting.misfit))
@@ -126,25 +128,25 @@ def test_larger_misfit_widens_intervals_without_changing_estimates(nominal):
 
 
 @pytest.fixture
-def exact_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
+def exact_and_wrong_labels(nominal) -> tuple[PoolCalibration, PoolCalibration]:
     """Return the calibration of a skin with exact labels, and with labels that have independent errors of 3 mm."""
-    exact, _ = calibrate_to_errors(nominal, unchanged)
+    exact, _ = calibrate_to_skin_with(nominal, unchanged)
     off_mm = 3 * rng_for(1, "labels").standard_normal(exact.pool.place_mm.shape)
     return exact, replace(exact, pool=replace(exact.pool, place_mm=exact.pool.place_mm + off_mm))
 
 
-def test_errors_of_held_out_labels_widen_intervals(exact_and_misled):
+def test_errors_of_held_out_labels_widen_intervals(exact_and_wrong_labels):
     powers = [Powers(0.3, 0.3), Powers(0.1, 0.1)]
-    fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in exact_and_misled)
-    _, misled = exact_and_misled
+    fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in exact_and_wrong_labels)
+    _, misled = exact_and_wrong_labels
     assert (misled_powers < fitting_powers / 2).all()
     assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
     # Forty wrong labels lower the powers more than three wrong labels do.
     assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 
-def test_single_label_is_held_out(exact_and_misled):
-    exact, misled = exact_and_misled
+def test_single_label_is_held_out(exact_and_wrong_labels):
+    exact, misled = exact_and_wrong_labels
     (found,) = lower_by_labels(misled, 1, [Powers(0.3, 0.3)])
     (without,) = estimate(exact.with_labels(0), exact.pool.db_uT[:1], [Powers(0.3, 0.3)])
     errors = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in without]

@@ -19,7 +19,7 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 
 @pytest.fixture(autouse=True)
-def small(monkeypatch):
+def small_lattice(monkeypatch):
     monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # only places within 2.8 mm, for speed
 
 

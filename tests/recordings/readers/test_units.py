@@ -30,7 +30,7 @@ def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
     return np.round(b_uT / step_uT) * step_uT
 
 
-def test_skin_field_passes_in_microtesla_only() -> None:
+def test_fields_of_a_skin_are_accepted_only_in_microtesla() -> None:
     check_fields(SKIN_uT, "here", first_line_n=1)
     with pytest.raises(CaptureError, match="Convert mT or G"):
         check_fields(SKIN_uT / 1e3, "here", first_line_n=1)
@@ -40,7 +40,7 @@ def test_skin_field_passes_in_microtesla_only() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(name=st.sampled_from(sorted(BOARDS_uT)), seed=st.integers(0, 1000))
-def test_board_passes_in_microtesla_only(name: str, seed: int) -> None:
+def test_fields_of_a_board_are_accepted_only_in_microtesla(name: str, seed: int) -> None:
     b_uT = fields_uT(*BOARDS_uT[name], seed)
     check_fields(b_uT, "here", first_line_n=1)
     for factor in (1e-2, 1e-3, 1e-6, 1e3):
@@ -54,7 +54,7 @@ def test_strong_fields_in_gauss_are_recognised_by_the_lsb() -> None:
 
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
-def test_fields_without_lsb_pass_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
+def test_fields_without_lsb_are_accepted_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
     constant = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
     check_fields(constant, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
@@ -62,7 +62,7 @@ def test_fields_without_lsb_pass_if_as_strong_as_the_earths_field(usual_uT: floa
     check_fields(smooth.round(2), "here", first_line_n=1)
 
 
-def test_real_boards_pass_in_microtesla_only(shared_data) -> None:
+def test_recorded_fields_are_accepted_only_in_microtesla(shared_data) -> None:
     files = sorted((shared_data / "lab").glob("*.csv"))
     boards = [np.loadtxt(file, delimiter=",", skiprows=1, usecols=[5, 6, 7, 9, 10, 11]) for file in files]
     boards += [np.loadtxt(file, delimiter=",")[:, 1:] for file in sorted((shared_data / "eflesh").rglob("sensor.csv"))]
@@ -73,7 +73,7 @@ def test_real_boards_pass_in_microtesla_only(shared_data) -> None:
             check_fields(b_uT / 100, "here", first_line_n=1)
 
 
-def test_press_passes_in_newtons_only() -> None:
+def test_forces_are_accepted_only_in_newtons() -> None:
     press_N = np.array([np.nan, 0.0, -9.5, 3.4])
     check_forces(press_N, "here", first_line_n=1)
     with pytest.raises(CaptureError, match="in line 12"):
@@ -89,7 +89,7 @@ def test_implausible_forces_are_refused() -> None:
 
 @settings(deadline=None)
 @given(extent_mm=st.floats(1.0, 199.0), start_mm=st.floats(-500, 500))
-def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> None:
+def test_places_are_accepted_only_in_millimetres(extent_mm: float, start_mm: float) -> None:
     place_mm = np.array([[start_mm, 3.0], [start_mm + extent_mm * 1.001, 3.0], [np.nan, np.nan]])
     check_places(place_mm, "here")
     for factor in (1e-3, 1e3):
@@ -106,7 +106,7 @@ def test_place_far_from_the_others_is_named_with_its_line() -> None:
         check_places(1e3 * place_mm[:20], "here")
 
 
-def test_single_place_with_rounding_errors_passes() -> None:
+def test_single_place_with_rounding_errors_is_accepted() -> None:
     check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
     check_places(np.full((3, 2), np.nan), "here")
 
@@ -114,7 +114,7 @@ def test_single_place_with_rounding_errors_passes() -> None:
 @pytest.mark.parametrize(
     ("deepest_mm", "accepted"), [(1.2, True), (0.0, True), (12.0, True), (0.0012, False), (1200, False)]
 )
-def test_depths_pass_in_millimetres_only(deepest_mm: float, accepted: bool) -> None:
+def test_depths_are_accepted_only_in_millimetres(deepest_mm: float, accepted: bool) -> None:
     depth_mm = np.array([0.0, deepest_mm / 2, deepest_mm, np.nan])
     if accepted:
         check_depths(depth_mm, "here")
