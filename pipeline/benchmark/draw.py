@@ -1,4 +1,4 @@
-"""Draw the folds of benchmark v1, which are frozen: this module documents how they were made, and must not change.
+"""Draw the folds of benchmark v1. They are frozen, so this module, which documents how they were made, must not change.
 
     python -m pipeline.benchmark.draw RECORDINGS OUT
 

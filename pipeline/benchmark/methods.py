@@ -5,7 +5,7 @@
 Writes the files of predictions to folder PREDICTIONS, for all datasets by default. The recordings must be in
 data/fetched (`reskin fetch lab`, `reskin fetch eflesh`). Each method receives only the arrays of
 `pipeline.benchmark.tasks`, as other people's methods do. Some choices in the universal model, such as the form of its
-law, were made after both boards of dataset lab had been seen (docs/learning.md).
+law, were made after results on both boards of dataset lab were known (docs/learning.md).
 """
 
 import sys

@@ -62,9 +62,9 @@ class Compare(SectionWithRows):
     layout: BoardLayout | None = None
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
+    skin_flipped: bool  # whether all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
     labels_middle_mm: tuple[float, float]  # label (x, y) of the place at the board's middle
-    labels_mirrored: bool  # the labels' y has the opposite sign of the board's y
+    labels_mirrored: bool  # whether the labels' y has the opposite sign of the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
     memory: Annotated[float, Field(ge=0, lt=1)]

@@ -51,7 +51,7 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
 SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
 DRAWN_N = 60  # number of pairs in the figure, for each board and separation
-SAME_PLACE = 0.0  # separation in mm: two pokes at one place show the effect of signal strength and noise alone
+SAME_PLACE = 0.0  # separation of 0 mm: two pokes at the same place show the effect of signal strength and noise alone
 TOLERANCE_MM = 0.5  # tolerance of a pair's separation, assumed; needed because places are on a grid
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
 

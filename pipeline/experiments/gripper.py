@@ -38,7 +38,7 @@ SWING = 3.0  # an object's stiffness varies between a third of its nominal value
 # force is reached, but not which force is reached.
 DEPTH_OF_1_N_MM = 0.8
 READINGS_N = 5  # number of readings averaged for the press of known force, as for each indentation (paper section 3)
-WITHIN = 0.1  # tolerance of the held force, relative to the aim (our choice; the paper's gripper holds a blueberry)
+WITHIN = 0.1  # tolerance of the held force, relative to the aim; our choice, because the paper states none
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
 Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # dB in uT -> x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]

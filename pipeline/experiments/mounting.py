@@ -1,8 +1,8 @@
 """How reliably the universal model finds the orientation of a skin and of its labels.
 
-The shipped model is used as a user would: fields of recorded boards and of simulated skins are changed as if the skin
-had been glued on after a quarter turn, or as if the chips were connected in another order, and labels as if their axes
-were mirrored or turned.
+The shipped model is used as a user would use it, on changed data of recorded boards and simulated skins. Fields are
+changed as if the skin had been glued on after a quarter turn, or as if the chips were connected in another order.
+Labels are changed as if their axes were mirrored or turned.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,8 +1,8 @@
 """Contacts and places of the universal model on a moving hand, with and without `external_uT`.
 
 When a robot moves a skin, the earth's field turns relative to it, and magnets and other skins come near. The experiment
-counts how often such a change is taken for a contact, and how much it moves the estimated place of a press. Results are
-of three kinds, which column `source` of the tables tells:
+counts how often such a change of the field is mistaken for a contact, and how much it shifts the estimated place of a
+press. Column `source` of the tables states the kind of each result:
 
 - *recorded*: changes of the field at the pads of a hand that moves without contact;
 - *superposed*: recorded presses of other boards, plus recorded changes of the hand. A superposition contains the noise

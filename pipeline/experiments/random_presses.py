@@ -179,7 +179,7 @@ def score_draw(
 
 
 def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
-    """Return the labels of each number, and after no label those of the known weight, with their names."""
+    """Return the labels to calibrate with, and their names: each number of labels and, after 0, the known weight."""
     if max(labels_n, default=0) > len(draw.labels):
         what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
         raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
@@ -192,7 +192,7 @@ def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list
 
 
 def raise_forces(labels: LabelledPresses) -> LabelledPresses:
-    """Raise forces to the least force of the map."""
+    """Raise forces below the smallest force of the map to this force."""
     return replace(labels, force_N=np.maximum(labels.force_N, FORCE_MIN_N))
 
 

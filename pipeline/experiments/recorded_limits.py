@@ -3,7 +3,7 @@
 - *Registration*: a few presses at known places correct a model of another board by a rotation and a shift, as in the
   procedure published for skins that are mounted again. Other presses of the board test the result.
 - *Shear*: how much of the recorded sideways force can be estimated from the field.
-- *Detection*: the field change and the force that can be told from no-load readings.
+- *Detection*: the smallest field change and force that can be distinguished from no-load readings.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

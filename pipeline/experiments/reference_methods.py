@@ -537,7 +537,7 @@ def flag_by_universal(
 # --- Tables ---
 
 DASH = "–"
-# What each method can and cannot correct by its mechanism; the table's other columns show whether it helps.
+# What each method can and cannot correct in principle; the other columns of the table show whether it helps.
 WHY = {
     "channels matched": "corrects the gain of each channel; a shifted or rotated skin mixes channels, and standard "
     "deviations also differ if forces differ",

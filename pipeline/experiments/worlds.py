@@ -1,4 +1,4 @@
-"""Which properties of simulated skins decide the scores of table 2 (not in the paper).
+"""Which properties of simulated skins determine the scores of table 2 (not in the paper).
 
 The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from
 those of the scene in one factor, for example a spread between skins, or an error of the simulation.

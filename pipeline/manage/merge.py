@@ -1,4 +1,4 @@
-"""Resolve merge conflicts between branches with different recordings: in registry, plan, dvc.lock and reports.
+"""Resolve merge conflicts in registry, plan, dvc.lock and reports, between branches with different recordings.
 
 Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """

@@ -39,7 +39,7 @@ class Calibrated(Strict):
 
 @dataclass(frozen=True)
 class Frame:
-    """Converts labels of a scene to the coordinates of the model, and back, which is the same operation."""
+    """Converts labels of a scene to the coordinates of the model, and back; both directions are the same operation."""
 
     centre_mm: tuple[float, float]
     mirrored: bool  # the labels' y has the opposite sign of the board's y

@@ -53,7 +53,7 @@ CARD = {
     "(8 N), gap and amplitude (1.6 mm, 1.4), how they vary together (0.95 per mm), the direction of the "
     "magnetisation, the length scales of the law's error, and the method by which forces are estimated",
 }
-SHIPPED = {  # what the card of the shipped model says in addition
+SHIPPED = {  # additional entries in the card of the shipped model
     "name": "universal, simulated alone",
     "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
     "evenly spread presses (see(presses, even=True)) and by labels. Table `random_presses` "

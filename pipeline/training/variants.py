@@ -26,7 +26,11 @@ from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
 FORCE = 2  # column of the force
-BEFORE, AFTER, CONTROL = "before", "after", "control"  # control: fine-tuned equally long, without pokes of the skin
+BEFORE, AFTER, CONTROL = (
+    "before",
+    "after",
+    "control",
+)  # control: fine-tuned for the same number of steps, without pokes of the skin
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
 
 
