@@ -15,7 +15,7 @@ from reskin.errors import ParamsError, SchemaError
 NOT_STATED = "not stated"
 NETWORK = "network of the paper"  # an entry that corresponds to method `network` of experiment labels
 UNLABELLED_N = 65  # unlabelled presses of dataset lab
-CHECKERBOARD = "other colour of a checkerboard"  # the split of experiment random_presses that dataset lab has
+CHECKERBOARD = "other colour of a checkerboard"  # dataset lab uses this split of experiment random_presses
 NONE_YET = "No entries yet."
 
 

@@ -198,7 +198,7 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
     """Return the agreement of a simulation with a board's recordings.
 
-    The agreement of the fitted law is stored in the board's mapping itself, that of other simulations under their name.
+    The mapping of a board holds the agreement of the fitted law itself, and that of other simulations by name.
     """
     agreement_numbers: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
     return agreement_numbers

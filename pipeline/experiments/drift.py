@@ -625,7 +625,7 @@ def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float
 
 
 def late_bias(late: Mapping[str, Any]) -> Comparison:
-    """Return the force bias after many contacts as a comparison with 0.
+    """Compare the force bias after many contacts with 0.
 
     The interval over training runs is widened to two standard errors over indentations if these are larger; it is None
     if there is only one network.

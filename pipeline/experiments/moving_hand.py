@@ -602,7 +602,7 @@ def _place_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[Row]:
         for name, title in (("accuracy_pct", "within 1 mm, %"), ("mse_xy_mm2", "MSE_xy, mm²")):
             line[option + title] = show(row[name])
         line[option + "in 90 % interval, %"] = round(row["coverage_pct"]["mean"])
-    alone = RECORDED if source == SUPERPOSED else source  # recorded presses without a change are no superposition
+    alone = RECORDED if source == SUPERPOSED else source  # without a change, nothing is superposed
     return [line | {"source": alone if field == NO_FIELD else source} for (field, _), line in lines.items()]
 
 

@@ -118,7 +118,8 @@ def number_places(place_mm: Float[np.ndarray, "m 2"]) -> Int64[np.ndarray, " m"]
 
 # --- Rigid registration with presses at known places ---
 
-CANDIDATES_N = 100  # random sets of places, of which the one with the largest least distance is used
+# Number of random sets of places. The set with the largest minimum distance between its places is used.
+CANDIDATES_N = 100
 # Uses of the presses at known places.
 UNCHANGED, SHIFT, RIGID, LABELS = "not used", "shift only", "rigid registration", "labels of the model"
 NETWORK = "network of the paper, other board"
@@ -267,7 +268,8 @@ def score_motions(
 ) -> list[dict[str, Any]]:
     """Score places of tested readings before and after motions from the estimated to the known places of presses.
 
-    `rigid_limit_mm2` is the least squared error of any rigid motion, which is fitted to the tested readings.
+    `rigid_limit_mm2` is the smallest mean squared error that a rigid motion can reach: that of the motion fitted to the
+    tested readings themselves.
     """
     best_mm = fit_rigid(place_mm, true_mm).apply(place_mm)
     limit = {"rigid_limit_mm2": float(((best_mm - true_mm) ** 2).mean())}
@@ -484,8 +486,8 @@ def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Record
 class Changes(NamedTuple):
     """Field changes relative to one kind of baseline.
 
-    The no-load readings are split: those of presses with odd numbers set thresholds, the others verify them. `contact`
-    and `force_N` are of the readings in contact.
+    The thresholds are set on the no-load readings of presses with odd numbers (`setting`) and verified on those of the
+    other presses (`verifying`). `contact` and `force_N` are of the readings in contact.
     """
 
     setting: Float[np.ndarray, "a ch"]
@@ -497,8 +499,9 @@ class Changes(NamedTuple):
 def changes(recording: Recording, baseline: str) -> Changes:
     """Subtract a baseline from the readings of a recording.
 
-    If the baseline is that of each press, the mean of the other no-load readings of its press is subtracted from a
-    no-load reading; a single reading is left out. The first press is left out for the other baselines.
+    If each press has its own baseline, a no-load reading is not part of its own baseline: the mean of the other no-load
+    readings of the press is subtracted, and presses with only one are omitted. With the other kinds of baseline, the
+    first press is omitted.
     """
     mean_uT = mean_by(recording.noload_press_i, recording.noload_uT)
     base_uT = {EACH: mean_uT, PREVIOUS: np.roll(mean_uT, 1, axis=0), START: np.broadcast_to(mean_uT[0], mean_uT.shape)}
@@ -763,7 +766,7 @@ LAW_MEANING = (
     "presses. R²: explained variance of log |dB| between the presses of a place."
 )
 IMPLIED = {"power_law_N": "force by power law, N", "proportional_N": "force in proportion, N"}
-ALARMS_MAX = 10  # forces are not shown for thresholds with more than this multiple of the intended false alarms
+ALARMS_MAX = 10  # forces are shown only for thresholds with at most this multiple of the intended false alarms
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -75,7 +75,7 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
     """Stack the rows without force between the contacts of a pass; the place of each row is that of the next contact.
 
     A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass
-    are left out because they are the pass's no-load reading, and rows after the last contact because none follows.
+    are omitted because they are the pass's no-load reading, and rows after the last contact because no contact follows.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}

@@ -40,7 +40,7 @@ METHODS = ("universal map, ", "universal, ")  # first words of method names: the
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of method names, by variant
 BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers, selected on other boards
 NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers for a misfit of 1
-ASSUMED_POWER = 0.5  # for places and forces of the map alone: as if channels had equal errors in pairs
+ASSUMED_POWER = 0.5  # for places and forces of the map alone; 0.5 would be right if pairs of channels had equal errors
 FORCE_MIN_N = float(FORCES_N[0])  # smallest force of the map; smaller forces of labelled presses are raised to it
 
 

@@ -16,7 +16,8 @@ MAX_DRAWS_N = 100  # if half of all draws are ties, only a fraction of 1e-30 of 
 # Two squared distances are a tie if they differ by less than this fraction of their sum. Rounding to float32 causes
 # differences of 1e-6.
 TIE_RTOL = 1e-5
-COMPARED_PLACES_N = 64  # places per group; a place at the same distance from all of them is not used as an anchor
+# Places per group whose distances are compared. A point at the same distance from all of them is not used as an anchor.
+COMPARED_PLACES_N = 64
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 

@@ -226,8 +226,8 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # Interpolate F / (E d^1.5) as a function of sqrt(d), of which it is a smooth function. At d = 0, where the contact
-    # is small compared with the layer, its value is 16/9 sqrt(R), from Hertz contact.
+    # F / (E d^1.5) is a smooth function of sqrt(d) and is therefore interpolated over sqrt(d). At d = 0, where the
+    # contact is small compared with the layer, its value is 16/9 sqrt(R), from Hertz contact.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]

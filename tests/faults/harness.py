@@ -227,7 +227,7 @@ def judge(
     checkout: Checkout, first: Result, again: Result, *, may_run: Iterable[str] | None = None,
     finished: dict[str, int] | None = None, fails: bool = True,
 ) -> Row:  # fmt: skip
-    """Return the outcome of a fault: compare the run with the fault, and the run after it, with an undisturbed run.
+    """Judge a fault by comparing the run with the fault, and the run after it, with an undisturbed run.
 
     first, again: results of the two runs. may_run: stages that the second run may run (None: any). finished: training
     runs that finished before the second run. fails: whether the first run must fail.
