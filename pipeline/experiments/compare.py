@@ -158,7 +158,7 @@ def compare_boards(
 
 
 def _outline(section: Compare) -> dict[str, Any]:
-    """Return the skin's least x and y, its sides and the chips' centres, in the coordinates of the labels."""
+    """Return the skin's smallest x and y, its sides and the chips' centres, in the coordinates of the labels."""
     middle_mm, sides_mm = np.array(section.labels_middle_mm), np.array(section.skin_mm)
     chips_mm = np.array(section.design.places_mm) * (1, -1 if section.labels_mirrored else 1) + middle_mm
     corner_mm = middle_mm - sides_mm / 2

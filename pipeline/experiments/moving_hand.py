@@ -96,7 +96,7 @@ class MovingHand(Strict):
     changes_n: Count  # of the external field, for each simulated skin
     turned_uT: Size_uT  # field in which a simulated skin is turned
     magnet_uT: Size_uT  # root mean square of the component of the magnet's field where it is nearest
-    magnet_mm: tuple[Annotated[float, Field(ge=20)], Annotated[float, Field(ge=20)]]  # least and largest distance
+    magnet_mm: tuple[Annotated[float, Field(ge=20)], Annotated[float, Field(ge=20)]]  # smallest and largest distance
     presses: Compare  # orientation of the boards with presses, and their skin
 
     @model_validator(mode="after")
@@ -348,7 +348,7 @@ def move_magnet(size_uT: float, distance_mm: tuple[float, float], n: int, rng: n
     """Draw changes of the field of a magnet that moves from one random position relative to the board to n others.
 
     The magnet is a dipole of constant size, turned at random. Its position is uniform in distance from the board's
-    centre and random in direction. size_uT: root mean square of a component of its field at the least distance.
+    centre and random in direction. size_uT: root mean square of a component of its field at the smallest distance.
     """
     near_mm, far_mm = distance_mm
     places_m = 1e-3 * rng.uniform(near_mm, far_mm, (1 + n, 1)) * _directions(1 + n, rng)

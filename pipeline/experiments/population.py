@@ -99,7 +99,7 @@ class PopulationSettings(Strict):
 class DesignedSkins:
     """Distribution of simulated skins around the design of a scene's skins, and the forces at the scene's depths.
 
-    forces_N: least and largest force.
+    forces_N: smallest and largest force.
     """
 
     prior: SkinPrior
@@ -287,8 +287,8 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
 def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
     """Return the skins of a simulated population as test skins, with noise added to their field changes.
 
-    The first `PLACES_N` presses (on the grid) are the pool, the last press is by the known weight, and all others are
-    test presses.
+    The first `PLACES_N` presses (on the grid) are the pool, the last one is the press of the known weight, and all
+    others are test presses.
     """
     tested = []
     for i in range(len(skins)):

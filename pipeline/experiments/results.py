@@ -9,7 +9,7 @@ from reskin.errors import SchemaError
 from reskin.schema import Readings
 
 Capture = TypeVar("Capture")
-# Losses of an experiment without captures of its own: the losses of the main captures are recorded elsewhere.
+# For experiments without captures of their own; the losses of the main captures are in other results.
 NO_LOSSES: Mapping[str, Any] = {"accounts": [], "left_out": {}}
 
 

@@ -103,7 +103,7 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
 
 @dataclass(frozen=True)
 class Touched:
-    """The rows of one recording with enough force, in order of time; `places` has one place number or two."""
+    """The rows of one recording with enough force, in order of time. `places`: numbers of the one or two places."""
 
     name: str
     places: tuple[int, ...]

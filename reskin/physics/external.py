@@ -11,8 +11,8 @@ from jaxtyping import Float
 # Distance of the dipole. It was chosen on recordings of a moving hand whose fingers have skins (data/leaphand; 40 mm is
 # most likely there) and on simulated skins (a larger distance is more accurate if sources are farther away).
 DISTANCE_MM = 50.0
-CHIP_RATIO = 3.0  # least distance of the dipole, in units of the distance of the farthest chip; assumed
-NOISE_MIN_uT = 0.1  # least noise for the suppressor; a log may begin with equal readings
+CHIP_RATIO = 3.0  # smallest distance of the dipole, in units of the distance of the farthest chip; assumed
+NOISE_MIN_uT = 0.1  # smallest noise for the suppressor; a log may begin with equal readings
 DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
 
 

@@ -51,8 +51,8 @@ def check_labels(
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return the places and forces of labelled presses as arrays; raise SchemaError if they are invalid.
 
-    Places must be within `reach_mm` (rows: least and largest x and y), and forces must be finite and above 0 N. There
-    must be one label for each of the `rows_n` readings, and at most LABELS_MAX_N labels.
+    Places must be within `reach_mm` (rows: smallest and largest x and y), and forces must be finite and above 0 N.
+    There must be one label for each of the `rows_n` readings, and at most LABELS_MAX_N labels.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n})"
@@ -269,7 +269,7 @@ def read_calibration(
     """Read the calibration data that `write_calibration` wrote.
 
     Raises SchemaError for other files, for a calibration on a board of another name, and for labelled places outside
-    `reach_mm` (rows: least and largest x and y, relative to the board's centre).
+    `reach_mm` (rows: smallest and largest x and y, relative to the board's centre).
     """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(

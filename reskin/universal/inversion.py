@@ -21,7 +21,7 @@ PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded bo
 ROUNDS_N = 3  # each round searches places with the current law, then fits parameters and places together
 EVALUATIONS_MAX_N = 8  # maximum number of least-squares steps per round
 STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in x or y, and in log force
-REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # largest |x| and |y|; least and largest force
+REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # largest |x| and |y|; smallest and largest force
 CELL = 1.0  # maximum length of the Gauss-Newton step in each coordinate, in steps of the lattice
 BLOCK_N = 500  # readings are searched in blocks of this size, to bound memory
 

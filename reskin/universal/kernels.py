@@ -238,7 +238,7 @@ def _clear(value):
 CELL_SD_MM = (
     0.2  # smallest standard deviation of a place, because positions within a lattice cell are not distinguished
 )
-TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
+TINY = float(np.finfo(np.float32).tiny)  # smallest probability of a place or force in the map
 LEAST = math.log(TINY)
 FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one
 

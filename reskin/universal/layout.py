@@ -27,7 +27,7 @@ from reskin.universal.population import THICKNESSES, TIPS, Forces
 FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
 FORCES_N = 9  # number of tabulated forces
 CHIPS_APART_MM = 0.5  # chips are larger than this distance
-EDGE_MM = 0.5  # least distance from the area of presses to the edge of the skin
+EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
 SIDE_MM = 20.0  # side of the paper's skin; the cells of larger skins are larger by the same factor
 
 Coordinate = Annotated[float, Field(ge=-200, le=200)]
@@ -134,7 +134,7 @@ class BoardLayout(Strict):
 
     @property
     def reach_mm(self) -> Float[np.ndarray, "2 2"]:
-        """Edges of the skin relative to the board's centre; rows: least and largest x and y."""
+        """Edges of the skin relative to the board's centre; rows: smallest and largest x and y."""
         return np.array([[-0.5], [0.5]]) * self.skin.size_mm
 
     @property
@@ -145,7 +145,7 @@ class BoardLayout(Strict):
 
     @property
     def forces(self) -> Forces:
-        """Distribution of forces in training; a fifth of the presses is lighter than ten times the least force."""
+        """Distribution of forces in training; a fifth of the presses is lighter than ten times the smallest force."""
         least_N, largest_N = self.force_N
         between_N = min(10 * least_N, (least_N * largest_N) ** 0.5)
         return Forces(between_N, largest_N / 0.95, light_N=least_N, light_share=0.2)

@@ -267,13 +267,13 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
 SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
-SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, however many labels there are
+SHARE_MIN = 0.03  # smallest fraction of the law's error variance that remains, however many labels there are
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
 ROUNDS_N = 3  # default number of rounds of expectation maximisation
 LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
 # Lattice on which the shift of presses onto the area is computed: width beyond the area, step, and largest shift.
 AREA_BEYOND_MM, AREA_STEP_MM, SHIFT_MAX_MM = 4.0, 0.2, 2.0
-DENSITY_MIN = 1e-3  # least density of a place relative to that inside the area, so that single outliers are tolerated
+DENSITY_MIN = 1e-3  # smallest density of a place relative to that inside the area, so that outliers are tolerated
 EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 

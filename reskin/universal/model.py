@@ -80,7 +80,7 @@ MAP_POWER = 0.6
 # underestimates the uncertainty of forces. It is the best of four values on simulated skins
 # (tests/benchmarks/test_force_benchmark.py).
 FORCE_POWER = 0.6
-SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
+SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networks' estimates
 FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
@@ -589,7 +589,7 @@ class Universal:
 
     @property
     def reach_mm(self) -> Float[np.ndarray, "2 2"]:
-        """Edges of the skin, in the coordinates of places; rows: least and largest x and y."""
+        """Edges of the skin, in the coordinates of places; rows: smallest and largest x and y."""
         return self._centre_mm + self.layout.reach_mm
 
     @property

@@ -90,7 +90,8 @@ def draw_population(
         for tip in TIPS
     }  # fmt: skip
     parts, selected = [], skins if isinstance(skins, slice) else slice(skins)
-    for skin_rng in rng.spawn(selected.stop)[selected]:  # one per skin: the first skins do not depend on the number
+    # Each skin has its own generator, so that the first skins do not depend on the number of skins.
+    for skin_rng in rng.spawn(selected.stop)[selected]:
         law = draw_law(centre, spreads, skin_rng)
         thickness, tip = (float(skin_rng.choice(list(sizes), p=list(sizes.values()))) for sizes in (THICKNESSES, TIPS))
         parts.append(draw_skin(law, setups[thickness, tip], skin_rng, forces))

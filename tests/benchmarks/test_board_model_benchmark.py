@@ -44,7 +44,7 @@ from tests.recordings.headers import DEFAULT_POLICY, PARAMS, make_header
 ROOT = Path(__file__).resolve().parents[2]
 LABELS_N, SEEDS_N, SKINS_N = size((0, 10, 40), (0, 10)), size(5, 1), size(12, 1)
 CLASSICAL = parse(RbfRidge, PARAMS["methods"]["few-labels"]["rbf-shape"], "params.yaml")  # not tuned on any pad
-FORCE_MIN_N = 0.3  # least force of the layout; weaker readings are not used
+FORCE_MIN_N = 0.3  # smallest force of the layout; weaker readings are not used
 PITCH_MM = 8.0  # assumed distance between the nine places of `eflash7`, which the recordings do not state
 
 

@@ -19,9 +19,10 @@ from tests.models.plain import plain_net, plain_train
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
-# Tolerances. Sums differ by 6e-8 of a term if the order, the processor or the memory alignment changes. AdamW divides a
-# gradient by its size: if rounding makes a ReLU positive for one row, all weights of this unit move by a whole step.
-# One unit of 200 changes the distance from the start by at most 7 %; a missing loss term changes it by more.
+# Tolerance. Sums differ by 6e-8 of a term if the order, the processor or the memory alignment changes. This can make a
+# ReLU positive for one more row; then all weights of this unit move by a whole step, because AdamW divides a gradient
+# by its size. One unit of 200 changes the distance from the start by at most 7 %; a missing loss term changes it by
+# more.
 DISTANCE_MAX = 2e-2
 
 

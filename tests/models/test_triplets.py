@@ -139,7 +139,8 @@ def test_every_other_point_is_drawn(case):
     others = mates[mates != 0]
     away = np.array(distances(place, 0))[others]
     positive, negative = draw(triplet_points(place, group), np.zeros(3000, int), seed)
-    # worst case, a point of eleven that forms a pair with one other point only: missed with (1 - 2 / 121)^3000 = 1e-22
+    # Worst case: of eleven points, one forms a pair with only one other point. The probability that no draw contains it
+    # is (1 - 2 / 121)^3000 = 1e-22.
     assert set(positive) == set(others[away < away.max()])
     assert set(negative) == set(others[away > away.min()])
 

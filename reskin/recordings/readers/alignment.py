@@ -112,7 +112,7 @@ def _distances(
 
 
 def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
-    """Find the two different lags and the row of the change with the least sum of distances.
+    """Find the two different lags and the row of the change with the smallest sum of distances.
 
     Returns the indices of the lags before and after the change, and the row.
     """
