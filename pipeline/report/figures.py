@@ -16,12 +16,12 @@ from jaxtyping import Float
 
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, universal_rows
-from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
+from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 
 HEADLINE = "headline.svg"
 FORCE = "headline_force.svg"
 HEADLINES = {HEADLINE: ("accuracy_pct", "mse_xy_mm2"), FORCE: ("mse_f_N2", "r2_f")}  # metrics of places and of forces
-UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("r2_f",)}  # the same, for boards that were never seen in training
+UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # the same, for boards that were never seen in training
 LABELS = "labels.svg"
 OFFSET = 0.17  # fraction of a row's height by which one mark is above the row's middle, and the other below it
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest error that counts as correct
@@ -46,12 +46,11 @@ PAPER_NAME = "paper's table 2: mean ± standard deviation"
 # Boards that were never seen in training (experiment random_presses): tests and models in figures.
 TESTED = "other colour of a checkerboard"
 WAYS = {
-    "universal, boards of the rig": "trained on simulated skins and the rig's other board",
-    "universal, simulated alone": "trained on simulated skins alone",
+    "universal, boards of the rig": "trained on simulation and the rig's other board",
+    "universal, simulated alone": "trained on simulation (the model that we ship)",
 }
 PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}  # of table 2
-PLACE_LABEL, R2_LABEL = "place: within 1 mm / %", "R² of the force (1: exact)"
-NO_R2 = "The paper prints no R².\nIts MSE_F: {least:.2g} to {most:.2g} N²"
+PLACE_LABEL, FORCE_LABEL = "place: within 1 mm / %", "force: rms error / N"
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -76,8 +75,9 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
     the scene compares methods by number of labels, there is a figure of all methods too.
     """
     figures = {LABELS: labels_figure(numbers, source)} if "labels" in numbers else {}
-    if boards_rows(numbers):
-        return figures | {name: unseen_boards(numbers, source, metrics) for name, metrics in UNSEEN.items()}
+    if rows := boards_rows(numbers):
+        drawn = {name: metrics for name, metrics in UNSEEN.items() if {*metrics} <= rows[0].keys()}
+        return figures | {name: unseen_boards(numbers, source, metrics) for name, metrics in drawn.items()}
     if numbers.get("table2"):
         figures |= {name: table2_figure(numbers, source, metrics) for name, metrics in HEADLINES.items()}
     elif LABELS in figures:
@@ -172,50 +172,41 @@ def boards_rows(numbers: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 def unseen_boards(
     numbers: Mapping[str, Any],
     source: str,
-    metrics: Sequence[str] = ("accuracy_pct", "r2_f"),
+    metrics: Sequence[str] = ("accuracy_pct", "mse_f_N2"),
     *,
     large: bool = False,
 ) -> str:
-    """Draw places within 1 mm and R² of forces on boards never seen in training, by number of labels.
+    """Draw places within 1 mm and rms errors of forces on boards never seen in training, by number of labels.
 
-    Each mark is one board. The paper's table 2 is below, as another kind of mark. `large`: for README.md, with panels
-    beside each other and large letters.
+    Each mark is one board. The paper's table 2 is below, as another kind of mark. A metric that the results lack has no
+    panel. `large`: for README.md, with panels beside each other and large letters.
     """
     rows = boards_rows(numbers)
+    metrics = [metric for metric in metrics if all(metric in row for row in rows)]
     labels = sorted({int(row["labels"]) for row in rows})
-    paper_n, labels_n = len(PAPERS_ROWS), len(labels)
-    y = {f"{n} labels": paper_n + 1.3 * (labels_n - i) for i, n in enumerate(labels)}
+    paper_n = len(PAPERS_ROWS)
+    y = {f"{n} labels": paper_n + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
     y |= {name: paper_n - i - 0.5 for i, name in enumerate(PAPERS_ROWS.values())}
     letters_pt, size_in = (13.0, (8.33, 5.2)) if large else (9.0, (4.7, 3.8))
     with drawing(*size_in) as figure:
-        widths = [1.35 if metric == "accuracy_pct" else 1.0 for metric in metrics]
-        panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True, width_ratios=widths)[0]
+        panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
         for axes, metric in zip(panels, metrics, strict=True):
             for i, (method, name) in enumerate(WAYS.items()):
                 look = {"color": COLOURS[1 + i], "marker": MARKERS[i], "markersize": letters_pt * 0.65, "linewidth": 1}
-                of_method = [row for row in rows if row["method"] == method]
-                shift = 1.3 * OFFSET * (1 - 2 * i)
-                for row in of_method:
-                    values, row_y = row[metric]["values"], y[f"{row['labels']} labels"] + shift
+                for row in (row for row in rows if row["method"] == method):
+                    values = readable(metric, row[metric]["values"])
+                    row_y = y[f"{row['labels']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
                     axes.plot(values, [row_y] * len(values), label=name, **look)
-                    mean = f"{row[metric]['mean']:.{0 if metric == 'accuracy_pct' else 2}f}"
+                    mean = f"{np.mean(values):.{0 if metric == 'accuracy_pct' else 1}f}"
                     beside = {"xytext": (0.7 * letters_pt, 0), "textcoords": "offset points", "va": "center"}
                     axes.annotate(mean, (max(values), row_y), color=COLOURS[1 + i], fontsize=0.8 * letters_pt, **beside)
-            if metric == "accuracy_pct":
-                _draw_papers_places(axes, [y[name] for name in PAPERS_ROWS.values()], letters_pt)
-            else:
-                low = min((value for row in rows for value in row[metric]["values"]), default=0.0)
-                axes.set(xlim=(min(low, 0.0) - 0.1, 1.02), xlabel=R2_LABEL)
-                axes.axvline(0, color="0.6", linewidth=0.8)
-                means = [TABLE_2[row]["mse_f_N2"][0] for row in PAPERS_ROWS]
-                text = NO_R2.format(least=min(means), most=max(means))
-                style = {"ha": "center", "va": "center", "color": "0.35", "fontsize": 0.85 * letters_pt}
-                axes.text(0.5, paper_n / 2, text, transform=axes.get_yaxis_transform(), **style)
+            _draw_papers_row(axes, metric, [y[name] for name in PAPERS_ROWS.values()], letters_pt)
+            axes.set_xlabel(PLACE_LABEL if metric == "accuracy_pct" else FORCE_LABEL, size=letters_pt)
+            axes.set_xlim(0, 105 if metric == "accuracy_pct" else 1.15 * axes.dataLim.x1)
+            axes.set_ylim(-0.1, max(y.values()) + 0.7)
             axes.axhline(paper_n + 0.4, color="0.6", linewidth=0.8, linestyle=":")
             axes.grid(axis="x", alpha=0.25)
             axes.tick_params(labelsize=letters_pt)
-            axes.xaxis.label.set_size(letters_pt)
-            axes.set_ylim(-0.1, max(y.values()) + 0.7)
         panels[0].set_yticks([*y.values()], [*y])
         test = (
             f"{rows[0]['presses_n']} unlabelled presses of the board; labels at random places, tests at other places; "
@@ -226,15 +217,23 @@ def unseen_boards(
         return svg(figure, column=not large)
 
 
-def _draw_papers_places(axes: Any, y: Sequence[float], letters_pt: float) -> None:
-    """Draw the accuracy of rows of the paper's table 2 beside ours on other skins."""
-    scores = [
-        {"accuracy_pct": dict(zip(("mean", "sd"), TABLE_2[row]["accuracy_pct"], strict=True))} for row in PAPERS_ROWS
-    ]
-    means, lengths = bars(scores, "accuracy_pct")
+def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:
+    """Convert mean squared errors of forces to rms errors; return other values unchanged."""
+    return np.sqrt(values) if metric == "mse_f_N2" else np.asarray(values, float)
+
+
+def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: float) -> None:
+    """Draw a metric of the paper's table 2 below ours on other skins; the bars of rms errors are not symmetric."""
+    means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
+    low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
     look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
-    axes.errorbar(means, y, xerr=lengths, label=f"{PAPER_NAME} (other skins, other test)", **look)
-    axes.set(xlim=(0, 105), xlabel=PLACE_LABEL)
+    name = f"{PAPER_NAME} (other skins, other test)"
+    axes.errorbar(middle, y, xerr=np.stack([middle - low, high - middle]), label=name, **look)
+
+
+def papers_row(metric: str) -> list[Number]:
+    """Return a metric of the paper's table 2 in the rows that are beside ours."""
+    return [TABLE_2[row][metric] for row in PAPERS_ROWS]
 
 
 def labels_figure(numbers: Mapping[str, Any], source: str) -> str:

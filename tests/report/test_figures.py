@@ -11,10 +11,10 @@ import pytest
 from pipeline.report.drawing import drawing, svg
 from pipeline.report.figures import (
     FORCE,
+    FORCE_LABEL,
     HEADLINE,
     LABELS,
     PLACE_LABEL,
-    R2_LABEL,
     WAYS,
     Outline,
     bars,
@@ -185,7 +185,10 @@ def test_headline_figure_is_reproducible():
 
 @pytest.fixture(scope="module")
 def lab() -> dict:
-    return json.loads((ROOT / "reports/lab/numbers.json").read_text())
+    numbers = json.loads((ROOT / "reports/lab/numbers.json").read_text())
+    for i, row in enumerate(numbers["random_presses"]["rows"]):
+        row["mse_f_N2"] = {"mean": 1.0 + i, "n": 2, "values": [0.5 + i, 1.5 + i]}
+    return numbers
 
 
 def test_labels_figure_has_each_method(lab):
@@ -205,19 +208,24 @@ def test_unseen_boards_show_each_board_and_the_paper(lab, large):
     rows = boards_rows(lab)
     assert {row["labels"] for row in rows} >= {"0", "10", "40"}
     for row in rows:
-        for metric, axis in (("accuracy_pct", PLACE_LABEL), ("r2_f", R2_LABEL)):
-            for value in row[metric]["values"]:
+        places, forces = row["accuracy_pct"]["values"], [mse**0.5 for mse in row["mse_f_N2"]["values"]]
+        for axis, values in ((PLACE_LABEL, places), (FORCE_LABEL, forces)):
+            for value in values:
                 assert f"{WAYS[row['method']]}\n{axis} = {value:.4g}\n{row['labels']} labels" in shown
-    mean, sd = TABLE_2["adapted"]["accuracy_pct"]
-    ends = f"bar from {mean - sd:.4g} to {min(mean + sd, 100):.4g}"
-    assert any(f"{PLACE_LABEL} = {mean:.4g}" in title and ends in title for title in shown)
+    (mean, sd), (mse, sd_mse) = (TABLE_2["adapted"][metric] for metric in ("accuracy_pct", "mse_f_N2"))
+    for axis, middle, low, high in (
+        (PLACE_LABEL, mean, mean - sd, min(mean + sd, 100)),
+        (FORCE_LABEL, mse**0.5, (mse - sd_mse) ** 0.5, (mse + sd_mse) ** 0.5),
+    ):
+        ends = f"bar from {low:.4g} to {high:.4g}"
+        assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
 
 
 def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
     figures = headline_figures(lab, "recorded")
     assert PLACE_LABEL in texts_of(figures[HEADLINE])
-    assert R2_LABEL in texts_of(figures[FORCE])
-    assert R2_LABEL not in texts_of(figures[HEADLINE])
+    assert FORCE_LABEL in texts_of(figures[FORCE])
+    assert FORCE_LABEL not in texts_of(figures[HEADLINE])
 
 
 def test_bars_of_another_kind_are_named():
