@@ -92,17 +92,13 @@ def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str
     y = np.arange(len(rows))[::-1].astype(float)
     with drawing(4.7, 1.2 + 0.5 * len(rows) * len(metrics)) as figure:
         for axes, metric in zip(figure.subplots(len(metrics), 1, squeeze=False)[:, 0], metrics, strict=True):
-            ours = {model.short: row for model, row in rows}
-            name = f"ours ({source}): {spread_of(ours)}"
-            _draw_scores(axes, metric, y + OFFSET, [*ours.values()], label=name, **_look(1))
-            printed = [
-                (row_y - OFFSET, {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))})
-                for row_y, (model, _) in zip(y, rows, strict=True)
-                if metric in model.paper
+            paper = [
+                {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))} if metric in model.paper else {}
+                for model, _ in rows
             ]
-            if printed:
-                paper_y, paper = zip(*printed, strict=True)
-                _draw_scores(axes, metric, np.array(paper_y), paper, label=PAPER_NAME, **PAPER)
+            name = f"ours ({source}): {spread_of({model.short: row for model, row in rows})}"
+            _draw_scores(axes, metric, y + OFFSET, [row for _, row in rows], label=name, **_look(1))
+            _draw_scores(axes, metric, y - OFFSET, paper, label=PAPER_NAME, **PAPER)
             _limit(axes, metric)
             # Non-breaking spaces keep "n = 6" on one line.
             names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]
@@ -118,9 +114,13 @@ def _look(i: int) -> dict[str, Any]:
 
 
 def _draw_scores(axes: Any, metric: str, y: np.ndarray, rows: Rows, **look: Any) -> None:
-    means, lengths = bars(rows, metric)
-    axes.errorbar(means, y, xerr=lengths, **look)
-    for mean, length, row_y in zip(means, lengths[1], y, strict=True):
+    """Draw a metric of those rows that have it, with numbers beside the bars."""
+    scored = [(row, row_y) for row, row_y in zip(rows, y, strict=True) if metric in row]
+    if not scored:
+        return
+    (means, lengths), drawn_y = bars([row for row, _ in scored], metric), [row_y for _, row_y in scored]
+    axes.errorbar(means, drawn_y, xerr=lengths, **look)
+    for mean, length, row_y in zip(means, lengths[1], drawn_y, strict=True):
         beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.5}
         axes.annotate(f"{mean:.2g}", (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
 
