@@ -16,6 +16,7 @@ from tests.report.synthetic import all_experiments
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 INPUTS = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
+FIGURE = "docs/img/headline.svg"
 
 
 def test_readme_shows_the_committed_results():
@@ -70,6 +71,26 @@ def test_rewritten_pages_and_scenes_are_printed(tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     output = reskin("readme")
     assert re.fullmatch(r"rewritten: README\.md, .*; results shown: scenes paper, quick\n", output)
+
+
+def test_figure_of_the_readme_shows_the_committed_results(tmp_path, monkeypatch):
+    root = copy_checkout(tmp_path)
+    copy_results(root, ["quick", "paper", "lab"])
+    (root / FIGURE).unlink(missing_ok=True)
+    monkeypatch.chdir(root)
+    assert FIGURE in reskin("readme")
+    assert (root / FIGURE).read_bytes() == (ROOT / FIGURE).read_bytes()
+    assert FIGURE not in reskin("readme")
+
+    file = root / "reports/lab/numbers.json"
+    numbers = io.read_json(file)
+    for row in numbers["random_presses"]["rows"]:
+        row["accuracy_pct"]["values"] = [50.0, 62.125]
+    io.write_json(file, numbers)
+    assert CliRunner().invoke(app, ["readme", "--check"]).exit_code == 1
+    reskin("readme")
+    assert "= 62.12" in (root / FIGURE).read_text()
+    assert "= 62.12" not in (ROOT / FIGURE).read_text()
 
 
 def test_readme_links_the_code_of_every_stage():

@@ -2,8 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import ceil
-from textwrap import fill
 from typing import Any
 
 import pandas as pd
@@ -25,8 +23,6 @@ COMPUTED = (
 MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
 # The size of rounding errors. Smaller errors are drawn at this value, because the axis is logarithmic.
 ERROR_SHOWN_MIN = 1e-16
-COLUMNS_N = 3
-CAPTION_CHARACTERS = 38  # characters that fit in the width of a panel or of the legend
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
@@ -42,8 +38,6 @@ def cost_pages(runtime: Row, source: str) -> dict[str, str]:
         if any(key in row for row in runtime.get("learning", [])):
             title = f"Error on new skins against {name} time ({source})"
             texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
-    if any("seconds" in row for row in runtime.get("adaptation", [])):
-        texts["adaptation.svg"] = adaptation(runtime["adaptation"], source)
     if "quadratures.md" in texts:
         texts["quadratures.svg"] = quadratures(runtime["quadratures"], runtime["choice"], source)
     if "integrators.md" in texts:
@@ -133,15 +127,17 @@ def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
     """Draw the errors of methods against the cost `key` on logarithmic axes; a step line joins the Pareto front."""
     points = trade_off_points(rows, key)
     members = [point for point in points if point.label]
-    with drawing(7.6, 4.2) as figure:
-        axes = _trade_off_axes(figure, points, title=title, xlabel=cost, xscale="log")
+    with drawing(4.7, 6.4) as figure:
+        axes = _trade_off_axes(figure, points, title=title, xlabel=cost)
         for point in points:
             mark = axes.plot(*point.position, **point.look, linestyle="none")[0]
             mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
-            _label(axes, point, (-5, -5))  # a point on the front has no other point to its lower left
+            # A point on the front has no other point to its lower left.
+            style = {"xytext": (-5, -5), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
+            axes.annotate(point.label, point.position, **style)
         steps = zip(*(point.position for point in members), strict=True)
         axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbered)")
-        figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+        figure.legend(loc="outside lower left", frameon=False, fontsize=8, ncols=2)
         return svg(figure)
 
 
@@ -162,36 +158,16 @@ def trade_off_points(rows: Rows, key: str) -> list[Point]:
     return sorted(points, key=lambda point: not point.label)
 
 
-def adaptation(rows: Rows, source: str) -> str:
-    """Draw the error after adaptation against the duration of the adaptation; labels are the numbers of pokes."""
-    timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
-    points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
-    with drawing(7.6, 4.2) as figure:
-        title = f"Error on a new skin against adaptation time ({source})"
-        axes = _trade_off_axes(figure, points, title=title, xlabel="median time per adaptation / s", xscale="linear")
-        for point in points:
-            axes.plot(*point.position, **point.look, linestyle="none")
-            _label(axes, point, (-6, 0))
-        figure.supxlabel("Labels: number of unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=9)
-        return svg(figure)
-
-
-def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel: str, xscale: str) -> Any:
-    """Make axes of error against cost that leave room for the labels of points; a linear cost axis begins at 0."""
+def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel: str) -> Any:
+    """Make logarithmic axes of error against cost that leave room for the labels of points."""
     axes = figure.subplots()
-    axes.set(xscale=xscale, yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
+    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
     axes.grid(alpha=0.25)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
     costs, errors = zip(*(point.position for point in points), strict=True)
     axes.set_ylim(min(errors) / MARGIN, max(errors) * MARGIN)
-    axes.set_xlim((min(costs) / MARGIN, max(costs) * MARGIN) if xscale == "log" else (0.0, 1.15 * max(costs)))
+    axes.set_xlim(min(costs) / MARGIN, max(costs) * MARGIN)
     return axes
-
-
-def _label(axes: Any, point: Point, offset_pt: tuple[float, float]) -> None:
-    vertical = "center" if offset_pt[1] == 0 else "top"
-    text_style = {"xytext": offset_pt, "textcoords": "offset points", "ha": "right", "va": vertical, "fontsize": 8}
-    axes.annotate(point.label, point.position, **text_style)
 
 
 def look_of(i: int) -> dict[str, Any]:
@@ -254,12 +230,9 @@ def draw_study(
         for row in rows
         if row["method"] != REFERENCE and row["error"] is not None and "median_s" in row
     }
-    columns_n = min(COLUMNS_N, len(studies))
-    lines_n = ceil(len(studies) / columns_n)
-    caption = "\n".join(fill(line, CAPTION_CHARACTERS * (1 + columns_n)) for line in (note, *failures(rows)))
-    with drawing(3.2 + 2.6 * columns_n, max(1.2 + 2.6 * lines_n + 0.15 * caption.count("\n"), 5.0)) as figure:
-        panels = figure.subplots(lines_n, columns_n, sharex=True, sharey=True, squeeze=False)
-        for axes, study in zip(panels.flat, studies, strict=False):
+    with drawing(4.7, 2.5 + 1.9 * len(studies)) as figure:
+        panels = figure.subplots(len(studies), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        for axes, study in zip(panels, studies, strict=True):
             axes.set(xscale="log", yscale="log")
             axes.grid(alpha=0.25)
             axes.set_title(study, loc="left", fontsize=9)
@@ -280,18 +253,15 @@ def draw_study(
                     continue
                 ring = {"color": "0.2", "fillstyle": "none", "markersize": 11 + 2 * i}
                 axes.plot(*points_ms[key], "so"[i % 2], label=label, **ring)
-        for axes in panels[-1]:
-            axes.set_xlabel("median time per indentation / ms")
-        for axes in panels[:, 0]:
-            axes.set_ylabel(error)
-        labelled = [axes.get_legend_handles_labels() for axes in panels.flat[: len(studies)]]
+        panels[-1].set_xlabel("median time per indentation / ms")
+        panels[len(panels) // 2].set_ylabel(error)
+        labelled = [axes.get_legend_handles_labels() for axes in panels]
         handles = {label: handle for panel in reversed(labelled) for handle, label in zip(*panel, strict=True)}
         names = dict.fromkeys(label for _, labels in labelled for label in labels)
-        figure.legend([handles[name] for name in names], names, loc="outside right upper", frameon=False, fontsize=8)
-        for axes in panels.flat[len(studies) :]:
-            axes.set_axis_off()
+        look = {"loc": "outside lower left", "frameon": False, "fontsize": 8, "alignment": "left"}
+        caption = "\n".join(line for line in (note, *failures(rows)) if line)
+        figure.legend([handles[name] for name in names], names, title=caption, title_fontsize=8, ncols=2, **look)
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-        figure.supxlabel(caption, x=0.01, ha="left", fontsize=9)
         return svg(figure)
 
 

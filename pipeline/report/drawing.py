@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.report.layout import lay_out
+
 MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which would make the file too large
 # Matplotlib writes the marks of an artist as <use> tags if there are many, and as <path> tags if there are few.
 USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")
@@ -25,6 +27,8 @@ REMOVED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DO
 COORDINATES = re.compile(r' (d|x|y|transform)="[^"]*"')
 DIGITS_BEYOND_2 = re.compile(r"(?<=\.\d\d)\d+")
 SVG_DPI = 72  # the unit of the file is the point, 1/72 inch
+# In dark mode, lightness is inverted and hues are kept. White becomes the colour of the page in dark mode.
+DARK = "@media screen and (prefers-color-scheme: dark) {svg {filter: invert(0.91) hue-rotate(180deg)}}"
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
@@ -146,24 +150,20 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
         yield Figure(figsize=(width_in, height_in), layout="constrained")
 
 
-def svg(figure: Any) -> str:
+def svg(figure: Any, *, column: bool = True) -> str:
     """Write a figure as SVG text whose marks show their values on hover.
 
-    The text contains no date and no version, so that equal data give equal bytes.
+    A row of panels is put in a column, unless `column` is False (see `pipeline.report.layout`). The text contains no
+    date and no version, so that equal data give equal bytes.
     """
-    buffer, titles = io.StringIO(), name_marks(figure)
-    _lay_out(figure)
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
-    # Matplotlib writes one font family for formulas. The others are added, or else browsers may use a serif font.
-    return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
-
-
-def _lay_out(figure: Any) -> None:
-    """Lay out the axes once, then turn the layout engine off, so that saving does not lay them out again."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     FigureCanvasSVG(figure)  # this canvas measures texts at the size that they have in the file
     figure.dpi = SVG_DPI
-    figure.get_layout_engine().execute(figure)
-    figure.set_layout_engine(None)
+    lay_out(figure, column=column)
+    buffer, titles = io.StringIO(), name_marks(figure)
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
+    # Matplotlib writes one font family for formulas. The others are added, or else browsers may use a serif font.
+    text = text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\"")
+    return put_titles(text.replace("</style>", f"{DARK}</style>", 1), titles)

@@ -1,5 +1,9 @@
-"""Figures of a scene as SVG text by file name: scores on held-out boards, maps of position errors, sweeps."""
+"""Figures of a scene as SVG text by file name: scores on held-out boards, maps of position errors, sweeps.
 
+Our scores are filled marks with thin bars and caps. The paper's scores are hollow diamonds on wide pale bars.
+"""
+
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
@@ -12,24 +16,41 @@ from jaxtyping import Float
 
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, universal_rows
-from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
+from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 
 HEADLINE = "headline.svg"
-OFFSET = 0.17  # fraction of a row's height by which our score is above the row's middle, and the paper's below it
+FORCE = "headline_force.svg"
+HEADLINES = {HEADLINE: ("accuracy_pct", "mse_xy_mm2"), FORCE: ("mse_f_N2", "r2_f")}  # metrics of places and of forces
+UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # the same, for boards that were never seen in training
+LABELS = "labels.svg"
+OFFSET = 0.17  # fraction of a row's height by which one mark is above the row's middle, and the other below it
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
 TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
 CHIP_MM = 3.0  # side of a chip
 MARGIN_MM = 0.5  # of the axes around the skin
-RANGES = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # metrics in figures, with their possible range
+# Metrics in figures, with their possible range.
+RANGES = {
+    "accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf), "mse_f_N2": (0.0, np.inf), "r2_f": (-np.inf, 1.0),
+}  # fmt: skip
+MANY_N = 4  # a legend with so many entries has several columns
+SWEPT = ("accuracy_pct", "mse_xy_mm2")
+R2_MIN = -1.0  # a smaller R² is outside the axis: such a model is much worse than a constant
 # The axis of the number of pokes is linear below this number, because a logarithmic axis cannot show 0.
 LINEAR_BELOW_N = 65
-BARS = (
-    "Bars: 95 % interval over boards. Two or three boards: lowest to highest value.\n"
-    "One board: sd over seeds. Paper: printed sd. Bars are cut at impossible values."
-)
 SENSOR_METHODS = ("multi", "triplet", "adapted")
+PAPER = {"fmt": "D", "color": "black", "markerfacecolor": "white", "markersize": 6, "ecolor": "#00000030"}
+PAPER |= {"elinewidth": 8, "zorder": 1.5}
+PAPER_NAME = "paper's table 2: mean ± standard deviation"
+# Boards that were never seen in training (experiment random_presses): tests and models in figures.
+TESTED = "other colour of a checkerboard"
+WAYS = {
+    "universal, boards of the rig": "trained on simulation and the rig's other board",
+    "universal, simulated alone": "trained on simulation (the model that we ship)",
+}
+PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}  # of table 2
+PLACE_LABEL, FORCE_LABEL = "place: within 1 mm / %", "force: rms error / N"
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -48,79 +69,220 @@ PAPERS_SKIN = Outline((-2.0, -2.0), (20.0, 20.0), ((8.0, 8.0), (1.0, 8.0), (15.0
 
 
 def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the scores on held-out boards, if there are any: by number of labels, or otherwise the rows of table 2."""
-    if "labels" in numbers:
-        return {HEADLINE: labels_figure(numbers, source)}
-    return {HEADLINE: table2_figure(numbers, source)} if numbers.get("table2") else {}
+    """Draw the scores on held-out boards, if there are any: places in one figure and forces in the other.
+
+    The figures show boards that were never seen in training, by number of labels; or otherwise the rows of table 2. If
+    the scene compares methods by number of labels, there is a figure of all methods too.
+    """
+    figures = {LABELS: labels_figure(numbers, source)} if "labels" in numbers else {}
+    if rows := boards_rows(numbers):
+        drawn = {name: metrics for name, metrics in UNSEEN.items() if {*metrics} <= rows[0].keys()}
+        return figures | {name: unseen_boards(numbers, source, metrics) for name, metrics in drawn.items()}
+    if numbers.get("table2"):
+        figures |= {name: table2_figure(numbers, source, metrics) for name, metrics in HEADLINES.items()}
+    elif LABELS in figures:
+        figures[HEADLINE] = figures[LABELS]
+    return figures
 
 
-def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
-    """Draw accuracy and MSE of each row of table 2 on held-out boards, ours beside the paper's."""
+def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str] = HEADLINES[HEADLINE]) -> str:
+    """Draw metrics of each row of table 2 on held-out boards, ours beside the paper's, with one panel per metric."""
     table_rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
-    rows = universal_rows(numbers) + table_rows
+    rows = table_rows + universal_rows(numbers)  # the paper's rows first, in its order
     y = np.arange(len(rows))[::-1].astype(float)
-    printed = [(row_y - OFFSET, model.paper) for row_y, (model, _) in zip(y, rows, strict=True) if model.paper]
-    with drawing(8.6, 0.9 + 0.55 * len(rows)) as figure:
-        panels = figure.subplots(1, len(RANGES), sharey=True)
-        for axes, metric in zip(panels, RANGES, strict=True):
-            ours = f"ours, {source} (95 % interval over boards)"
-            _draw_scores(axes, metric, y + OFFSET, [row for _, row in rows], label=ours, fmt="o", colour=COLOURS[1])
-            if printed:
-                paper = [{metric: dict(zip(("mean", "sd"), scores[metric], strict=True))} for _, scores in printed]
-                look = {"label": "paper (mean, sd)", "fmt": "s", "colour": COLOURS[0], "face": "white"}
-                _draw_scores(axes, metric, np.array([row_y for row_y, _ in printed]), paper, **look)
-            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 1.18 * axes.dataLim.x1))
-            axes.grid(axis="x", alpha=0.25)
-        # Non-breaking spaces keep "n = 6" on one line.
-        names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 34) for model, row in rows]
-        panels[0].set_yticks(y, names, fontsize=9)
-        panels[0].set_ylim(-0.6, len(rows) - 0.4)
-        about = "n: number of held-out boards, or of pairs of skins"
-        title = f"Scores on held-out boards ({numbers['provenance']['scene']}, {source}; {about})"
-        _finish_headline(figure, title, ncols=2)
+    with drawing(4.7, 1.2 + 0.5 * len(rows) * len(metrics)) as figure:
+        for axes, metric in zip(figure.subplots(len(metrics), 1, squeeze=False)[:, 0], metrics, strict=True):
+            paper = [
+                {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))} if metric in model.paper else {}
+                for model, _ in rows
+            ]
+            name = f"ours ({source}): {spread_of({model.short: row for model, row in rows})}"
+            _draw_scores(axes, metric, y + OFFSET, [row for _, row in rows], label=name, **_look(1))
+            _draw_scores(axes, metric, y - OFFSET, paper, label=PAPER_NAME, **PAPER)
+            _limit(axes, metric)
+            # Non-breaking spaces keep "n = 6" on one line.
+            names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]
+            axes.set_yticks(y, names, fontsize=8.5)
+            axes.set_ylim(-0.6, len(rows) - 0.4)
+        _finish(figure, f"Scores on held-out boards (scene {numbers['provenance']['scene']}, {source})")
         return svg(figure)
 
 
-def _draw_scores(
-    axes: Any, metric: str, y: np.ndarray, rows: Rows, *, label: str, fmt: str, colour: str, face: str = ""
-) -> None:
-    means, lengths = bars(rows, metric)
-    look = {"color": colour, "markerfacecolor": face or colour, "markersize": 6, "capsize": 3, "linewidth": 1.2}
-    axes.errorbar(means, y, xerr=lengths, fmt=fmt, label=label, **look)
-    for mean, length, row_y in zip(means, lengths[1], y, strict=True):
-        beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center", "fontsize": 9, "color": colour}
-        axes.annotate(f"{mean:.3g}", (mean + length, row_y), **beside)
+def _look(i: int) -> dict[str, Any]:
+    """Return the look of our marks: filled, with thin bars with caps."""
+    return {"fmt": MARKERS[0], "color": COLOURS[i], "markersize": 6, "capsize": 3, "elinewidth": 1.2}
+
+
+def _draw_scores(axes: Any, metric: str, y: np.ndarray, rows: Rows, **look: Any) -> None:
+    """Draw a metric of those rows that have it, with numbers beside the bars."""
+    scored = [(row, row_y) for row, row_y in zip(rows, y, strict=True) if metric in row]
+    if not scored:
+        return
+    (means, lengths), drawn_y = bars([row for row, _ in scored], metric), [row_y for _, row_y in scored]
+    axes.errorbar(means, drawn_y, xerr=lengths, **look)
+    for mean, length, row_y in zip(means, lengths[1], drawn_y, strict=True):
+        beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.5}
+        axes.annotate(f"{mean:.2g}", (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
+
+
+def _limit(axes: Any, metric: str) -> None:
+    """Set label, limits and grid of the axis of a metric, with room for the numbers beside the bars."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = axes.dataLim.x0, axes.dataLim.x1
+    axes.set(xlabel=COLUMNS[metric].replace(", ", " / "))
+    if metric == "r2_f":
+        low = max(min(low, 0.0), R2_MIN)
+        axes.set_xlim(low - 0.05, 1.0 + 0.15 * (1.0 - low))
+        axes.axvline(0, color="0.6", linewidth=0.8)
+    else:
+        axes.set_xlim(0, 1.15 * (100.0 if metric == "accuracy_pct" else high))
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.set_xticks([tick for tick in axes.get_xticks() if axes.get_xlim()[0] <= tick <= RANGES[metric][1]])
+    axes.grid(axis="x", alpha=0.25)
+
+
+def spread_of(scores: Mapping[Any, Mapping[str, Any]]) -> str:
+    """Name what the bars of scores by name show; scores with another kind of bars than most are named."""
+    kinds = {name: _spread(row["accuracy_pct"]) for name, row in scores.items()}
+    most = Counter(kinds.values()).most_common(1)[0][0]
+    others = [f"{name}: {kind}" for name, kind in kinds.items() if kind != most]
+    return "; ".join([most, *others])
+
+
+def _spread(stat: Mapping[str, Any]) -> str:
+    if "ci95" in stat:
+        return "95 % interval over boards"
+    if "values" in stat:
+        return "lowest to highest board"
+    return "standard deviation over seeds" if "sd_seeds" in stat else "standard deviation" if "sd" in stat else "no bar"
+
+
+def boards_rows(numbers: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the scores on boards never seen in training, with the most presses, by model and number of labels."""
+    rows = [
+        row
+        for row in numbers.get("random_presses", {}).get("rows", ())
+        if row["method"] in WAYS and row["tested"] == TESTED and row["labels"].isdecimal()
+    ]
+    most_n = max((row["presses_n"] for row in rows), default=0)
+    return [row for row in rows if row["presses_n"] == most_n]
+
+
+def unseen_boards(
+    numbers: Mapping[str, Any],
+    source: str,
+    metrics: Sequence[str] = ("accuracy_pct", "mse_f_N2"),
+    *,
+    large: bool = False,
+) -> str:
+    """Draw places within 1 mm and rms errors of forces on boards never seen in training, by number of labels.
+
+    Each mark is one board. The paper's table 2 is below, as another kind of mark. A metric that the results lack has no
+    panel. `large`: for README.md, with panels beside each other and large letters.
+    """
+    rows = boards_rows(numbers)
+    metrics = [metric for metric in metrics if all(metric in row for row in rows)]
+    labels = sorted({int(row["labels"]) for row in rows})
+    paper_n = len(PAPERS_ROWS)
+    y = {f"{n} labels": paper_n + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
+    y |= {name: paper_n - i - 0.5 for i, name in enumerate(PAPERS_ROWS.values())}
+    letters_pt, size_in = (13.0, (8.33, 5.2)) if large else (9.0, (4.7, 3.8))
+    with drawing(*size_in) as figure:
+        panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
+        for axes, metric in zip(panels, metrics, strict=True):
+            for i, (method, name) in enumerate(WAYS.items()):
+                look = {"color": COLOURS[1 + i], "marker": MARKERS[i], "markersize": letters_pt * 0.65, "linewidth": 1}
+                for row in (row for row in rows if row["method"] == method):
+                    values = readable(metric, row[metric]["values"])
+                    row_y = y[f"{row['labels']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
+                    axes.plot(values, [row_y] * len(values), label=name, **look)
+                    mean = f"{np.mean(values):.{0 if metric == 'accuracy_pct' else 1}f}"
+                    beside = {"xytext": (0.7 * letters_pt, 0), "textcoords": "offset points", "va": "center"}
+                    axes.annotate(mean, (max(values), row_y), color=COLOURS[1 + i], fontsize=0.8 * letters_pt, **beside)
+            _draw_papers_row(axes, metric, [y[name] for name in PAPERS_ROWS.values()], letters_pt)
+            axes.set_xlabel(PLACE_LABEL if metric == "accuracy_pct" else FORCE_LABEL, size=letters_pt)
+            axes.set_xlim(0, 105 if metric == "accuracy_pct" else 1.15 * axes.dataLim.x1)
+            axes.set_ylim(-0.1, max(y.values()) + 0.7)
+            axes.axhline(paper_n + 0.4, color="0.6", linewidth=0.8, linestyle=":")
+            axes.grid(axis="x", alpha=0.25)
+            axes.tick_params(labelsize=letters_pt)
+        panels[0].set_yticks([*y.values()], [*y])
+        test = (
+            f"{rows[0]['presses_n']} unlabelled presses of the board; labels at random places, tests at other places; "
+            f"means of {numbers['random_presses']['draws_n']} draws"
+        )
+        title = f"Boards never seen in training ({source}): each mark is one board"
+        _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
+        return svg(figure, column=not large)
+
+
+def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:
+    """Convert mean squared errors of forces to rms errors; return other values unchanged."""
+    return np.sqrt(values) if metric == "mse_f_N2" else np.asarray(values, float)
+
+
+def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: float) -> None:
+    """Draw a metric of the paper's table 2 below ours on other skins; the bars of rms errors are not symmetric."""
+    means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
+    low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
+    look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
+    name = f"{PAPER_NAME} (other skins, other test)"
+    axes.errorbar(middle, y, xerr=np.stack([middle - low, high - middle]), label=name, **look)
+
+
+def papers_row(metric: str) -> list[Number]:
+    """Return a metric of the paper's table 2 in the rows that are beside ours."""
+    return [TABLE_2[row][metric] for row in PAPERS_ROWS]
 
 
 def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
-    """Draw accuracy and MSE of each method on held-out boards, with one point per number of labels of the board."""
+    """Draw place and force scores of each method on held-out boards, with one point per number of labels."""
     rows = numbers["labels"]
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     counts = sorted({row["labels_n"] for row in rows})
-    with drawing(8.6, 1.1 + 0.32 * len(methods)) as figure:
-        panels = figure.subplots(1, len(RANGES), sharey=True)
-        for axes, metric in zip(panels, RANGES, strict=True):
+    metrics = ("accuracy_pct", "mse_f_N2")
+    with drawing(4.7, 1.1 + 0.25 * len(methods) * len(metrics)) as figure:
+        for axes, metric in zip(figure.subplots(len(metrics), 1), metrics, strict=True):
             for i, count in enumerate(counts):
                 count_rows = [row for row in rows if row["labels_n"] == count]
                 means = [row["as_labelled"][metric]["mean"] for row in count_rows]
                 y = [-methods.index((row["method"], row["inputs"])) for row in count_rows]
                 look = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "linestyle": "none"}
-                axes.plot(means, y, label=f"{count} labels", markersize=6, **look)
+                axes.plot(means, y, label=f"{count} labels", markersize=5, **look)
             axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
             axes.grid(alpha=0.25)
-        names = [f"{method} ({inputs})" for method, inputs in methods]
-        panels[0].set_yticks([-i for i in range(len(methods))], names, fontsize=9)
+            axes.set_yticks([-i for i in range(len(methods))], [f"{m} ({inputs})" for m, inputs in methods], fontsize=8)
         boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
-        about = f"means over {boards_n} boards; intervals: see table"
-        title = f"Scores on held-out boards, as labelled ({numbers['provenance']['scene']}, {source}; {about})"
-        _finish_headline(figure, title, ncols=len(counts))
+        _finish(
+            figure,
+            f"Scores on held-out boards, as labelled (scene {numbers['provenance']['scene']}, {source}): means over "
+            f"{boards_n} boards",
+        )
         return svg(figure)
 
 
-def _finish_headline(figure: Any, title: str, *, ncols: int) -> None:
-    handles = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=ncols, frameon=False, fontsize=9)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11)
+def _finish(figure: Any, title: str, letters_pt: float = 9.0, *, note: str = "") -> None:
+    """Write the title; put the legend of all panels and a note below them."""
+    handles = {
+        label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    look = {"loc": "outside lower left", "frameon": False, "fontsize": letters_pt, "alignment": "left"}
+    columns_n = 1 if len(handles) < MANY_N else 3
+    figure.legend(handles.values(), handles.keys(), title=note, title_fontsize=letters_pt, ncols=columns_n, **look)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=letters_pt + 1)
+
+
+HELD_OUT = {  # of the predictions in maps, by experiment
+    "single_random": "one skin, random readings held out",
+    "single_indentation": "one skin, indentations held out",
+    "single_pass": "one skin, passes held out",
+    "single_temporal": "one skin, last passes held out",
+    "transfer": "trained on one skin, tested on others",
+    "lobo": "held-out boards",
+    "triplet": "held-out boards, with the triplet loss",
+    "adapt": "held-out boards, after adaptation",
+}
 
 
 def error_grids(
@@ -131,7 +293,7 @@ def error_grids(
         for experiment in table["question"].unique().to_pylist():
             wanted = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
             true_mm, predicted_mm = (_places(table.filter(wanted), side) for side in ("true", "predicted"))
-            title = f"{scene}, {experiment}: position error on held-out readings"
+            title = f"Position error: {HELD_OUT.get(experiment, experiment)} (scene {scene})"
             yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title, outline=outline)
 
 
@@ -220,10 +382,14 @@ def sweep_pokes(rows: Rows, source: str) -> str:
     """Draw scores against the number of unlabelled pokes (figure 6a), with the paper's scores for two numbers."""
     ordered = sorted(rows, key=lambda row: row["pokes_n"])
     paper = [{m: {"mean": mean, "sd": sd} for m, (mean, sd) in TABLE_2[row].items()} for row in ("triplet", "adapted")]
-    hollow = {"color": COLOURS[2], "marker": MARKERS[1], "markerfacecolor": "white", "linestyle": "none"}
     lines = [
-        Line("ours", [row["pokes_n"] for row in ordered], ordered, {"color": COLOURS[1], "marker": MARKERS[0]}),
-        Line("paper (table 2)", [0, ADAPTED_POKES_N], paper, hollow, shift_pt=5.0),
+        Line(
+            f"ours: {spread_of(dict(enumerate(ordered)))}",
+            [row["pokes_n"] for row in ordered],
+            ordered,
+            _look(1) | {"fmt": "o-"},
+        ),
+        Line(PAPER_NAME, [0, ADAPTED_POKES_N], paper, PAPER, shift_pt=7.0),
     ]
     return _sweep(lines, f"Scores after adaptation with unlabelled pokes ({source})", "pokes of the new skin", log=True)
 
@@ -233,10 +399,12 @@ def sweep_sensors(rows: Rows, source: str) -> str:
     lines = []
     for i, method in enumerate(SENSOR_METHODS):
         swept = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
-        look = {"color": COLOURS[1 + i], "marker": MARKERS[i]}
+        look = _look(1 + i) | {"fmt": f"{MARKERS[i]}-"}
         if swept:
             lines.append(Line(SHORT[method], [row["skins_n"] for row in swept], swept, look, shift_pt=4.0 * (i - 1)))
-    title = f"Scores on held-out boards by number of training skins ({source})"
+    title = (
+        f"Scores on held-out boards by number of training skins ({source}; bars: {spread_of(dict(enumerate(rows)))})"
+    )
     return _sweep(lines, title, "training skins", log=False)
 
 
@@ -261,8 +429,8 @@ def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
 
 def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
     counts = sorted({count for line in lines for count in line.counts})
-    with drawing(5.6, 6.4) as figure:
-        for axes, metric in zip(figure.subplots(len(RANGES), 1), RANGES, strict=True):
+    with drawing(4.7, 5.8) as figure:
+        for axes, metric in zip(figure.subplots(len(SWEPT), 1), SWEPT, strict=True):
             if log:
                 axes.set_xscale("symlog", linthresh=LINEAR_BELOW_N, linscale=0.5)
                 axes.set_xlim(-LINEAR_BELOW_N / 4, 1.3 * counts[-1])
@@ -274,9 +442,7 @@ def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:
             axes.grid(alpha=0.25)
             _draw_lines(axes, lines, metric)
         figure.align_ylabels()
-        look = {"loc": "outside lower left", "ncols": 2, "frameon": False, "fontsize": 9, "alignment": "left"}
-        figure.legend(*axes.get_legend_handles_labels(), title=BARS, title_fontsize=9, **look)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10)
+        _finish(figure, title)
         return svg(figure)
 
 
@@ -287,8 +453,9 @@ def _draw_lines(axes: Any, lines: Sequence[Line], metric: str) -> None:
     for line in lines:
         means, lengths = bars(line.scores, metric)
         shift = ScaledTranslation(line.shift_pt / 72, 0, axes.figure.dpi_scale_trans)
-        look = {"linewidth": 1, "markersize": 5, "capsize": 2, "elinewidth": 0.8, **line.look}
-        axes.errorbar(line.counts, means, lengths, transform=axes.transData + shift, label=line.name, **look)
+        axes.errorbar(
+            line.counts, means, lengths, transform=axes.transData + shift, label=line.name, linewidth=1, **line.look
+        )
         ends += [*(means - lengths[0]), *(means + lengths[1])]
     # The limits are set here, because Matplotlib does not compute them from shifted data.
     margin = 0.05 * (max(ends) - min(ends)) or 1.0

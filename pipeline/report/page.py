@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from pipeline.report.costs import cost_tables
 from pipeline.report.experiments import add_sections
 from pipeline.report.figures import HEADLINE
 from pipeline.report.formatting import notes
+from pipeline.report.sentences import sentences
 from pipeline.report.tables import summary_table
 from pipeline.stages import is_stage, module_name
 from reskin.code import ROOT, file_of
@@ -77,6 +78,7 @@ class Drawing:
     height_px: int
     least_px: int
     wide: bool
+    sentence: str = ""  # what it shows, or what to look for
 
     @property
     def scrolls(self) -> bool:
@@ -110,6 +112,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
     """Render the page of a scene, which is the same for every repeat of a run; `figures`: SVG text by file name."""
     source, summary = numbers["provenance"]["source"], summary_table(numbers)
     drawings = {name: measure(f"figures/{name}", text) for name, text in figures.items()}
+    drawings = describe(drawings, sentences(numbers))
     checklist = tables.get("checklist", pd.DataFrame())
     return template("page.html").render(
         scene=numbers["provenance"]["scene"],
@@ -134,6 +137,7 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
     drawings = {name: measure(name, text) for name, text in costs.items() if name.endswith(".svg")}
+    drawings = describe(drawings, sentences(numbers))
     provenance = pd.DataFrame(
         {
             "what": key,
@@ -250,6 +254,11 @@ def measure(file: str, svg: str) -> Drawing:
     least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt
     width_px, height_px = (round(PX_PER_PT * side_pt) for side_pt in (width_pt, height_pt))
     return Drawing(file, width_px, height_px, round(least_px), width_pt > WIDE_PT)
+
+
+def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
+    """Add to each figure its sentence, if there is one for its name."""
+    return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
 
 
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:

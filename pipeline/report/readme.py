@@ -1,4 +1,7 @@
-"""Fill in the generated blocks of README.md and docs, and what the live page shows, from the results in `reports/`."""
+"""Write the generated blocks of README.md and docs, the figure of README.md, and what the live page shows.
+
+All of it is made from the results in `reports/`.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -10,6 +13,7 @@ import pandas as pd
 
 from pipeline import FLOW
 from pipeline.benchmark import entries
+from pipeline.report.figures import TESTED, unseen_boards
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.paper import TABLE_2, TABLE_2_ROWS
@@ -44,7 +48,7 @@ SIMULATED_MEANING = (
     "simulated, the paper's were recorded. The simulation was tuned to row *Single-sensor*, so agreement there is not "
     "evidence."
 )
-CHECKERBOARD, PRESSES_N, UNIVERSAL = "other colour of a checkerboard", 65, "universal, "
+PRESSES_N, UNIVERSAL = 65, "universal, "
 TRAINED_ON = {
     "universal, boards of the rig": "simulation, other board of the rig",
     "universal, simulated alone": "simulation (the model that we ship)",
@@ -58,6 +62,7 @@ RECORDED_MEANING = (
     "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. The model is calibrated to "
     "{presses_n} presses at unknown places, and to labels: presses with known places and forces. {touch}"
 )
+FIGURE = "docs/img/headline.svg"  # what README.md shows of this model and of one trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
@@ -88,11 +93,17 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
     if SHIPPED_SCENE in numbers:
-        file, measured = root / MEASURED, measured_of(numbers[SHIPPED_SCENE])
+        shipped = numbers[SHIPPED_SCENE]
+        file, measured = root / MEASURED, measured_of(shipped)
         if not file.exists() or io.read_json(file) != measured:
             changed.append(str(file))
             if write:
                 io.write_json(file, measured)
+        file, figure = root / FIGURE, unseen_boards(shipped, shipped["provenance"]["source"], large=True)
+        if not file.exists() or file.read_text(encoding="utf-8") != figure:
+            changed.append(str(file))
+            if write:
+                io.write_text(file, figure)
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
 
 
@@ -113,8 +124,7 @@ def measured_of(numbers: Numbers) -> dict[str, Any]:
     ] + [
         {"presses_n": row["presses_n"], "labels_n": int(row["labels"])} | by_board(row)
         for row in numbers["random_presses"]["rows"]
-        if (row["method"], row["tested"]) == (SHIPPED_NAME, "other colour of a checkerboard")
-        and row["labels"].isdecimal()
+        if (row["method"], row["tested"]) == (SHIPPED_NAME, TESTED) and row["labels"].isdecimal()
     ]
     detection = [
         row
@@ -198,7 +208,7 @@ def _recorded(numbers: Numbers) -> str:
     rows = {
         (row["method"], row["labels"]): row
         for row in numbers["random_presses"]["rows"]
-        if row["tested"] == CHECKERBOARD and row["presses_n"] == PRESSES_N
+        if row["tested"] == TESTED and row["presses_n"] == PRESSES_N
     }
     methods = list(dict.fromkeys(method for method, _ in rows if method.startswith(UNIVERSAL)))
     lines = [

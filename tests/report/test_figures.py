@@ -1,25 +1,34 @@
 """Tests of the report's figures: marks, units, source, numbers of the paper, reproducible files."""
 
-import io
 import json
 import re
 import xml.etree.ElementTree as ET
+from html import unescape
 
 import numpy as np
 import pytest
 
 from pipeline.report.drawing import drawing, svg
 from pipeline.report.figures import (
+    FORCE,
+    FORCE_LABEL,
     HEADLINE,
+    LABELS,
+    PLACE_LABEL,
+    WAYS,
     Outline,
     bars,
+    boards_rows,
     error_grid,
     headline_figures,
     learning_figures,
+    spread_of,
     sweep_pokes,
     sweep_sensors,
+    unseen_boards,
 )
 from pipeline.report.formatting import models
+from pipeline.report.paper import TABLE_2
 from tests.report.synthetic import all_experiments, texts_of
 from tests.stages.checkout import ROOT
 
@@ -87,18 +96,6 @@ def test_error_grid_is_reproducible():
     assert draw_grid() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
 
 
-def test_layout_equals_that_of_matplotlib_on_save():
-    def places(save) -> list[tuple[float, ...]]:
-        with drawing(5.0, 3.0) as figure:
-            for axes, scale in zip(figure.subplots(1, 2), ("linear", "log"), strict=True):
-                axes.plot([1, 10, 1000])
-                axes.set(ylabel="force / N", title="a long title of a panel", yscale=scale)
-            save(figure)
-            return [axes.get_position().bounds for axes in figure.axes]
-
-    assert places(svg) == places(lambda figure: figure.savefig(io.BytesIO(), format="svg"))
-
-
 def row(accuracy_pct: float, mse_xy_mm2: float = 0.5, **spread) -> dict:
     spread = spread or {"sd": 0.1, "n": 6}
     return {
@@ -117,7 +114,7 @@ SENSORS = [
 
 def test_sweep_pokes_labels():
     labels = texts_of(sweep_pokes(POKES, "simulated"))
-    for label in ("0", "65", "3900", "simulated", "%", "mm²", "paper (table 2)", "pokes"):
+    for label in ("0", "65", "3900", "simulated", "%", "mm²", "paper's table 2: mean ± standard deviation", "pokes"):
         assert label in labels
 
 
@@ -173,16 +170,66 @@ def test_headline_figure_has_all_rows_of_table_2():
         assert label in labels
 
 
+def test_headline_figures_have_place_and_force():
+    figures = headline_figures(all_experiments(), "simulated")
+    assert "MSE_F / N²" in texts_of(figures[FORCE])
+    assert "R² of F" in texts_of(figures[FORCE])
+    assert "MSE_xy / mm²" in texts_of(figures[HEADLINE])
+
+
 def test_headline_figure_is_reproducible():
     numbers = all_experiments()
     assert headline_figures(numbers, "simulated") == headline_figures(numbers, "simulated")
     assert headline_figures({name: numbers[name] for name in ("provenance",)}, "recorded") == {}
 
 
-@pytest.mark.parametrize("scene", ["lab"])
-def test_labels_figure_has_each_method(scene):
-    numbers = json.loads((ROOT / "reports" / scene / "numbers.json").read_text())
-    labels = texts_of(headline_figures(numbers, "recorded")[HEADLINE])
-    assert all(f"{row['method']} ({row['inputs']})" in labels for row in numbers["labels"])
+@pytest.fixture(scope="module")
+def lab() -> dict:
+    numbers = json.loads((ROOT / "reports/lab/numbers.json").read_text())
+    for i, row in enumerate(numbers["random_presses"]["rows"]):
+        row["mse_f_N2"] = {"mean": 1.0 + i, "n": 2, "values": [0.5 + i, 1.5 + i]}
+    return numbers
+
+
+def test_labels_figure_has_each_method(lab):
+    labels = texts_of(headline_figures(lab, "recorded")[LABELS])
+    assert all(f"{row['method']} ({row['inputs']})" in labels for row in lab["labels"])
     assert "recorded" in labels
     assert "as labelled" in labels
+
+
+def titles(svg: str) -> list[str]:
+    return [unescape(title) for title in re.findall(r"<title>(.*?)</title>", svg, re.DOTALL)]
+
+
+@pytest.mark.parametrize("large", [True, False])
+def test_unseen_boards_show_each_board_and_the_paper(lab, large):
+    shown = titles(unseen_boards(lab, "recorded", large=large))
+    rows = boards_rows(lab)
+    assert {row["labels"] for row in rows} >= {"0", "10", "40"}
+    for row in rows:
+        places, forces = row["accuracy_pct"]["values"], [mse**0.5 for mse in row["mse_f_N2"]["values"]]
+        for axis, values in ((PLACE_LABEL, places), (FORCE_LABEL, forces)):
+            for value in values:
+                assert f"{WAYS[row['method']]}\n{axis} = {value:.4g}\n{row['labels']} labels" in shown
+    (mean, sd), (mse, sd_mse) = (TABLE_2["adapted"][metric] for metric in ("accuracy_pct", "mse_f_N2"))
+    for axis, middle, low, high in (
+        (PLACE_LABEL, mean, mean - sd, min(mean + sd, 100)),
+        (FORCE_LABEL, mse**0.5, (mse - sd_mse) ** 0.5, (mse + sd_mse) ** 0.5),
+    ):
+        ends = f"bar from {low:.4g} to {high:.4g}"
+        assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
+
+
+def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
+    figures = headline_figures(lab, "recorded")
+    assert PLACE_LABEL in texts_of(figures[HEADLINE])
+    assert FORCE_LABEL in texts_of(figures[FORCE])
+    assert FORCE_LABEL not in texts_of(figures[HEADLINE])
+
+
+def test_bars_of_another_kind_are_named():
+    scores = {"single": row(40.0), "multi": row(80.0, ci95=[70, 90]), "adapted": row(85.0, ci95=[80, 90])}
+    assert spread_of(scores) == "95 % interval over boards; single: standard deviation"
+    del scores["single"]
+    assert spread_of(scores) == "95 % interval over boards"

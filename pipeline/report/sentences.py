@@ -1,0 +1,163 @@
+"""One sentence below each figure: what it shows, with numbers from the results, or what to look for."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from pipeline.report.figures import FORCE, HEADLINE, LABELS, WAYS, boards_rows, readable
+from pipeline.report.formatting import SHORT
+from pipeline.report.paper import TABLE_2
+
+Numbers = Mapping[str, Any]  # numbers.json of one scene
+MAPS = (
+    "Look for places with large errors, for example at the edge of the skin or between the chips. All maps have the "
+    "same scale of colours."
+)
+# What to look for, by figure, where the sentence contains no result.
+LOOK = {
+    LABELS: "In each row, the marks from 0 labels to the most labels show how much labels of the new board help.",
+    "variation_time.svg": "The distance of a line from 0 is the drift of the field since the first visit; its "
+    "colour is the number of contacts before.",
+    "variation_skins.svg": "The distance between the lines is what a network must cope with on a new skin: the "
+    "indentations are equal, and the fields differ.",
+    "drift_wander.svg": "A line that falls (left to right) shows a drift of the field at rest that is too fast for how "
+    "often no-load readings are taken.",
+    "sensitivity.svg": "Where a curve crosses the line of 95 %, pairs of readings with that difference of weight are "
+    "ordered correctly 95 times in 100.",
+    "logs.svg": "Where both lines of the force differ, the model misses a contact, reports a false one, or misjudges "
+    "its force.",
+    "ambient.svg": "Where a line falls, a field that appeared after the no-load reading spoils the estimates.",
+    "contacts.svg": "A model of single contacts estimates one place for two contacts: look how far apart they must be "
+    "before they are detected as two.",
+    "dynamics.svg": "Errors that grow towards short presses (left) are caused by motion during a reading.",
+    "gripper.svg": "Marks inside the band are runs that held the intended force within the stated tolerance.",
+    "population_scaling.svg": "Look whether more simulated training skins still reduce the errors.",
+    "compare_arrows.svg": "Equal directions of arrows in the recorded and the simulated row mean that the simulation "
+    "describes the board.",
+    "compare_growth.svg": "Recorded and simulated points that lie on each other show that the field grows equally with "
+    "the force.",
+    "compare_touch.svg": "Left of the recorded presses there are only simulations: they differ there, so recordings of "
+    "light touches would decide between them.",
+    "recorded_limits.svg": "Presses above a line of threshold are detected; extrapolated lines show the lightest "
+    "press that would be.",
+    "moving_hand.svg": "Look for values at which false contacts are rare and places are still found.",
+    "worlds.svg": "A factor matters if the lines of its column are steep; compare them with the dashed lines of the "
+    "paper.",
+    "training.svg": "A method above and to the right of a numbered one is worse and slower.",
+    "inference.svg": "A method above and to the right of a numbered one is worse and slower.",
+    "quadratures.svg": "Of the points below the limit, the one farthest to the left is the cheapest.",
+    "integrators.svg": "Lower and farther to the left is better; failures are listed below the panels.",
+}
+
+
+def sentences(numbers: Numbers) -> dict[str, str]:
+    """Return a sentence for each figure of a scene's report, by file name."""
+    maps = {f"error_grid_{name}.svg": MAPS for name in numbers.get("variants", ())}
+    found = LOOK | maps
+    for key, write in WRITERS.items():
+        if numbers.get(key):
+            found |= write(numbers)
+    return found
+
+
+def _table2(numbers: Numbers) -> dict[str, str]:
+    ours = {name: row for name, row in numbers["table2"].items() if name in ("single", "multi", "adapted")}
+    parts = [
+        f"{SHORT[name]} {row['accuracy_pct']['mean']:.0f} % (paper: {TABLE_2[name]['accuracy_pct'][0]:.0f} %)"
+        for name, row in ours.items()
+    ]
+    errors = [
+        f"{SHORT[name]} {row['mse_f_N2']['mean'] ** 0.5:.1f} N (paper: {TABLE_2[name]['mse_f_N2'][0] ** 0.5:.1f} N)"
+        for name, row in ours.items()
+        if "mse_f_N2" in row
+    ]
+    return {HEADLINE: f"Within 1 mm: {'; '.join(parts)}."} | (
+        {FORCE: f"Square roots of the mean MSE_F: {'; '.join(errors)}."} if errors else {}
+    )
+
+
+def _unseen(numbers: Numbers) -> dict[str, str]:
+    rows = sorted(boards_rows(numbers), key=lambda row: int(row["labels"]))
+    written = {}
+    for file, metric, digits, unit in ((HEADLINE, "accuracy_pct", 0, "%"), (FORCE, "mse_f_N2", 1, "N")):
+        parts = []
+        for method, name in WAYS.items():
+            swept = [row for row in rows if row["method"] == method and metric in row]
+            if swept:
+                first, last = (readable(metric, row[metric]["values"]).mean() for row in (swept[0], swept[-1]))
+                ends = f"{first:.{digits}f} {unit} with {swept[0]['labels']} labels"
+                parts.append(f"{name}: {ends}, {last:.{digits}f} {unit} with {swept[-1]['labels']}")
+        if parts:
+            what = "Within 1 mm" if metric == "accuracy_pct" else "Rms error of the force"
+            written[file] = f"{what}, mean over the boards: {'; '.join(parts)}."
+    return written
+
+
+def _pokes(numbers: Numbers) -> dict[str, str]:
+    rows = sorted(numbers["sweep_pokes"], key=lambda row: row["pokes_n"])
+    ends = [f"{row['accuracy_pct']['mean']:.1f} % with {row['pokes_n']} pokes" for row in _spaced(rows)]
+    return {"sweep_pokes.svg": f"Mean accuracy: {', '.join(ends)}. The intervals show how sure the difference is."}
+
+
+def _spaced(rows: Sequence[Numbers]) -> list[Numbers]:
+    """Return the first, the second and the last row."""
+    return [rows[i] for i in dict.fromkeys((0, min(1, len(rows) - 1), len(rows) - 1))]
+
+
+def _sensors(numbers: Numbers) -> dict[str, str]:
+    means = {(row["method"], row["skins_n"]): row["accuracy_pct"]["mean"] for row in numbers["sweep_sensors"]}
+    counts = sorted({n for method, n in means if method == "adapted" and ("triplet", n) in means})
+    gains = [
+        f"{means['adapted', n] - means['triplet', n]:+.1f} points with {n} training skin{'s' if n > 1 else ''}"
+        for n in dict.fromkeys((*counts[:1], *counts[-1:]))
+    ]
+    return {"sweep_sensors.svg": f"Adaptation changes the mean accuracy by {', '.join(gains)}."} if gains else {}
+
+
+def _drift(numbers: Numbers) -> dict[str, str]:
+    drift = numbers["drift"]
+    names = {
+        "initial": "one no-load reading at the start",
+        "regular": f"one every {drift['regular_n']} {drift['unit']}s" if "regular_n" in drift else "regular ones",
+        "each": "one before each contact",
+    }
+    last = {name: drift[name][-1] for name in names if drift.get(name)}
+    parts = [f"{row['accuracy_pct']:.0f} % with {names[name]}" for name, row in last.items()]
+    written = {"drift.svg": f"Accuracy in the last test window: {', '.join(parts)}."} if parts else {}
+    if "late" in drift:
+        bias_N = drift["late"]["bias_N"]
+        written["drift_force.svg"] = (
+            f"Points above the line are forces that are estimated too high. On average, forces are estimated "
+            f"{abs(bias_N):.3f} N too {'high' if bias_N > 0 else 'low'}."
+        )
+    return written
+
+
+def _shear(numbers: Numbers) -> dict[str, str]:
+    names = ("explained_fxy", "explained_fz")
+    if not all(name in numbers["shear"] for name in names):
+        return {"shear.svg": "Points on the diagonal are exact."}
+    shares = [100 * numbers["shear"][name]["mean"] for name in names]
+    share = "{:.2f} % of the variance of sideways forces and {:.2f} % of that of normal forces".format(*shares)
+    return {"shear.svg": f"Points on the diagonal are exact. The networks explain {share}."}
+
+
+def _flexible(numbers: Numbers) -> dict[str, str]:
+    bias_N = [numbers["flexible"]["bias_f_N"][name]["mean"] for name in ("before", "after")]
+    ends = "{:+.1f} N before adaptation and {:+.1f} N after it".format(*bias_N)
+    return {"flexible.svg": f"Points above the line are forces that are estimated too high: the mean error is {ends}."}
+
+
+def _sleeve(numbers: Numbers) -> dict[str, str]:
+    parts = {"near_seam": "near a border between boards", "inside": "elsewhere"}
+    found = [
+        f"{numbers['sleeve'][name]['median_error_mm']['mean']:.2f} mm {where}"
+        for name, where in parts.items()
+        if name in numbers["sleeve"]
+    ]
+    return {"sleeve.svg": f"Median error: {' and '.join(found)}."}
+
+
+WRITERS: dict[str, Callable[[Numbers], dict[str, str]]] = {
+    "table2": _table2, "random_presses": _unseen, "sweep_pokes": _pokes, "sweep_sensors": _sensors,
+    "drift": _drift, "shear": _shear, "flexible": _flexible, "sleeve": _sleeve,
+}  # fmt: skip

@@ -1,0 +1,66 @@
+"""Tests of the sentences below figures."""
+
+import json
+from copy import deepcopy
+
+import pytest
+
+from pipeline.report.figures import FORCE, HEADLINE
+from pipeline.report.sentences import sentences
+from tests.report.synthetic import all_experiments
+from tests.stages.checkout import ROOT
+
+SCENES = sorted(file.parent.name for file in (ROOT / "reports").glob("*/numbers.json"))
+MADE_FROM_RESULTS = (
+    "headline.svg",
+    "sweep_pokes.svg",
+    "sweep_sensors.svg",
+    "drift.svg",
+    "drift_force.svg",
+    "shear.svg",
+)
+
+
+def numbers_of(scene: str) -> dict:
+    return json.loads((ROOT / f"reports/{scene}/numbers.json").read_text())
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_each_committed_figure_has_one_sentence_or_two(scene):
+    written = sentences(numbers_of(scene))
+    drawn = [*(ROOT / "reports" / scene).glob("figures/*.svg")]
+    assert [file.name for file in drawn if file.name not in written] == []
+    for sentence in written.values():
+        assert sentence.endswith(".")
+        assert sentence.count(". ") <= 1
+        assert "nan" not in sentence.split()
+
+
+@pytest.mark.parametrize("figure", MADE_FROM_RESULTS)
+def test_stated_results_are_those_of_the_run(figure):
+    numbers = numbers_of("paper")
+    changed = deepcopy(numbers)
+    changed["table2"]["multi"]["accuracy_pct"]["mean"] = 12.0
+    changed["sweep_pokes"][0]["accuracy_pct"]["mean"] = 12.0
+    fewest = {row["method"]: row["accuracy_pct"] for row in reversed(changed["sweep_sensors"])}
+    fewest["adapted"]["mean"] = fewest["triplet"]["mean"] + 12.0
+    changed["drift"]["initial"][-1]["accuracy_pct"] = 12.0
+    changed["drift"]["late"]["bias_N"] = -0.12
+    changed["shear"]["explained_fz"]["mean"] = 0.12
+    before, after = sentences(numbers)[figure], sentences(changed)[figure]
+    assert before != after
+    assert "12" in after
+    assert ("too high" in before and "0.120 N too low" in after) or figure != "drift_force.svg"
+
+
+def test_unseen_boards_replace_table_2():
+    numbers = numbers_of("lab")
+    for row in numbers["random_presses"]["rows"]:
+        row["mse_f_N2"] = {"mean": 4.0, "n": 2, "values": [4.0, 16.0]}
+    written = sentences(numbers)
+    assert "with 0 labels" in written[HEADLINE]
+    assert "3.0 N with 40" in written[FORCE]
+
+
+def test_results_without_optional_parts():
+    assert set(sentences({})) <= set(sentences(all_experiments()))
