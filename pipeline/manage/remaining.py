@@ -1,8 +1,8 @@
 """Estimate how long the running `dvc repro` still takes: `progress: 23 % after 1.2 min, about 4 min left`.
 
-The estimate needs the reports of the scenes, whose files provenance.json have the costs of all stages. It scales these
-costs by the speed of this run so far. A stage counts if DVC will probably run it: if its settings, code or inputs differ
-from dvc.lock, or an output is missing.
+The costs of all stages come from the provenance.json of each scene's last report. The estimate scales them by the speed
+of this run so far. A stage counts if DVC will probably run it: if its settings, code or inputs differ from dvc.lock, or
+an output is missing.
 
 No stage imports this module, so that it may change without making results stale.
 """

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from pipeline.manage.compare import Comparison, Echo, Report, compare_reports, read_folder, read_revision
@@ -9,9 +10,10 @@ from pipeline.report.summary import summarise
 from reskin.errors import SchemaError
 
 COMMITTED = "HEAD"
+WIDTH = 100  # columns
 NEXT = (
     ("{page}", "figures and tables; open it in a browser"),
-    ("make ui", "MLflow: settings, curve, scores and model of every training"),
+    ("make ui", "MLflow: every training with its curve, scores and model"),
     (".venv/bin/reskin live --emulate nominal", "contacts on a simulated board, live"),
     ("docs/tutorial.md", "in 30 minutes from a simulated board to your own model"),
     ("docs/add-a-skin.md", "your own boards: reskin new, reskin add, dvc repro"),
@@ -27,7 +29,9 @@ def print_summary(root: Path, scenes: list[str], echo: Echo) -> None:
             continue
         fresh = read_folder(root / "reports" / scene, scene)
         pages.append(f"reports/{scene}/index.html")
-        for line in (*_comparison(root, scene, fresh), "", *summarise(fresh.numbers)):
+        for sentence in _comparison(root, scene, fresh):
+            echo(fill(sentence, WIDTH))
+        for line in ("", *summarise(fresh.numbers)):
             echo(line)
         echo("")
     page = pages[0] if len(pages) == 1 else "reports/index.html"

@@ -8,7 +8,7 @@ from pipeline.report.formatting import PAPER_METRICS, models
 SHORT_TITLES = {
     "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F",
 }  # fmt: skip
-MEANING = "R² of F: 1 if all forces are exact, 0 if a constant force would be as good. Intervals are on the page."
+MEANING = "R² of F: 1 if all forces are exact, 0 if a constant force is as good. The page has the intervals."
 LABELLED = ("accuracy_pct", "r2_f")  # metrics shown of methods that use labels
 CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of the methods that are, and are not, shown
 Numbers = Mapping[str, Any]  # numbers.json of one scene
@@ -18,12 +18,12 @@ def summarise(numbers: Numbers) -> list[str]:
     """Return the main scores of a scene on held-out boards as lines of text; none if the scene holds out no board."""
     data = str(numbers["provenance"]["source"]).capitalize()
     if numbers.get("labels"):
-        title = f"{data} boards that the models have not seen, by number of labelled indentations:"
+        title = f"{data} boards not seen in training, by number of labelled indentations:"
         return [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
     if numbers.get("table2"):
         rows = _rows_of_table_2(numbers)
-        paper = " (in parentheses: the paper's, on recorded boards)" if "(" in str(rows[1:]) else ""
-        return [f"{data} boards that the networks have not seen: means{paper}", *_table(rows), MEANING]
+        paper = " (the paper's in parentheses, on recorded boards)" if "(" in str(rows[1:]) else ""
+        return [f"{data} boards not seen in training: means{paper}", *_table(rows), MEANING]
     return []
 
 
