@@ -24,7 +24,7 @@ from reskin.config import read_yaml
 STATE = Path(".reskin/run.json")  # the current run: its process, its start, the planned stages and those that started
 LOCK = Path("dvc.lock")
 CODE, DIGESTS = "code", "data/code"  # the stage that writes digests of modules, and its output
-START_S = 2.0  # assumed: start of Python and DVC's own work, for each stage
+START_S = 1.5  # assumed: start of Python and DVC's own work, for each stage
 SIDE_BY_SIDE_N = 2  # trainings, by default
 TRUSTED = 0.1  # fraction of the work after which the speed of this run counts as much as that of the recorded one
 
@@ -155,7 +155,17 @@ def _expected_s(name: str, costs: Mapping[str, Mapping[str, Any]]) -> float | No
     cost = costs[scene].get(f"{stage}-{part}" if part else stage)
     if cost is None:  # its cost is not in the report, because it runs after it or takes no time worth mentioning
         return START_S
-    return START_S + float(cost["computed_s"]) / (SIDE_BY_SIDE_N if cost["trainings_n"] > 1 else 1)
+    return START_S + _without_reuse_s(cost)
+
+
+def _without_reuse_s(cost: Mapping[str, Any]) -> float:
+    """Return the time that a stage takes if none of its trainings is finished before.
+
+    The processor time of the stage limits its own time, as a busy machine makes the elapsed time longer.
+    """
+    own_s = min(cost["seconds"], cost["cpu_s"])
+    reused = cost["reused_n"] / cost["trainings_n"] if cost["trainings_n"] else 0.0
+    return float(own_s + reused * max(cost["computed_s"] - cost["seconds"], 0.0) / SIDE_BY_SIDE_N)
 
 
 def announce() -> None:
