@@ -9,6 +9,7 @@ SHORT_TITLES = {
     "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F",
 }  # fmt: skip
 MEANING = "R² of F: 1 if all forces are exact, 0 if a constant force is as good. The page has the intervals."
+RECORDED = "Recorded"
 LABELLED = ("accuracy_pct", "r2_f")  # metrics shown of methods that use labels
 CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of the methods that are, and are not, shown
 Numbers = Mapping[str, Any]  # numbers.json of one scene
@@ -19,12 +20,16 @@ def summarise(numbers: Numbers) -> list[str]:
     data = str(numbers["provenance"]["source"]).capitalize()
     if numbers.get("labels"):
         title = f"{data} boards not seen in training, by number of labelled indentations:"
-        return [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
-    if numbers.get("table2"):
+        lines = [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
+    elif numbers.get("table2"):
         rows = _rows_of_table_2(numbers)
         paper = " (the paper's in parentheses, on recorded boards)" if "(" in str(rows[1:]) else ""
-        return [f"{data} boards not seen in training: means{paper}", *_table(rows), MEANING]
-    return []
+        lines = [f"{data} boards not seen in training: means{paper}", *_table(rows), MEANING]
+    else:
+        return []
+    if data == RECORDED and (model := numbers.get("final_model")):
+        lines.append(f"A model of all {model['boards_n']} boards, for use: reskin live --model {model['file']}")
+    return lines
 
 
 def _rows_of_table_2(numbers: Numbers) -> list[list[str]]:

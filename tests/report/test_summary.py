@@ -41,6 +41,14 @@ def test_recorded_scores_stand_alone():
     assert any("50" in line and "–" in line for line in lines)  # an unknown score is a dash
 
 
+def test_final_model_of_recorded_boards_is_named():
+    model = {"file": "data/models/mine/final/final.safetensors", "boards_n": 3}
+    row = {"accuracy_pct": {"mean": 50.0, "n": 2}}
+    for source, named in (("recorded", True), ("simulated", False)):
+        lines = summarise({"provenance": {"source": source}, "table2": {"multi": row}, "final_model": model})
+        assert (model["file"] in lines[-1]) is named
+
+
 def test_methods_with_labels_are_shown_with_the_fewest_and_the_most():
     def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
         scores = {"accuracy_pct": {"mean": accuracy_pct}, "r2_f": {"mean": accuracy_pct / 100}}
