@@ -58,11 +58,19 @@ def _continue_run(stage: str, process: int, command: str) -> dict[str, Any]:
     return run
 
 
-def _until_targets(stages: Sequence[str], command: str) -> Sequence[str]:
-    """Leave out the stages after the last target of a command like `dvc repro report@mine`."""
-    targets = [word.rpartition(":")[2] for word in command.split()]
-    last = max((i for i, stage in enumerate(stages) if stage in targets), default=len(stages) - 1)
-    return stages[: last + 1]
+def _until_targets(stages: Sequence[str], command: str) -> list[str]:
+    """Return the stages that a command like `dvc repro report@mine` may run: those of the scene up to the target."""
+    targets = {word.rpartition(":")[2] for word in command.split()} & set(stages)
+    if not targets:
+        return list(stages)
+    last = max(stages.index(target) for target in targets)
+    items = {target.partition("@")[2] for target in targets}
+    return [name for name in stages[: last + 1] if any(_same_scene(name.partition("@")[2], item) for item in items)]
+
+
+def _same_scene(item: str, other: str) -> bool:
+    """Return whether two items, such as `quick` and `quick-wear`, are of one scene; stages without item are of all."""
+    return not item or not other or item == other or item.startswith(f"{other}-") or other.startswith(f"{item}-")
 
 
 def _sentence(stage: str, run: Mapping[str, Any], now_s: float) -> str | None:
