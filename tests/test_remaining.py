@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from pipeline.manage import remaining, running
 from pipeline.manage.remaining import expected_seconds, planned, progress
 from reskin import io
+from tests.stages.checkout import ROOT, copy_checkout, run
 
 ORDER = ["code", "simulate@tiny-wear", "train_multi@tiny", "report@tiny", "publish@tiny"]
 NONE = {"trainings_n": 0, "reused_n": 0}
@@ -156,6 +157,16 @@ def test_stage_outside_dvc_prints_nothing(checkout, monkeypatch):
     assert progress() is None
     monkeypatch.setenv(remaining.VARIABLE, ORDER[1])  # inherited, but no DVC runs
     assert progress() is None
+
+
+def test_stage_prints_the_progress_of_its_run(tmp_path):
+    root = copy_checkout(tmp_path / "copy")
+    for file in ("dvc.lock", "reports/quick/provenance.json"):
+        io.write_text(root / file, (ROOT / file).read_text())
+    entry = {"pid": os.getpid(), "cmd": "dvc repro table2@quick"}
+    io.write_json(root / running.DVC_FILES / running.RWLOCK, {"write": {"data/code": entry}, "read": {}})
+    done = run(root, "python", "-m", "pipeline", "code", "--digests", "data/code", DVC_STAGE="code")
+    assert minutes_left(done.stderr) > 0
 
 
 def test_broken_state_does_not_stop_a_stage(checkout, start):
