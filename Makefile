@@ -1,5 +1,6 @@
 # make repro   everything from scratch: the environment, then `dvc repro` for the scenes of pipeline/plan.yaml
 # make test    lint, types, layers, tests
+# make test-pythons   make test on each supported Python that is installed, each in an environment of its own
 # make test-processors   checks that training gives the same bits on emulated Intel and AMD processors (needs qemu-user)
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks at full size (the tests run each at a tiny size), and slow tests
@@ -15,6 +16,7 @@
 # make clean   removes the files made by the targets above, except data and results
 
 PYTHON ?= python3
+PYTHONS := 3.11 3.12 3.13
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -30,7 +32,7 @@ export PYTHONDONTWRITEBYTECODE =
 # Stages run `python`, which must be the one of this environment.
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: repro test test-processors compiled lint ui bench faults time-repro time-install readme constraints licences audit clean
+.PHONY: repro test test-pythons test-processors compiled lint ui bench faults time-repro time-install readme constraints licences audit clean
 .PHONY: team-server teams cluster-test
 .DEFAULT_GOAL := repro
 
@@ -44,12 +46,19 @@ repro: $(STAMP)
 	$(BIN)/reskin scenes check
 	$(BIN)/dvc repro
 	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage publish if all results equal those in dvc.lock
-	@$(BIN)/reskin compare || true # compares with the committed reports; your own scenes have none
+	@$(BIN)/reskin summary
 
 # Three workers, for two cores or more: tests of live boards mostly wait.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 lint compiled
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+
+test-pythons:
+	@for version in $(PYTHONS); do \
+		if python$$version -c '' 2>/dev/null; then \
+			$(MAKE) --no-print-directory test PYTHON=python$$version VENV=.venv-$$version || exit 1; \
+		else echo "python$$version is not installed: not tested"; fi; \
+	done
 
 # Trains tiny networks on processors that QEMU emulates: weights must equal those from this processor. Needs qemu-user.
 test-processors: $(STAMP)
@@ -115,4 +124,4 @@ readme: $(STAMP)
 	$(BIN)/reskin readme
 
 clean:
-	rm -rf $(VENV) .audit build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) .venv-* .audit build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

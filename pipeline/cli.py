@@ -245,6 +245,16 @@ def compare(
 
 
 @app.command(rich_help_panel=PIPELINE)
+def summary(
+    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
+) -> None:
+    """Print the main scores, whether they equal the committed ones, and where to look next."""
+    from pipeline.manage.summary import print_summary
+
+    print_summary(ROOT, [scene] if scene else list(checked_plan().scenes), typer.echo)
+
+
+@app.command(rich_help_panel=PIPELINE)
 def score(
     predictions: Annotated[Path, Argument(help="A .csv or .parquet file in the format of docs/benchmark.md.")],
     enter: Annotated[

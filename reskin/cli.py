@@ -21,7 +21,7 @@ from reskin.errors import ParamsError, ReskinError, explaining
 
 CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
     "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes", "score",
-    "verify-reports",
+    "summary", "verify-reports",
 )  # fmt: skip
 
 BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (

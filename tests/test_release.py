@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from pipeline.cli import app as checkout
 from release import constraints
@@ -129,6 +130,19 @@ def test_version_is_the_same_everywhere():
     top = re.search(r"^## (\S+) \((\S+)\)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert (citation["version"], citation["date-released"]) == top.groups()
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+
+
+def test_supported_versions_of_python_are_the_same_everywhere():
+    classified = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
+    (made,) = re.findall(r"^PYTHONS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    workflow = read_yaml(ROOT / ".github/workflows/test.yml")
+    assert made.split() == workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == classified
+    supported = SpecifierSet(PROJECT["requires-python"])
+    assert [f"3.{minor}" for minor in range(9, 20) if f"3.{minor}" in supported] == classified
+    (container,) = re.findall(
+        r"^FROM python:(3\.\d+)", (ROOT / "deploy/Containerfile").read_text("utf-8"), re.MULTILINE
+    )
+    assert container in classified
 
 
 def test_licences_are_compatible():

@@ -252,12 +252,17 @@ def _parse_cell(cell: str) -> int | float | str:
     return cell
 
 
-def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -> int:
-    """Print how the reports of two runs differ, with a summary last; return 0 if all values are equal, else 1."""
-    parts = {
+def compare_reports(committed: Report, fresh: Report) -> dict[str, Comparison]:
+    """Compare numbers.json and the cells of tables of two reports."""
+    return {
         "numbers.json": compare(committed.numbers, fresh.numbers),
         "tables": compare(committed.tables, fresh.tables),
     }
+
+
+def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -> int:
+    """Print how the reports of two runs differ, with a summary last; return 0 if all values are equal, else 1."""
+    parts = compare_reports(committed, fresh)
     values = f"{sum(part.compared_n for part in parts.values()):,} values"
     if all(part.reproduced for part in parts.values()):
         by_part = " and ".join(f"{part.compared_n:,} of {name}" for name, part in parts.items())

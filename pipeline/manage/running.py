@@ -12,7 +12,7 @@ LOCK, RWLOCK = "lock", "rwlock"  # DVC locks file `lock` between stages, and lis
 
 def require_idle(root: Path) -> None:
     """Raise `ParamsError` if DVC runs in this checkout."""
-    users = _users(root / DVC_FILES / RWLOCK)
+    users = dvc_processes(root)
     if users:
         pid = min(users)
         raise ParamsError(
@@ -23,17 +23,18 @@ def require_idle(root: Path) -> None:
         raise ParamsError("`dvc repro` runs in this checkout. Nothing was changed: try again when it has ended.")
 
 
-def _users(rwlock: Path) -> set[int]:
-    """Return the ids of running processes in DVC's file `rwlock`, which may also list processes that were killed."""
+def dvc_processes(root: Path) -> dict[int, str]:
+    """Return the command of each DVC process that runs a stage in this checkout, by the id of the process."""
     try:
-        content = io.read_json(rwlock)
+        content = io.read_json(root / DVC_FILES / RWLOCK)
     except SchemaError:  # the file is missing, or broken, in which case DVC itself does not run
-        return set()
+        return {}
     entries = [
         *content.get("write", {}).values(),
         *(user for users in content.get("read", {}).values() for user in users),
     ]
-    return {entry["pid"] for entry in entries if _is_alive(entry["pid"])}
+    # The file may also list processes that were killed.
+    return {entry["pid"]: entry["cmd"] for entry in entries if _is_alive(entry["pid"])}
 
 
 def _is_alive(pid: int) -> bool:

@@ -39,6 +39,7 @@ from pipeline.report.numbers import (
     sweep_curves,
 )
 from pipeline.report.page import index, page, run_page
+from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, table_2_summary, table_texts
 from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.settings import Settings
@@ -99,9 +100,11 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     write_index(reports.parent)
-    if numbers.get("table2"):
-        say(f"{name} ({source})\n{to_markdown(table_2_summary(numbers))}")
-    say(f"{name}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
+    for line in (
+        *summarise(numbers),
+        f"{name}: open {reports}/index.html in a browser; numbers and tables are beside it",
+    ):
+        say(line)
 
 
 @dataclass(frozen=True)

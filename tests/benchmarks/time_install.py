@@ -9,6 +9,7 @@ printed as JSON. Packages come from pip's index or cache.
 import argparse
 import json
 import os
+import resource
 import shutil
 import socket
 import subprocess
@@ -39,9 +40,9 @@ def page_loads(url: str) -> bool:
         return False
 
 
-def seconds_to_page(reskin: Path, folder: Path) -> float:
-    """Start `reskin live` on a simulated skin; return the seconds until its page loads."""
-    port, begun_s = free_port(), time.monotonic()
+def seconds_to_page(reskin: Path, folder: Path) -> dict[str, float]:
+    """Start `reskin live` on a simulated skin; return the wall and CPU seconds until its page loads."""
+    port, begun_s, before = free_port(), time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     command = [str(reskin), "live", "--emulate", "nominal", "--http-port", str(port)]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
@@ -50,10 +51,13 @@ def seconds_to_page(reskin: Path, folder: Path) -> float:
             if process.poll() is not None or time.monotonic() - begun_s > PAGE_S:
                 sys.exit(f"{' '.join(command)}: the page did not load within {PAGE_S:g} s")
             time.sleep(0.05)
-        return round(time.monotonic() - begun_s, 1)
+        wall_s = time.monotonic() - begun_s
     finally:
         process.terminate()
         process.wait()
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1)}
 
 
 def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, object]:
@@ -75,7 +79,7 @@ def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, obj
         "venv": environment, "wheel": built, "install": installed,
         "wheel_MB": round(wheel.stat().st_size / 1e6, 1), "environment_MB": size_MB(folder / "venv"),
         "packages_n": len(packages), "load_1min": round(os.getloadavg()[0], 1),
-        "page_s": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],
+        "pages": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],
     }  # fmt: skip
 
 

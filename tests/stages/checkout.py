@@ -35,7 +35,7 @@ def copy_checkout(folder: Path) -> Path:
     compile_modules()
     folder.mkdir(parents=True, exist_ok=True)
     for path in ROOT.iterdir():
-        if path.name in NOT_COPIED or path.name.endswith(".egg-info"):
+        if path.name in NOT_COPIED or path.name.endswith(".egg-info") or path.name.startswith(".venv-"):
             continue
         if path.is_dir():
             shutil.copytree(path, folder / path.name, ignore=shutil.ignore_patterns("cache", "tmp", *TEST_BYTECODE))

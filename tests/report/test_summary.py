@@ -1,0 +1,108 @@
+"""Tests of the summary of a scene for a terminal."""
+
+import subprocess
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.cli import app
+from pipeline.report.paper import TABLE_2
+from pipeline.report.summary import summarise
+from reskin import io
+from tests.stages.checkout import ROOT
+
+SCENES = sorted(file.parent.name for file in (ROOT / "reports").glob("*/numbers.json"))
+
+
+def numbers_of(scene: str) -> dict:
+    return io.read_json(ROOT / f"reports/{scene}/numbers.json")
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_summary_fits_a_terminal_and_names_the_kind_of_data(scene):
+    lines = summarise(numbers_of(scene))
+    assert len(lines) <= 12
+    assert max(map(len, lines), default=0) <= 100
+    assert not lines or lines[0].lower().startswith(numbers_of(scene)["provenance"]["source"])
+
+
+def test_simulated_scores_stand_beside_those_of_the_paper():
+    lines = summarise(numbers_of("quick"))
+    row = next(line for line in lines if "multi-sensor  " in line)
+    for metric, (mean, _) in TABLE_2["multi"].items():
+        assert f"({mean:.0f})" in row or f"({mean:.2f})" in row, metric
+    assert f"{numbers_of('quick')['table2']['multi']['accuracy_pct']['mean']:.0f} (" in row
+
+
+def test_recorded_scores_stand_alone():
+    row = {"accuracy_pct": {"mean": 50.0, "n": 2}, "mse_f_N2": {"mean": 1.0, "n": 2}}
+    lines = summarise({"provenance": {"source": "recorded"}, "table2": {"multi": row}})
+    assert "(" not in "".join(lines)
+    assert any("50" in line and "–" in line for line in lines)  # an unknown score is a dash
+
+
+def test_final_model_of_recorded_boards_is_named():
+    model = {"file": "data/models/mine/final/final.safetensors", "boards_n": 3}
+    row = {"accuracy_pct": {"mean": 50.0, "n": 2}}
+    for source, named in (("recorded", True), ("simulated", False)):
+        lines = summarise({"provenance": {"source": source}, "table2": {"multi": row}, "final_model": model})
+        assert (model["file"] in lines[-1]) is named
+
+
+def test_methods_with_labels_are_shown_with_the_fewest_and_the_most():
+    def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
+        scores = {"accuracy_pct": {"mean": accuracy_pct}, "r2_f": {"mean": accuracy_pct / 100}}
+        return {"method": method, "inputs": "raw", "labels_n": labels_n, "as_labelled": scores}
+
+    rows = [row(name, n, 40.0 + n) for name in ("network", "ridge", "universal map", "universal") for n in (0, 5, 10)]
+    lines = summarise({"provenance": {"source": "recorded"}, "labels": rows})
+    assert [line.split()[0] for line in lines[3:5]] == ["universal", "network"]
+    assert lines[3].split()[1:] == ["40", "50", "0.40", "0.50"]
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """Create a git checkout with a committed report of scene quick, change to it, and return its folder."""
+    provenance = {"git": "abc", "trained": "abc", "versions": {"torch": "1"}, "seconds": 1.0}
+    io.write_json(tmp_path / "reports/quick/numbers.json", numbers_of("quick"))
+    io.write_json(tmp_path / "reports/quick/provenance.json", provenance)
+    author = ("-c", "user.name=a", "-c", "user.email=a@b")
+    for arguments in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"]):
+        subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def change(checkout, file: str, **values) -> None:
+    path = checkout / "reports/quick" / file
+    io.write_json(path, io.read_json(path) | values)
+
+
+def run(scene: str) -> str:
+    done = CliRunner().invoke(app, ["summary", scene])
+    assert done.exit_code == 0, done.output
+    assert len(done.output.splitlines()) <= 24
+    assert max(map(len, done.output.splitlines())) <= 100
+    return " ".join(done.output.split())
+
+
+def test_equal_report_is_called_reproduced_only_if_it_was_computed_again(checkout):
+    assert "it was not computed again" in run("quick")
+    change(checkout, "provenance.json", seconds=2.0)
+    assert "Scene quick is reproduced: all " in run("quick")
+
+
+def test_differences_are_counted_with_probable_reasons(checkout):
+    scores = numbers_of("quick")["table2"]
+    scores["multi"]["accuracy_pct"]["mean"] *= 0.5
+    change(checkout, "numbers.json", table2=scores)
+    change(checkout, "provenance.json", versions={"torch": "2"})
+    output = run("quick")
+    assert "not reproduced exactly: 1 (by up to 50 %; 0 verdicts changed) of " in output
+    assert "package torch 2 (committed: 1)" in output
+
+
+def test_uncommitted_and_missing_reports_are_named(checkout):
+    (checkout / "reports/quick").rename(checkout / "reports/mine")
+    assert "Scene mine: its report is not committed" in run("mine")
+    assert "Scene other: no results yet. Run: dvc repro report@other" in run("other")
