@@ -60,12 +60,16 @@ def new(
             "Default: the paper's, written into the scene's file for you to edit."
         ),
     ] = None,
+    simulated: Annotated[
+        bool, Option("--simulated", help="For recordings of emulated boards (`reskin record --simulated`).")
+    ] = False,
 ) -> None:
     """Write a scene for two or more boards of your own, each of which is held out in turn."""
     from pipeline.manage import new as creating
 
     names = [name.strip() for name in boards.split(",") if name.strip()]
-    for step in creating.new(ROOT, scene, names, presses_n, passes_n, layout)[1]:
+    source: Source = "simulated" if simulated else "recorded"
+    for step in creating.new(ROOT, scene, names, presses_n, passes_n, layout, source)[1]:
         typer.echo(step)
 
 

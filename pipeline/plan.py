@@ -34,7 +34,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
-        if scene.source == "recorded" and not captures[name]:
+        if scene.simulate is None and not captures[name]:
             remedy = f"Try: reskin add RECORDING --scene {name} ..."
             raise ParamsError(f"scene {name} has no recorded captures. {remedy}")
     many = [name for name in scenes if len(captures[name]) > MANY_N]

@@ -66,7 +66,10 @@ class Simulation(Strict):
 
 
 class Scene(Strict, extra="allow"):
-    """A scene: recorded or simulated captures, the experiments to run on them, and the settings of each experiment."""
+    """A scene: recorded or simulated captures, the experiments to run on them, and the settings of each experiment.
+
+    A simulated scene has a section `simulate`, or consists of recordings of emulated boards that were added to it.
+    """
 
     source: Source
     seed: Seed
@@ -74,7 +77,7 @@ class Scene(Strict, extra="allow"):
     selection: Selection
     split: Split
     simulate: Simulation | None = None
-    boards: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None  # names of the boards of a recorded scene
+    boards: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None  # names of the boards of added recordings
 
     @property
     def entries(self) -> list[Experiment]:
@@ -149,12 +152,14 @@ class Scene(Strict, extra="allow"):
         stage, _, part = unit.partition("-")
         if stage in {experiment.stage for experiment in EXPERIMENTS.values() if experiment.kind != "report"}:
             return stage in {experiment.stage for experiment in self.entries}
-        return not part or self.source == "recorded" or part in self.protocols
+        return not part or self.simulate is None or part in self.protocols
 
     @model_validator(mode="after")
     def _check_sections(self) -> "Scene":
-        if (self.simulate is not None) != (self.source == "simulated"):
-            raise ValueError("a scene has a section simulate if and only if its source is simulated")
+        if self.simulate is not None and self.source == "recorded":
+            raise ValueError("a recorded scene must not have a section simulate")
+        if self.simulate is None and self.source == "simulated" and self.boards is None:
+            raise ValueError("a simulated scene must have a section simulate, or key boards with the emulated boards")
         for experiment in self.entries:
             if missing := set(experiment.needs) - set(self.experiments):
                 raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")

@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
@@ -52,6 +53,11 @@ SCAN = (
     "note, which is written to the header."
 )
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
+BOARD_NAME = "With nominal: name of the simulated board. Each name gives another board, with another skin."
+ROBOT = (
+    "With nominal: a robot presses the skin at the paper's 65 places, twice, and appends times, places and forces to "
+    "this CSV file, for `reskin record --labels`."
+)
 SIMULATED = (
     "Mark the capture as simulated. Use it for a port of `reskin emulate`, which looks like that of a real board."
 )
@@ -214,16 +220,27 @@ def emulate(
     true_places: Annotated[
         bool, Option("--true-places", help="Print the true place and force of each simulated touch.")
     ] = False,
+    board: Annotated[str | None, Option(help=BOARD_NAME)] = None,
+    robot: Annotated[Path | None, Option(help=ROBOT)] = None,
 ) -> None:
     """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""
-    from reskin.live.emulator import TouchPrinter, inject, make_port, parse_fault, play, read_script
+    from reskin.live.emulator import RobotLog, TouchPrinter, inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
     _announce_simulation(source)
-    script = read_script(source)
+    script = read_script(source, board=board, robot=robot is not None)
     for spec in faults:
         script = inject(script, spec)
-    on_sent = TouchPrinter(script, source, typer.echo) if true_places else lambda piece_i: None
+    listeners: list[Callable[[int], None]] = []
+    if true_places:
+        listeners.append(TouchPrinter(script, source, typer.echo))
+    if robot is not None:
+        listeners.append(RobotLog(script, robot, speed))
+
+    def on_sent(piece_i: int) -> None:
+        for listener in listeners:
+            listener(piece_i)
+
     emulated, stop = make_port(port), threading.Event()
     typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C: stop")
     started_s = time.monotonic()

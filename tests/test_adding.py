@@ -13,6 +13,7 @@ from pipeline import PLAN, SCENES, plan
 from pipeline.cli import app
 from pipeline.experiments.compare import Compare
 from pipeline.manage import add
+from pipeline.manage import new as creating
 from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_scene
 from pipeline.settings import read_settings
@@ -285,14 +286,31 @@ def probe_log(frame_s: float = 1 / 400) -> ProbeLog:
     )  # fmt: skip
 
 
-def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary")) -> Path:
+def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary"), source: str = "recorded") -> Path:
     header = make_header(
-        capture=folder.name, layout="native", wire="binary", chips_n=2,
+        capture=folder.name, layout="native", wire="binary", chips_n=2, source=source,
         clock=Clock(kind="rate", rate_hz=400.0, marks=((0.0, 0.0),)),
     )  # fmt: skip
     files = {"stream.bin": stream, "probe.csv": probe.render(probe_log()).encode()}
     write_capture(folder, header, files)
     return folder
+
+
+def test_recording_cannot_join_a_scene_that_simulates_its_captures(root, tmp_path):
+    folder = native_folder(tmp_path / "run1", source="simulated")
+    prepared = preparing.native(folder, labels(), None, ())
+    assert_refused(root, lambda: add.add(root, "ci", prepared, allow_copy=False), "ci simulates its own captures")
+
+
+def test_recording_of_an_emulated_board_joins_a_scene_for_such_boards(root, tmp_path):
+    folder = native_folder(tmp_path / "run1", source="simulated")
+    creating.new(root, "emulated", ["board1", "b2"], 4, 1, "reskin", "simulated")
+    prepared = preparing.native(folder, labels(), None, ())
+    header = add.add(root, "emulated", prepared, allow_copy=False)
+    assert header.source == read_scene(root, "emulated").source == "simulated"
+    planned = config.read_yaml(root / PLAN)
+    assert planned["stages"]["ingest"] == {"emulated-run1": {"scene": "emulated", "capture": "run1"}}
+    assert planned["stages"]["simulate"] == {}
 
 
 def test_native_capture_keeps_its_header(root, tmp_path):

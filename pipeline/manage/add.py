@@ -44,10 +44,12 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     remedy = f"To create it: reskin new {scene} --boards ..., or add --like ini."
     settings = read_scene(root, plan.scene_file(root, scene, remedy=remedy).stem)
     if settings.source != header.source:
-        remedy = "Choose a scene of the same source"
-        if header.source == "recorded":
-            remedy += ", or create one: --scene NEW --like ini"
+        create = "--scene NEW --like ini" if header.source == "recorded" else "reskin new NEW --boards ... --simulated"
+        remedy = f"Choose a scene of the same source, or create one: {create}"
         raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
+    if settings.simulate is not None:
+        remedy = "Create a scene for recordings of emulated boards: reskin new NAME --boards ... --simulated."
+        raise ParamsError(f"scene {scene} simulates its own captures, so none can be added. {remedy}")
     if settings.boards is not None and header.board not in settings.boards:
         guess, known = did_you_mean(header.board, settings.boards), ", ".join(settings.boards)
         remedy = f"Correct the name, or add it to key boards of {plan.scene_file(root, scene)}."

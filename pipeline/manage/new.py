@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline import SCENES
 from pipeline.plan import scene_names
-from pipeline.scenes import read_scene
+from pipeline.scenes import Source, read_scene
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.recordings.header import NAME
@@ -18,7 +18,7 @@ LABELS_N = (0, 5, 10, 20, 40)
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\
 # Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/parameters.md explains the keys.
-source: recorded
+source: {source}
 boards: [{boards}] # `reskin add` accepts only these names
 seed: 2021
 # Experiments may be removed from this list; their settings may stay in this file.
@@ -82,13 +82,13 @@ ONE_BOARD = (
 
 
 def new(
-    root: Path, scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None
+    root: Path, scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None, source: Source
 ) -> tuple[Path, list[str]]:
     """Write `pipeline/scenes/<scene>.yaml`; return its path, and sentences on what to do next.
 
     boards: names of two or more boards. presses_n: indentations of each skin in one pass; with two passes or more, the
     scene also adapts networks. layout: a layout of the project, a YAML file whose text is copied, or None for the
-    layout of the paper's board as a text to edit.
+    layout of the paper's board as a text to edit. source: "simulated" for recordings of emulated boards.
 
     Raises
     ------
@@ -104,24 +104,29 @@ def new(
     if scene in scene_names(root):
         raise ParamsError(f"{root / SCENES / scene}.yaml exists. Choose another name, or edit this file.")
     file = root / SCENES / f"{scene}.yaml"
-    io.write_text(file, scene_text(scene, boards, presses_n, passes_n, layout))
+    io.write_text(file, scene_text(scene, boards, presses_n, passes_n, layout, source))
     try:
         experiments = read_scene(root, scene).experiments
     except BaseException:
         io.remove(file)
         raise
-    return file, _next_steps(file.relative_to(root), scene, layout, experiments)
+    return file, _next_steps(file.relative_to(root), scene, layout, experiments, source)
 
 
-def scene_text(scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None) -> str:
+def scene_text(
+    scene: str, boards: Sequence[str], presses_n: int, passes_n: int, layout: str | None, source: Source = "recorded"
+) -> str:
     """Return the text of the scene's file; see `new`."""
     given = paper_layout() if layout is None else read_layout(layout)
     fits, adapted = layout is not None and is_shipped(given), passes_n > 1
     model = SHIPPED if fits else f"{scene}.safetensors"
-    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit", "compare"]
+    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit"]
+    # Experiment compare compares recorded fields with simulated ones.
+    experiments += ["compare"] * (source == "recorded")
     pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
     return TEMPLATE.format(
-        scene=scene, boards=", ".join(boards), experiments=", ".join(experiments + ["calibrated"] * fits),
+        scene=scene, source=source, boards=", ".join(boards),
+        experiments=", ".join(experiments + ["calibrated"] * fits),
         transfer_n=max(1, len(boards) // 2), pool_n=pool_n, pool_passes=POOL_PASSES if adapted else "",
         adapt=ADAPT.format(pokes_n=presses_n) if adapted else "", labels_n=[n for n in LABELS_N if n <= pool_n],
         model=model, about_model="" if fits else ABOUT_MODEL.format(file=f"{SCENES}/{scene}.yaml", model=model),
@@ -147,13 +152,15 @@ def _layout_text(layout: str | None, scene: str) -> str:
     return "".join(f"\n    {line}" if line.strip() else "\n" for line in lines)
 
 
-def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequence[str]) -> list[str]:
+def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequence[str], source: Source) -> list[str]:
     steps = [f"wrote {file}"]
     if "adapt" not in experiments:
         steps.append("left out: adapt, which needs recordings with --passes 2 or more")
     if "calibrated" not in experiments:
         steps.append("left out: calibrated, which needs a universal model for your layout (the file says how)")
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
+    if source == "simulated":
+        add = f"reskin add captures/BOARD_SKIN ... --layout capture --scene {scene}"
     if layout is None:
         steps.append("next: describe your boards in this file, key layout of section compare: it has the paper's board")
     return [*steps, f"then: {add}" if layout is None else f"next: {add}"]

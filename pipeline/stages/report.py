@@ -169,7 +169,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
         **{entry.key: experiments[entry.key] for entry in scene.entries if entry.key in experiments},
         "runtime": runtime,
     }  # fmt: skip
-    if scene.source == "simulated":
+    if scene.simulate is not None:
         losses = {name: result["losses"] for name, result in inputs.analyses.items()}
         numbers["capture_by_protocol"] = lost_by_protocol(losses)
     if "choice" in scene.experiments:

@@ -25,6 +25,7 @@ from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_
 from reskin.board.stream import decode_all
 from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
+from reskin.data.grid import points_mm
 from reskin.errors import CaptureError, ParamsError
 from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Source
 from reskin.recordings.ingest import read_header, timer
@@ -32,11 +33,19 @@ from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 from reskin.simulation.capture import SimulatedCapture, list_captures, simulate_capture
 from reskin.simulation.defaults import NOMINAL, SHARED, nominal
+from reskin.simulation.protocols import LIFTED_MM, Plan, Walk
 from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
 SEED = 2021  # default seed of a simulation, if the scene's YAML file has none
 TOUCH_PROTOCOL = "log"  # touches with pauses between them, similar to manual use
+
+ROBOT_PASSES_N = 2  # passes of an emulated robot over the 65 places of the grid
+# Times of an emulated robot for each press: above the skin, moving down or up, and pressing. Before the first press, it
+# waits ROBOT_QUIET_S, because the first frames are lost if the port is opened late.
+LIFTED_S, MOVING_S, PRESSING_S, ROBOT_QUIET_S = 0.12, 0.02, 0.1, 4.0
+ROBOT_RATE_HZ = 100.0
+AT_REST = 0.999  # an emulated robot is at rest while the force is at least this fraction of the force of the press
 
 START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
@@ -75,6 +84,7 @@ class Script:
     unplugged_s: dict[int, float] = field(default_factory=dict)
     # True x_mm, y_mm and F_N of each frame; NaN without contact. None if the true contacts are unknown.
     true_contacts: Float64[np.ndarray, "f 3"] | None = None
+    presses_per_pass_n: int | None = None  # if a robot presses the skin
 
     def __len__(self) -> int:
         return len(self.pieces)
@@ -85,18 +95,24 @@ class Script:
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
-def read_script(source: str) -> Script:
+def read_script(source: str, *, board: str | None = None, robot: bool = False) -> Script:
     """Create a script from a recorded capture or from a simulation.
 
-    `source` is the folder of a capture, `nominal` (the nominal skin), or the YAML file of a scene with a section
-    `simulate`.
+    Parameters
+    ----------
+    source : folder of a capture, `nominal` (the nominal skin), or the YAML file of a scene with a section `simulate`
+    board : name of a nominal board: each name gives another board, with another skin; default: the first one
+    robot : whether a robot presses the nominal skin on the grid, instead of touches at random places
     """
     folder = Path(source)
+    if (board is not None or robot) and source != NOMINAL_SOURCE:
+        raise ParamsError(f"{source}: --board and --robot are only for {NOMINAL_SOURCE}. Omit them.")
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
     if source == NOMINAL_SOURCE:
         settings = read_yaml(NOMINAL)
-        return simulate({name: settings[name] for name in ("boards", "protocols")}, SEED, source)
+        section = {name: settings[name] for name in ("boards", "protocols")}
+        return simulate(section, SEED, source, board=board, robot=robot)
     if folder.suffix == ".yaml" and folder.is_file():
         scene = read_yaml(folder)
         if not isinstance(scene, dict) or "simulate" not in scene:
@@ -131,18 +147,49 @@ def read_capture(folder: Path) -> Script:
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
 
-def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
-    """Create a script by simulating the first skin of a scene's section `simulate`.
+class RobotPresses(Walk):
+    """Presses of an emulated robot: passes over the grid in random order, in one recording as of protocol `walk`."""
 
-    The protocol is `log` if the section has it, or else the scan over a grid of places.
+    def plan(self, rng: np.random.Generator, skin_mm: tuple[float, float]) -> Plan:
+        """Draw the order of the places and the depth of each press; each frame is a stop, as in a walk."""
+        lifted_n, moving_n, pressing_n = (round(s * self.rate_hz) for s in (LIFTED_S, MOVING_S, PRESSING_S))
+        ramp = np.arange(1, moving_n + 1) / (moving_n + 1)
+        share = np.concatenate([ramp, np.ones(pressing_n), ramp[::-1]])
+        place_mm = np.concatenate([rng.permutation(points_mm()) for _ in range(self.steps_n)])
+        depth_mm = rng.uniform(*self.depth_mm, size=len(place_mm))
+        lifted_mm = np.full((len(place_mm), lifted_n), LIFTED_MM)
+        frames_mm = np.hstack([depth_mm[:, None] * share, lifted_mm])
+        x_mm, y_mm = place_mm.repeat(frames_mm.shape[1], axis=0).T[:, None]
+        description = f"an emulated robot, {self.steps_n} passes over {len(points_mm())} places in random order"
+        return Plan(
+            np.zeros(1, np.int32), x_mm, y_mm, frames_mm.reshape(1, -1), np.zeros((1, 2)), description
+        )  # fmt: skip
+
+
+def simulate(
+    section: Mapping[str, Any], seed: int, where: str, *, board: str | None = None, robot: bool = False
+) -> Script:
+    """Create a script by simulating a skin of a scene's section `simulate`.
+
+    The protocol is `log` if the section has it, or else the scan over a grid of places. `board` is the name of the
+    board; by default, it is the first one. With `robot`, the touches of protocol `log` are replaced by presses of a
+    robot.
     """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
-    board, skin = list_captures(simulation, protocol)[0]
-    capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
+    if robot:
+        touches = simulation.protocols[TOUCH_PROTOCOL]
+        changes = {"steps_n": ROBOT_PASSES_N, "rate_hz": ROBOT_RATE_HZ, "quiet_s": ROBOT_QUIET_S}
+        presses = RobotPresses(**dict(touches) | changes)
+        simulation = simulation.model_copy(update={"protocols": {**simulation.protocols, TOUCH_PROTOCOL: presses}})
+    first_board, skin = list_captures(simulation, protocol)[0]
+    if board is not None:
+        skin = f"{board}_s1"
+    capture = simulate_capture(simulation, protocol, board=board or first_board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
-    return replace(script, true_contacts=true_contacts_of(capture))
+    presses_n = len(points_mm()) if robot else None
+    return replace(script, true_contacts=true_contacts_of(capture), presses_per_pass_n=presses_n)
 
 
 def true_contacts_of(capture: SimulatedCapture) -> Float64[np.ndarray, "f 3"] | None:
@@ -486,6 +533,51 @@ class EmulatedBoard:
             return (np.nan, np.nan, np.nan)
         x_mm, y_mm, force_N = self._true_contacts[self._sent_i].tolist()
         return x_mm, y_mm, force_N
+
+
+class RobotLog:
+    """Appends a row for each sent frame to a CSV file, as the program of a robot does for `reskin record --labels`.
+
+    Columns: `unix_s`, `phase` (`noload`, `moving` or `contact`), `pass_i`, `x_mm`, `y_mm`, `Fz_N`.
+    """
+
+    def __init__(self, script: Script, file: Path, speed: float = 1.0) -> None:
+        if script.true_contacts is None or script.presses_per_pass_n is None:
+            raise ParamsError(f"--robot: no robot presses the skin. Use {NOMINAL_SOURCE}.")
+        self._cells = _robot_cells(script.true_contacts, script.presses_per_pass_n)
+        self._due_s = script.t_s / speed
+        self._sent_i, self._last_s = -1, 0.0
+        self._stream = file.open("w", encoding="utf-8", buffering=1)  # a buffer of one line
+        self._stream.write("unix_s,phase,pass_i,x_mm,y_mm,Fz_N\n")
+
+    def __call__(self, piece_i: int) -> None:
+        if piece_i < self._sent_i:  # the script has restarted
+            self._sent_i = -1
+        now_s = time.time()
+        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent at once, but were due one after another
+            self._last_s = max(self._last_s, now_s - float(self._due_s[piece_i] - self._due_s[i]))
+            self._stream.write(f"{self._last_s:.6f},{self._cells[i]}\n")
+        self._sent_i = piece_i
+
+    def close(self) -> None:
+        self._stream.close()
+
+
+def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: int) -> list[str]:
+    """Return the cells of each frame after its time: phase, pass, place and force."""
+    contact = np.isfinite(true_contacts[:, 0])
+    edges = np.flatnonzero(np.diff(contact, prepend=False, append=False)).tolist()  # starts and ends in turn
+    cells = ["noload,0,,,"] * len(contact)
+    for press_i, (first, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
+        force_max_N = true_contacts[first:end, 2].max()
+        for i, (x_mm, y_mm, force_N) in enumerate(true_contacts[first:end].tolist(), first):
+            phase = "contact" if force_N >= AT_REST * force_max_N else "moving"
+            cells[i] = f"{phase},{press_i // presses_per_pass_n},{x_mm:g},{y_mm:g},{force_N:.4f}"
+        # The rows after a press have its pass, so that each no-load dwell is one run of rows.
+        following = edges[2 * press_i + 2] if 2 * press_i + 2 < len(edges) else len(contact)
+        pass_i = (press_i + 1) // presses_per_pass_n
+        cells[end:following] = [f"noload,{pass_i},,,"] * (following - end)
+    return cells
 
 
 class TouchPrinter:

@@ -12,10 +12,12 @@ import pytest
 
 from reskin.board.port import open_port, read_waiting
 from reskin.board.stream import decode_all
+from reskin.data.grid import points_mm
 from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.live.emulator import (
     LATE_MAX_S,
     EmulatedBoard,
+    RobotLog,
     TouchPrinter,
     inject,
     make_port,
@@ -24,6 +26,7 @@ from reskin.live.emulator import (
     read_script,
 )
 from reskin.recordings.header import LOG_FILE, Clock, write_capture
+from reskin.recordings.labels import DwellBuilder, SampleTable
 from reskin.recordings.readers.sd_card import render
 from tests.live.boards import RATE_HZ, make_script, write_script
 from tests.recordings.headers import make_header
@@ -305,3 +308,44 @@ def test_invalid_sources_raise(tmp_path):
         with pytest.raises(ReskinError, match="must be the folder of a capture|recorded, not simulated") as error:
             read_script(source)
         assert "Traceback" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def robot_script():
+    return read_script("nominal", board="b1", robot=True)
+
+
+class TestRobot:
+    @pytest.mark.parametrize("batch_n", [1, 7])
+    def test_rows_of_its_log_give_one_labelled_touch_for_each_place_and_pass(
+        self, robot_script, tmp_path, monkeypatch, batch_n
+    ):
+        clock = SimpleNamespace(s=0.0, time=lambda: clock.s)
+        monkeypatch.setattr("reskin.live.emulator.time", clock)
+        log = RobotLog(robot_script, tmp_path / "robot.csv")
+        for i in range(batch_n - 1, len(robot_script), batch_n):  # late frames are sent in batches
+            clock.s = 1e9 + robot_script.t_s[i]
+            log(i)
+        log.close()
+        dwells = list(DwellBuilder().feed(SampleTable("log").feed((tmp_path / "robot.csv").read_bytes())))
+        touches = [dwell for dwell in dwells if dwell.label.contact]
+        assert len(dwells) == 2 * len(touches)  # the rows after the last touch are not closed
+        for pass_i in range(2):
+            places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
+            assert sorted(places) == sorted(map(tuple, points_mm().tolist()))
+        for touch in touches:  # the label is the true contact at any time of the dwell
+            inside = (robot_script.t_s >= touch.t_start_s - 1e9) & (robot_script.t_s <= touch.t_end_s - 1e9)
+            true = robot_script.true_contacts[inside]
+            assert np.isfinite(true).all()
+            np.testing.assert_allclose(true[:, 2], touch.label.Fz_N, rtol=2e-3)
+
+    def test_boards_with_other_names_have_other_skins(self, robot_script):
+        other = read_script("nominal", board="b2", robot=True)
+        untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
+        assert np.abs(untouched[0] - untouched[1]).max() > 50  # uT
+
+    def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
+        write_script(SCRIPT, tmp_path / "c0")
+        for options in ({"board": "b1"}, {"robot": True}):
+            with pytest.raises(ParamsError, match="only for nominal"):
+                read_script(str(tmp_path / "c0"), **options)

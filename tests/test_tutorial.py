@@ -1,0 +1,58 @@
+"""Tests of docs/tutorial.md: its commands run, and print what the page shows."""
+
+import os
+
+import pytest
+
+from tests.benchmarks import FULL
+from tests.tutorial import PAGE, Done, Step, checkout_copy, differences, read_steps, run, shown, write
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
+    pytest.mark.timeout(3600),
+]
+
+
+def test_commands_of_the_page_print_its_outputs():
+    steps = [step for step in read_steps(PAGE.read_text(encoding="utf-8")) if FULL or not step.slow]
+    with checkout_copy() as folder:
+        wrong = [sentence for done in run(steps, folder) for sentence in differences(done)]
+    assert not wrong, "\n".join(wrong)
+
+
+PAGE_TEXT = """\
+<!-- until ready; within 5 % -->
+```sh
+serve
+```
+
+```text
+ready in 2.00 s
+```
+
+```python
+print(1)
+```
+"""
+
+
+def test_steps_have_options_and_outputs():
+    first, second = read_steps(PAGE_TEXT)
+    assert first == Step("sh", "serve\n", "ready in 2.00 s\n", {"until": "ready", "within": "5 %"})
+    assert second == Step("python", "print(1)\n", None)
+
+
+@pytest.mark.parametrize(("printed", "differs"), [("2.15", False), ("2.3", True), ("about 2", True)])
+def test_numbers_are_compared_with_a_tolerance_and_words_exactly(printed, differs):
+    first, _ = read_steps(PAGE_TEXT)
+    assert bool(differences(Done(first, f"ready in {printed} s\n"))) == differs
+
+
+def test_writing_replaces_only_outputs():
+    done = [Done(step, "new\n") for step in read_steps(PAGE_TEXT)]
+    assert write(PAGE_TEXT, done) == PAGE_TEXT.replace("ready in 2.00 s", "new")
+
+
+def test_shown_output_hides_the_folder_and_marks_what_is_left_out(tmp_path):
+    step = Step("sh", "", "", {"last": "1"})
+    assert shown(f"one\ntwo {tmp_path}/a\n", step, tmp_path) == "[...]\ntwo /home/me/reskin/a\n"
