@@ -221,8 +221,7 @@ def merge() -> None:
 def publish() -> None:
     """Write missing training runs and reports to MLflow, for example after its store was deleted or unreachable."""
     from pipeline.scenes import read_scene
-    from pipeline.stages.report import read_curves
-    from pipeline.tracking import publish as write
+    from pipeline.stages.report import published_results, write_scene
 
     for name in checked_plan().scenes:
         scene, results = read_scene(ROOT, name), ROOT / "data/results" / name
@@ -232,8 +231,8 @@ def publish() -> None:
         if missing:
             typer.echo(f"{name}: {missing[0].relative_to(ROOT)} not found; run dvc repro first")
             continue
-        counts = write(models, read_curves(scene, results), ROOT / "reports" / name, scene=name, root=ROOT)
-        typer.echo(f"{name}: MLflow runs {counts}")
+        folders = (ROOT / "data/indentations" / name, ROOT / "data/models" / name, results, ROOT / "reports" / name)
+        typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))
 
 
 @app.command(rich_help_panel=PIPELINE)

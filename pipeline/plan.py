@@ -73,7 +73,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
                 name: scenes[name].named_file(experiment.name) for name in items[experiment.stage]
             }
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
-    items |= {"report": list(scenes), "publish": list(scenes)}
+    items["report"] = list(scenes)
     return {
         "scenes": {name: list(scene.experiments) for name, scene in scenes.items()},
         "captures": captures,

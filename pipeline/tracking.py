@@ -9,38 +9,116 @@ import json
 import os
 import re
 import sqlite3
+import tempfile
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipeline.provenance import COSTS, SECONDS
 from pipeline.statistics import over_folds, tidy
+from pipeline.views import TRAIN_S, link, missing_tags
 from reskin import io
 from reskin.errors import ReskinError
+from reskin.metrics import METRICS
+
+if TYPE_CHECKING:
+    import numpy as np
 
 VARIABLE = "MLFLOW_TRACKING_URI"
+PUBLISH = "RESKIN_PUBLISH"  # environment variable; with the value 0, stages write nothing to MLflow
 SQLITE = "sqlite:///"
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
-LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
-LAYOUT = 2  # version of the content of MLflow runs; runs of older versions are written again
+CHAMPION = "champion"  # alias of the version of a registered model to use
+UNIVERSAL = "reskin-universal"  # registered name of the universal model
+UNIVERSAL_EXPERIMENT = "universal model"
+LAYOUT = 3  # version of the content of MLflow runs; runs of older versions are written again
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
 TIMEOUT_S = 2.0  # time in which an HTTP server must answer
 LOCK_TIMEOUT_S = 5.0  # how long to wait for a locked SQLite store; UIs and other writers lock it for much shorter
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
-# Keys of numbers.json that are not metrics of the report's run: run times, provenance, and values that other MLflow
-# runs contain.
-NOT_METRICS = {"provenance", "runtime", "described", "variants"}
+# Keys of numbers.json that are not metrics of a run: run times, provenance, counts of data, and values that other
+# MLflow runs contain.
+NOT_METRICS = {"provenance", "runtime", "described", "variants", "capture", "trainings"}
 
 # A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and the mean of
 # each metric.
 Point = tuple[str, int, Mapping[str, float]]
 Curves = Mapping[str, Sequence[Point]]
+
+
+class Span(NamedTuple):
+    """When something ran: Unix time of its start, and its duration."""
+
+    start_s: float
+    duration_s: float
+
+    @classmethod
+    def now(cls) -> "Span":
+        """Return a span of no duration, for a result whose time is unknown."""
+        return cls(time.time(), 0.0)
+
+    @property
+    def start_ms(self) -> int:
+        return round(1e3 * self.start_s)
+
+    @property
+    def end_ms(self) -> int:
+        return round(1e3 * (self.start_s + self.duration_s))
+
+
+@dataclass(frozen=True)
+class Times:
+    """When the training runs and the stages of a scene ran, as far as this checkout knows.
+
+    trainings: spans by stage and name of the training run. stages: spans by stage. by_key_s: seconds of training runs
+    by their key.
+    """
+
+    trainings: Mapping[tuple[str, str], Span] = field(default_factory=dict)
+    stages: Mapping[str, Span] = field(default_factory=dict)
+    by_key_s: Mapping[str, float] = field(default_factory=dict)
+
+
+def read_times(scene: str) -> Times:
+    """Read the times that stages recorded in the working directory; results of other machines have none."""
+    trainings, stages, by_key_s = {}, {}, {}
+    for file in sorted((SECONDS / scene).glob("*.json")):
+        for run in io.read_json(file):
+            if "started_s" in run:  # files of earlier versions lack it
+                trainings[file.stem, run["name"]] = Span(run["started_s"], run["train_s"])
+    for file in sorted((COSTS / scene).glob("*.json")):
+        cost, end_s = io.read_json(file), file.stat().st_mtime  # written when the stage ended
+        stages[file.stem] = Span(end_s - cost["seconds"], cost["seconds"])
+        by_key_s |= cost.get("trainings_s", {})
+    return Times(trainings, stages, by_key_s)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the stages of a scene wrote.
+
+    models: folders of models and model cards, by stage. curves: points of sweeps and experiments, by stage. reports:
+    folder of the scene's report. scores: mean scores of the paper's recipe, by stage. final: weights of the final
+    model. readings: tables of readings, for examples of a model's input.
+    """
+
+    models: Mapping[str, Path]
+    curves: Curves
+    reports: Path
+    scores: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    final: Path | None = None
+    readings: Sequence[Path] = ()
+    times: Times = field(default_factory=Times)
 
 
 class TrackingUnavailable(ReskinError):
@@ -52,6 +130,11 @@ class TrackingUnavailable(ReskinError):
 def server_uri() -> str | None:
     """Return the tracking server that the environment variable names; None if the embedded store is used."""
     return os.environ.get(VARIABLE) or None
+
+
+def publishing() -> bool:
+    """Return whether stages write to MLflow."""
+    return os.environ.get(PUBLISH) != "0"
 
 
 def tracking_uri(root: Path) -> str:
@@ -91,7 +174,7 @@ def _probe_sqlite(file: str) -> None:
         ) from None
 
 
-def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
+def publish(results: Results, *, scene: str, root: Path, register: bool = True) -> dict[str, int]:
     """Write every training run and the report of a scene to MLflow, each once.
 
     A sweep or an experiment is one MLflow run with metrics by step, because hundreds of child runs would hide the
@@ -99,14 +182,12 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 
     Parameters
     ----------
-    models
-        Folders of models and model cards, by stage.
-    curves
-        Points of sweeps and experiments, by stage.
-    reports
-        Folder of the scene's report.
+    results
+        Files of the scene.
     scene, root
         Name of the MLflow experiment; folder of the checkout.
+    register
+        Whether to register the scene's final model and the universal model, with alias `champion`.
 
     Returns
     -------
@@ -122,17 +203,39 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     uri = tracking_uri(root)
     probe(uri)
     cards = {
-        stage: {file: io.read_json(file) for file in sorted(folder.glob("*.json"))} for stage, folder in models.items()
+        stage: {file: io.read_json(file) for file in sorted(folder.glob("*.json"))}
+        for stage, folder in results.models.items()
     }
     trainings_n = sum(map(len, cards.values()))
     with _client(uri) as client:
-        publisher = Publisher(client, scene, root, runs_n=trainings_n)
+        publisher = Publisher(client, scene, root, results, runs_n=trainings_n)
         new_n = sum(publisher.write_trainings(stage, stage_cards) for stage, stage_cards in cards.items())
-        for stage, points in curves.items():
+        for stage, points in results.curves.items():
             publisher.write_curve(stage, points)
-        publisher.write_report(reports)
+        if results.final is not None and results.final.exists():
+            publisher.write_final(results.final, register=register)
+        publisher.write_report(results.reports)
         superseded_n = publisher.mark_superseded()
+        if register:
+            publish_universal(client, root)
         return {"new_n": new_n, "kept_n": trainings_n - new_n, "superseded_n": superseded_n}
+
+
+def publish_universal(client: Any, root: Path) -> None:
+    """Write and register the universal model that comes with the project."""
+    from reskin.universal.model import FILE
+
+    publisher = Publisher(client, UNIVERSAL_EXPERIMENT, root, Results({}, {}, root), runs_n=1)
+    publisher.write_universal(FILE, root / "reports/lab/numbers.json")
+    publisher.mark_superseded()
+
+
+def scores_link(scene: str, root: Path) -> str:
+    """Return the address of the view of the scores of a scene's training runs."""
+    with _client(tracking_uri(root)) as client:
+        server = server_uri() or ""
+        host = {"host": server} if server.startswith("http") else {}
+        return link(_experiment(client, scene, root), **host)
 
 
 class Publisher:
@@ -141,13 +244,27 @@ class Publisher:
     The tag `run_key`, a digest of a run's content, identifies the run.
     """
 
-    def __init__(self, client: Any, scene: str, root: Path, *, runs_n: int) -> None:
+    def __init__(self, client: Any, scene: str, root: Path, results: Results, *, runs_n: int) -> None:
         self.client = client
         self.scene = scene
+        self.results = results
         self.experiment_id = _experiment(client, scene, root)
         self.current: set[str] = set()
         self.limit_s = PATIENCE_S + PATIENCE_PER_RUN_S * runs_n
         self.end_s = time.monotonic() + self.limit_s
+
+    @cached_property
+    def marked(self) -> dict[str, Any]:
+        """The runs that were current before, by key; read at once, because single queries take 10 ms each."""
+        runs, token = [], None
+        while True:
+            page = self.client.search_runs(
+                [self.experiment_id], "tags.current = 'true'", max_results=1000, page_token=token
+            )
+            runs += page
+            token = page.token
+            if not token:
+                return {run.data.tags["run_key"]: run for run in runs}
 
     def find(self, stage: str, **tags: str) -> Any:
         """Return a stage's newest run with these tags; None if no run has them."""
@@ -156,7 +273,14 @@ class Publisher:
         return runs[0] if runs else None
 
     def open_run(
-        self, stage: str, key: str, *, name: str = "", parent: str = "", tags: Mapping[str, str] = MappingProxyType({})
+        self,
+        stage: str,
+        key: str,
+        span: Span,
+        *,
+        name: str = "",
+        parent: str = "",
+        tags: Mapping[str, str] = MappingProxyType({}),
     ) -> tuple[str, bool]:
         """Find or create the run with this key; return its id, and whether its content must still be written.
 
@@ -167,7 +291,7 @@ class Publisher:
                 f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` sends the rest."
             )
         self.current.add(key)
-        existing = self.find(stage, run_key=key)
+        existing = self.marked.get(key) or self.find(stage, run_key=key)
         current = {"current": "true"} | ({PARENT: parent} if parent else {})
         if existing and existing.info.status == "FINISHED":
             self.set_tags(existing, current)
@@ -175,7 +299,7 @@ class Publisher:
         if existing:
             self.client.delete_run(existing.info.run_id)
         all_tags = {"run_key": key, "stage": stage, "scene": self.scene, "kind": "stage", **current, **tags}
-        run = self.client.create_run(self.experiment_id, tags=all_tags, run_name=name or stage)
+        run = self.client.create_run(self.experiment_id, span.start_ms, tags=all_tags, run_name=name or stage)
         return str(run.info.run_id), True
 
     def set_tags(self, run: Any, tags: Mapping[str, str]) -> None:
@@ -184,64 +308,191 @@ class Publisher:
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
 
-    def log(self, run_id: str, rows: Iterable[tuple[str, float, int]], params: Mapping[str, Any] | None = None) -> None:
-        """Write metrics, given as rows (name, value, step), and parameters to a run."""
-        from mlflow.entities import Metric, Param
+    def log(
+        self,
+        run_id: str,
+        rows: Iterable[tuple[str, float, int]],
+        span: Span,
+        *,
+        params: Mapping[str, Any] | None = None,
+        tags: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write metrics, given as rows (name, value, step), parameters and tags to a run.
 
-        metrics = [Metric(name, value, 0, step) for name, value, step in rows]
+        The points of a curve are spread over the run's duration, in proportion to their steps.
+        """
+        from mlflow.entities import Metric, Param, RunTag
+
+        rows = list(rows)
+        last_step = max((step for _, _, step in rows), default=0) or 1
+        metrics = [
+            Metric(name, value, round(span.start_ms + 1e3 * span.duration_s * step / last_step), step)
+            for name, value, step in rows
+        ]
         texts = [Param(name, str(value)[:500]) for name, value in (params or {}).items()]
-        for start in range(0, len(metrics), METRICS_MAX_N):
-            self.client.log_batch(run_id, metrics[start : start + METRICS_MAX_N], texts if not start else ())
+        marks = [RunTag(name, value) for name, value in (tags or {}).items()]
+        for start in range(0, max(len(metrics), 1), METRICS_MAX_N):
+            first = not start
+            self.client.log_batch(
+                run_id, metrics[start : start + METRICS_MAX_N], texts if first else (), marks if first else ()
+            )
+
+    def end(self, run_id: str, span: Span) -> None:
+        """Mark a run as finished."""
+        self.client.set_terminated(run_id, end_time=span.end_ms)
 
     def write_trainings(self, stage: str, cards: Mapping[Path, dict[str, Any]]) -> int:
         """Write a stage's training runs as children of an MLflow run of the stage; return how many are new."""
+        scores = self.results.scores.get(stage, {})
         keys = [run_key(card) for card in cards.values()]
-        parent_key = hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]
-        parent_id, unwritten = self.open_run(stage, parent_key)
+        parent_key = _digest([*sorted(keys), scores, LAYOUT])
+        spans = [self.results.times.trainings[stage, file.stem] for file in cards if self._is_timed(stage, file)]
+        start_s = min((span.start_s for span in spans), default=time.time())
+        whole = Span(start_s, max((span.start_s + span.duration_s for span in spans), default=start_s) - start_s)
+        parent_id, unwritten = self.open_run(stage, parent_key, whole)
         new_n = sum(self.write_training(stage, parent_id, file, card) for file, card in cards.items())
         if unwritten:
-            means = []
-            for (experiment, recipe), rows in tidy(list(cards.values())).groupby(["question", "recipe"]):
-                for name, summary in over_folds(rows).items():
-                    means += [(f"{experiment}.{recipe}.{name}.{key}", value, 0) for key, value in summary.items()]
-            self.log(parent_id, means)
-            self.client.set_terminated(parent_id)
+            rows = [(name, value, 0) for name, value in scores.items()]
+            rows += [(TRAIN_S, sum(span.duration_s for span in spans), 0)] if spans else []
+            for (experiment, recipe), group in tidy(list(cards.values())).groupby(["question", "recipe"]):
+                means = {name: summary["mean"] for name, summary in over_folds(group).items()}
+                rows += [(f"{name}.{experiment}.{recipe}", value, 0) for name, value in means.items()]
+            self.log(parent_id, rows, whole)
+            self.end(parent_id, whole)
         return new_n
+
+    def _is_timed(self, stage: str, file: Path) -> bool:
+        return (stage, file.stem) in self.results.times.trainings
 
     def write_training(self, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
         """Write one training run: settings, scores, loss curve, datasets and model; return whether it is new."""
-        tags = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
-        tags |= {"cell": card["key"], "kind": "training"}
-        tags |= {"board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
-        tags |= {"mlflow.source.name": f"python -m pipeline {stage}", "mlflow.source.git.commit": card["git"]}
-        run_id, unwritten = self.open_run(stage, run_key(card), name=file.stem, parent=parent_id, tags=tags)
+        span = self.results.times.trainings.get((stage, file.stem), Span.now())
+        tags = {"cell": card["key"], "board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
+        tags |= {"mlflow.source.name": f"python -m pipeline {stage}"}
+        run_id, unwritten = self.open_run(
+            stage, run_key(card), span, name=file.stem, parent=parent_id, tags=_tags_of(card, "training") | tags
+        )
         if not unwritten:
             return False
-        settings = {"method": card["recipe_name"]}
-        settings |= {name: card[name] for name in ("question", "fold", "seed_i", "seed")} | card["recipe"]
-        settings |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
-        settings |= {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
-        metrics = [(name, value, 0) for name, value in card["scores"]["all"].items()]
-        metrics += [(f"registered_{name}", value, 0) for name, value in card["scores"]["registered"].items()]
-        metrics += [("train_loss", value, step) for step, value in enumerate(card["curve"])]
-        self.log(run_id, metrics, settings)
-        self.client.log_inputs(run_id, datasets=_datasets(card))
-        for artifact in (file, file.with_suffix(".safetensors")):
-            self.client.log_artifact(run_id, str(artifact), "model")
-        # File MLmodel names the loader and the file of the weights. MLflow reads it as YAML; JSON is valid YAML.
-        flavor = {"python_function": {"loader_module": LOADER, "data": f"{file.stem}.safetensors"}}
-        about = {"artifact_path": "model", "flavors": flavor, "run_id": run_id}
-        self.client.log_text(run_id, json.dumps(about, indent=2), "model/MLmodel")
-        self.client.set_terminated(run_id)
+        scores = card["scores"]
+        rows = [(name, value, 0) for name, value in scores["all"].items() if name in METRICS]
+        # One offset per board, subtracted from the places, does not change the scores of the force.
+        rows += [(f"registered_{name}", scores["registered"][name], 0) for name in METRICS[:2]]
+        rows += [(TRAIN_S, span.duration_s, 0)] if self._is_timed(stage, file) else []
+        self.write_model(run_id, file.with_suffix(".safetensors"), card, rows, span)
         return True
+
+    def write_model(
+        self, run_id: str, weights: Path, card: Mapping[str, Any], rows: Iterable[tuple[str, float, int]], span: Span
+    ) -> None:
+        """Write a trained network with its settings, loss curve and datasets, and metrics `rows`, to a run; end it."""
+        curve = zip(_curve_steps(card), card["curve"], strict=True)
+        rows = [*rows, *(("train_loss", value, step) for step, value in curve)]
+        about = self.write_artifacts(run_id, weights, self.example_uT(card["input"]["channels_n"]), span)
+        self.log(run_id, rows, span, params=_settings_of(card), tags=about)
+        self.client.log_inputs(run_id, datasets=_datasets(card))
+        self.end(run_id, span)
+
+    def write_artifacts(self, run_id: str, weights: Path, example_uT: "np.ndarray", span: Span) -> dict[str, str]:
+        """Write a model in MLflow's format to the artifacts of a run; return the tag that makes MLflow list it."""
+        from pipeline.pyfunc import FOLDER, write_model_files
+
+        created = datetime.fromtimestamp(span.end_ms / 1e3, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
+        with tempfile.TemporaryDirectory() as temporary:
+            about = write_model_files(Path(temporary), weights, example_uT, run_id=run_id, created=created)
+            self.client.log_artifacts(run_id, temporary, FOLDER)
+        listed = {name: about[name] for name in ("artifact_path", "flavors", "run_id", "utc_time_created")}
+        return {"mlflow.log-model.history": json.dumps([listed])}
+
+    @cached_property
+    def _read_example(self) -> "np.ndarray | None":
+        from pipeline.pyfunc import read_example
+
+        return read_example(self.results.readings)
+
+    def example_uT(self, channels_n: int) -> "np.ndarray":
+        """Return an example of a model's input; it has no rows if the scene's readings are not there."""
+        import numpy as np
+
+        example_uT = self._read_example
+        fits = example_uT is not None and example_uT.shape[1] == channels_n
+        return example_uT if fits else np.empty((0, channels_n))
+
+    def write_final(self, weights: Path, *, register: bool) -> None:
+        """Write the final model of a scene, which is trained on all boards; register it as `reskin-SCENE`.
+
+        Its scores are means over boards of the networks of the same recipe that were trained without the tested board.
+        """
+        card = io.read_json(weights.with_suffix(".json"))
+        train_s = self.results.times.by_key_s.get(card["key"])
+        stage = self.results.times.stages.get("train_multi", Span.now())
+        end_s = stage.start_s + stage.duration_s
+        span = Span(end_s - (train_s or 0.0), train_s or 0.0)
+        tags = {"mlflow.source.name": "python -m pipeline train_multi"}
+        run_id, unwritten = self.open_run(
+            "final", run_key(card), span, name="final", tags=_tags_of(card, "final") | tags
+        )
+        if unwritten:
+            by_board = list(card["held_out"].values())
+            known = [name for name in METRICS if by_board and all(name in scores for scores in by_board)]
+            rows = [(name, sum(scores[name] for scores in by_board) / len(by_board), 0) for name in known]
+            rows += [(TRAIN_S, train_s, 0)] if train_s is not None else []
+            self.write_model(run_id, weights, card, rows, span)
+        if register:
+            boards = ", ".join(card["train_boards"])
+            self.register(
+                f"reskin-{self.scene}", run_id, f"Network trained on all boards of scene {self.scene}: {boards}."
+            )
+
+    def write_universal(self, weights: Path, tested: Path) -> None:
+        """Write and register the universal model, with its scores on the recorded boards of scene lab.
+
+        The step of its metrics is the number of labelled presses that it was calibrated to.
+        """
+        from pipeline.pyfunc import simulated_example
+
+        card = io.read_json(weights.with_suffix(".json"))
+        labels = io.read_json(tested)["labels"] if tested.exists() else []
+        of_this = [row for row in labels if row["method"] == card["name"]]
+        rows = [
+            (name, row["as_labelled"][name]["mean"], row["labels_n"])
+            for row in sorted(of_this, key=lambda row: row["labels_n"])
+            for name in METRICS
+            if name in row["as_labelled"]
+        ]
+        seconds = float(sum(card["made_in_s"].values()))
+        span = Span(time.time() - seconds, seconds)
+        key = _digest([io.sha256(weights), io.sha256(weights.with_suffix(".json")), rows, LAYOUT])
+        run_id, unwritten = self.open_run(UNIVERSAL, key, span, name=UNIVERSAL, tags={"kind": "final"})
+        if unwritten:
+            about = self.write_artifacts(run_id, weights, simulated_example(), span)
+            texts = ("source", "tested_on", "not_for", "map", "network", "recorded_knowledge")
+            params = {name: card[name] for name in texts if name in card} | card["training"]
+            self.log(run_id, [*rows, (TRAIN_S, seconds, 0)], span, params=params, tags=about)
+            self.end(run_id, span)
+        self.register(UNIVERSAL, run_id, f"Model for any skin on the paper's board. Not for {card['not_for']}.")
+
+    def register(self, name: str, run_id: str, description: str) -> None:
+        """Register the model of a run as a version of `name`, and let alias `champion` refer to this version."""
+        from pipeline.pyfunc import FOLDER
+
+        found = self.client.search_registered_models(f"name = '{name}'")
+        model = found[0] if found else self.client.create_registered_model(name, description=description)
+        versions = self.client.search_model_versions(f"name = '{name}'")
+        version = next((existing.version for existing in versions if existing.run_id == run_id), None)
+        if version is None:
+            version = self.client.create_model_version(name, f"runs:/{run_id}/{FOLDER}", run_id).version
+        if str(model.aliases.get(CHAMPION)) != str(version):
+            self.client.set_registered_model_alias(name, CHAMPION, str(version))
 
     def write_curve(self, stage: str, points: Sequence[Point]) -> None:
         """Write the points of a sweep or an experiment as one MLflow run."""
-        run_id, unwritten = self.open_run(stage, _digest([stage, points]))
+        span = self.results.times.stages.get(stage, Span.now())
+        run_id, unwritten = self.open_run(stage, _digest([stage, points, LAYOUT]), span)
         if unwritten:
             rows = ((f"{curve}.{name}", value, step) for curve, step, means in points for name, value in means.items())
-            self.log(run_id, rows)
-            self.client.set_terminated(run_id)
+            self.log(run_id, rows, span)
+            self.end(run_id, span)
 
     def write_report(self, reports: Path) -> None:
         """Write the report's numbers and files to a run; its key depends on numbers, figures and tables, not on costs.
@@ -252,41 +503,55 @@ class Publisher:
         inputs = _digest(sorted(self.current))
         earlier = self.find("report", inputs=inputs)
         existing = key = None
-        metrics: list[tuple[str, float, int]] = []
+        span = self.results.times.stages.get("report", Span.now())
         if (reports / "numbers.json").exists():
-            metrics = metrics_of(io.read_json(reports / "numbers.json"))
+            numbers = io.read_json(reports / "numbers.json")
             files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
-            key = _digest([*metrics, *((file.name, io.sha256(file), 0) for file in files)])
+            key = _digest([*metrics_of(numbers), *((file.name, io.sha256(file), 0) for file in files), LAYOUT])
             existing = self.find("report", run_key=key)
         other_inputs = existing is not None and existing.data.tags.get("inputs") != inputs
         if earlier is not None and (key is None or other_inputs):
             self.set_tags(earlier, {"current": "true"})
             self.current.add(earlier.data.tags["run_key"])
         elif key is not None:
-            run_id, unwritten = self.open_run("report", key)
+            run_id, unwritten = self.open_run("report", key, span)
             if unwritten:
-                self.log(run_id, metrics)
-            self.client.set_tag(run_id, "inputs", inputs)
+                scores = reports / "scores.json"
+                self.log(run_id, metrics_of(io.read_json(scores)) if scores.exists() else (), span)
+            if existing is None or other_inputs:
+                self.client.set_tag(run_id, "inputs", inputs)
             self.client.log_artifacts(run_id, str(reports))  # always, because page texts and costs may have changed
-            self.client.set_terminated(run_id)
+            if unwritten:
+                self.end(run_id, span)
 
     def mark_superseded(self) -> int:
         """Set tag `current` of superseded runs to false, so that `tags.current = 'true'` shows each result once.
 
         Return the number of these runs.
         """
-        marked_n, token = 0, None
-        while True:
-            page = self.client.search_runs(
-                [self.experiment_id], "tags.current = 'true'", max_results=1000, page_token=token
-            )
-            for run in page:
-                if run.data.tags["run_key"] not in self.current:
-                    self.client.set_tag(run.info.run_id, "current", "false")
-                    marked_n += 1
-            token = page.token
-            if not token:
-                return marked_n
+        superseded = [run for key, run in self.marked.items() if key not in self.current]
+        for run in superseded:
+            self.client.set_tag(run.info.run_id, "current", "false")
+        return len(superseded)
+
+
+def _tags_of(card: Mapping[str, Any], kind: str) -> dict[str, str]:
+    named = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
+    return named | {"kind": kind, "mlflow.source.git.commit": card["git"]}
+
+
+def _settings_of(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a training run."""
+    settings = {"method": f"{card['question']}.{card['recipe_name']}"}
+    settings |= {name: card[name] for name in ("question", "fold", "seed_i", "seed")} | card["recipe"]
+    settings |= {name: card[name] for name in ("train_rows_n", "train_boards", "test_boards", "test_skins")}
+    return settings | {f"adapt_{name}": value for name, value in card.get("tuning", {}).get("settings", {}).items()}
+
+
+def _curve_steps(card: Mapping[str, Any]) -> list[int]:
+    """Return the training steps at which the points of the loss curve end; cards of earlier versions lack them."""
+    points_n = len(card["curve"])
+    return list(card.get("curve_steps", range(1, points_n + 1)))
 
 
 def run_key(card: Mapping[str, Any]) -> str:
@@ -327,12 +592,15 @@ def _client(uri: str) -> Iterator[Any]:
 def _experiment(client: Any, scene: str, root: Path) -> str:
     """Find or create the experiment of a scene; return its id."""
     existing = client.get_experiment_by_name(scene)
-    if existing is not None:
-        return str(existing.experiment_id)
-    location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
-    # With this kind of experiment, the UI shows training runs instead of chats.
-    kind = {"mlflow.experimentKind": "custom_model_development"}
-    return str(client.create_experiment(scene, artifact_location=location, tags=kind))
+    if existing is None:
+        location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
+        # With this kind of experiment, the UI shows training runs instead of chats.
+        kind = {"mlflow.experimentKind": "custom_model_development"}
+        existing = client.get_experiment(client.create_experiment(scene, artifact_location=location, tags=kind))
+    experiment_id = str(existing.experiment_id)
+    for name, value in missing_tags(existing.tags, experiment_id, existing.creation_time or 0):
+        client.set_experiment_tag(experiment_id, name, value)
+    return experiment_id
 
 
 def _datasets(card: Mapping[str, Any]) -> list[Any]:
@@ -359,10 +627,20 @@ def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
     """Flatten numbers.json to rows (name, value, step).
 
     A list of rows whose first key is a count becomes a curve over this count. Other lists, texts, costs and the content
-    of training runs are left out.
+    of training runs are left out, and so are counts.
     """
     published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
-    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0)]
+    rows = ((re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0))
+    return [(name, value, step) for name, value, step in rows if not _is_count(name)]
+
+
+def _is_count(name: str) -> bool:
+    """Return whether a metric is a count, such as `drift.skins_n`, or the number of values of a mean.
+
+    >>> [_is_count(name) for name in ("drift.skins_n", "table2.multi.r2_f.n", "table2.multi.mse_f_N2.mean")]
+    [True, True, False]
+    """
+    return any(part == "n" or part.endswith("_n") for part in name.split("."))
 
 
 def _flatten(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:

@@ -139,7 +139,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
     assert stale_stages(before, after) == {
-        "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # stages that read the numbers of all experiments
+        "repeat@ci", "table2@ci", "report@ci",  # stages that read the numbers of all experiments
         "contacts@ci",  # reads the whole scene file
     }  # fmt: skip
 
@@ -148,10 +148,10 @@ def test_edited_caption_reruns_the_report_and_edited_code_the_experiment(root, b
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
     with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
-    assert stale_stages(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # all tables are in one module
+    assert stale_stages(before, after) == {"table2@ci", "report@ci"}  # all tables are in one module
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
-    assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
+    assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci"}
 
 
 def test_comments_rerun_no_stage(root, before):

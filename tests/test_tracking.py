@@ -1,3 +1,4 @@
+import json
 import logging
 import shutil
 import socket
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 
 from pipeline import tracking
-from pipeline.tracking import TrackingUnavailable, probe, publish
+from pipeline.tracking import Results, Span, Times, TrackingUnavailable, metrics_of, probe, publish
+from pipeline.views import SCORES, VIEWS
 from reskin import io
 
 
@@ -55,8 +57,9 @@ def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -
         "seed_i": 0, "recipe": {"steps_n": 3, "inputs": "raw", "architecture": "paper"}, "train_rows_n": 4,
         "train_skins": ["b1_s0"], "train_boards": ["b1"], "test_boards": ["b0"],
         "test_skins": ["s0"],
-        "curve": [3.0, 2.0, 1.0],
-        "scores": {"all": {"accuracy_pct": accuracy_pct}, "registered": {"accuracy_pct": 60.0},
+        "curve": [3.0, 2.0, 1.0], "curve_steps": [16, 32, 48], "input": {"channels_n": 15},
+        "scores": {"all": {"accuracy_pct": accuracy_pct, "mse_xy_mm2": 2.0, "force_mean_N": 1.0},
+                   "registered": {"accuracy_pct": 60.0, "mse_xy_mm2": 1.0},
                    "by_skin": {}, "board_of": {}, "rows_n": 4},
     }  # fmt: skip
     io.write_json(models / f"{name}.json", card)
@@ -68,7 +71,13 @@ def write(root: Path, **keys: str) -> dict[str, int]:
     for name, key in keys.items():
         write_model(root / "models", name, key)
     write_report(root / "reports")
-    return publish({"train_multi": root / "models"}, {}, root / "reports", scene="ci", root=root)
+    return send(root, {"train_multi": root / "models"})
+
+
+def send(root: Path, models=None, curves=None, **options) -> dict[str, int]:
+    """Publish folders of models and curves by stage, and the report, to MLflow experiment `ci`."""
+    results = Results(models or {}, curves or {}, root / "reports", **options)
+    return publish(results, scene="ci", root=root, register=False)
 
 
 def write_report(reports: Path, accuracy_pct: float = 50.0, seconds: float = 1.0) -> None:
@@ -81,6 +90,7 @@ def write_report(reports: Path, accuracy_pct: float = 50.0, seconds: float = 1.0
         },
     }  # fmt: skip
     io.write_json(reports / "numbers.json", numbers)
+    io.write_json(reports / "scores.json", {"table2": {"multi": {"accuracy_pct": accuracy_pct}}})
     io.write_text(reports / "index.html", f"<p>{seconds}</p>")
     io.write_text(reports / "figures/a.svg", "<svg/>")
 
@@ -98,15 +108,19 @@ def test_each_training_run_is_published_once(tmp_path):
     assert sorted(run.data.tags["fold"] for run in children) == ["b0", "b1"]
     assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parent.info.run_id}
     assert {run.info.status for run in [*children, parent]} == {"FINISHED"}
-    assert parent.data.metrics["lobo.paper.accuracy_pct.mean"] == 50.0
-    assert parent.data.metrics["lobo.paper.accuracy_pct.n"] == 2
+    assert parent.data.metrics == {"accuracy_pct.lobo.paper": 50.0, "mse_xy_mm2.lobo.paper": 2.0}
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     run = children[0]
-    assert run.data.metrics == {"accuracy_pct": 50.0, "registered_accuracy_pct": 60.0, "train_loss": 1.0}
+    assert run.data.metrics == {
+        "accuracy_pct": 50.0, "mse_xy_mm2": 2.0, "registered_accuracy_pct": 60.0, "registered_mse_xy_mm2": 1.0,
+        "train_loss": 1.0,
+    }  # fmt: skip
     assert run.data.params["steps_n"] == "3"
-    assert [point.value for point in client.get_metric_history(run.info.run_id, "train_loss")] == [3.0, 2.0, 1.0]
-    assert len(client.list_artifacts(run.info.run_id, "model")) == 3
-    assert {run.data.params["method"], run.data.params["fold"]} == {"paper", run.data.tags["fold"]}
+    curve = client.get_metric_history(run.info.run_id, "train_loss")
+    assert [(point.step, point.value) for point in curve] == [(16, 3.0), (32, 2.0), (48, 1.0)]
+    files = {Path(one.path).name for one in client.list_artifacts(run.info.run_id, "model")}
+    assert files == {"MLmodel", f"{run.info.run_name}.json", f"{run.info.run_name}.safetensors"}
+    assert {run.data.params["method"], run.data.params["fold"]} == {"lobo.paper", run.data.tags["fold"]}
     assert (run.data.tags["board"], run.data.tags["skin"]) == ("b0", "s0")
     contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
     assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
@@ -128,13 +142,13 @@ def test_new_score_replaces_the_old_and_dropped_experiments_are_not_current(tmp_
     write(tmp_path, b0="k0", b1="k1")
     # The same training run with a new score.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
-    counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
+    counts = send(tmp_path, {"train_multi": tmp_path / "models"})
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
 
     # A dropped experiment has no current runs.
-    publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
+    send(tmp_path)
     assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
 
 
@@ -143,31 +157,79 @@ def test_report_run_has_figures_page_and_numbers(tmp_path):
     write(tmp_path)
     (run,) = runs(tmp_path, "tags.stage = 'report'")
     assert run.info.status == "FINISHED"
-    assert {one.path for one in client.list_artifacts(run.info.run_id)} == {"figures", "index.html", "numbers.json"}
-    assert [one.path for one in client.list_artifacts(run.info.run_id, "figures")] == ["figures/a.svg"]
-    assert run.data.metrics == {
-        "table2.multi.accuracy_pct.mean": 50.0, "table2.multi.accuracy_pct.n": 2, "drift.each.accuracy_pct": 80.0,
+    assert {one.path for one in client.list_artifacts(run.info.run_id)} == {
+        "figures", "index.html", "numbers.json", "scores.json",
     }  # fmt: skip
-    curve = client.get_metric_history(run.info.run_id, "drift.each.accuracy_pct")
-    assert [(point.step, point.value) for point in curve] == [(5, 90.0), (10, 80.0)]
+    assert [one.path for one in client.list_artifacts(run.info.run_id, "figures")] == ["figures/a.svg"]
+    assert run.data.metrics == {"table2.multi.accuracy_pct": 50.0}
 
     # Changed costs only update files of the report's run; a changed number creates a new run.
     write_report(tmp_path / "reports", seconds=2.0)
-    publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
+    send(tmp_path)
     (same,) = runs(tmp_path, "tags.stage = 'report'")
-    assert len(client.get_metric_history(same.info.run_id, "drift.each.accuracy_pct")) == 2
+    assert len(client.get_metric_history(same.info.run_id, "table2.multi.accuracy_pct")) == 1
     assert Path(client.download_artifacts(same.info.run_id, "index.html")).read_text() == "<p>2.0</p>"
     write_report(tmp_path / "reports", accuracy_pct=60.0)
-    assert publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)["superseded_n"] == 1
+    assert send(tmp_path)["superseded_n"] == 1
     (current,) = runs(tmp_path, "tags.stage = 'report' and tags.current = 'true'")
-    assert current.data.metrics["table2.multi.accuracy_pct.mean"] == 60.0
+    assert current.data.metrics == {"table2.multi.accuracy_pct": 60.0}
+
+
+def test_counts_of_data_are_no_metrics():
+    numbers = {"capture": {"bytes_n": 5}, "drift": {"skins_n": 3, "end": {"accuracy_pct": {"mean": 90.0, "n": 2}}}}
+    assert metrics_of(numbers) == [("drift.end.accuracy_pct.mean", 90.0, 0)]
+
+
+def test_runs_last_as_long_as_their_training(tmp_path):
+    for name in ("b0", "b1"):
+        write_model(tmp_path / "models", name, name)
+    trainings = {("train_multi", "b0"): Span(1000.0, 4.0), ("train_multi", "b1"): Span(1003.0, 6.5)}
+    times, scores = Times(trainings, {"drift": Span(2000.0, 9.0)}), {"train_multi": {"accuracy_pct": 51.0}}
+    curves = {"drift": [("each", 0, {"accuracy_pct": 60.0})]}
+    send(tmp_path, {"train_multi": tmp_path / "models"}, curves, times=times, scores=scores)
+    by_name = {run.info.run_name: run for run in runs(tmp_path, "")}
+    spans = {name: (run.info.start_time, run.info.end_time) for name, run in by_name.items()}
+    assert spans["b0"] == (1_000_000, 1_004_000)
+    assert spans["b1"] == (1_003_000, 1_009_500)
+    assert spans["train_multi"] == (1_000_000, 1_009_500)  # from the first start to the last end
+    assert spans["drift"] == (2_000_000, 2_009_000)
+    assert by_name["b1"].data.metrics["train_s"] == 6.5
+    stage = by_name["train_multi"].data.metrics
+    assert (stage["accuracy_pct"], stage["train_s"]) == (51.0, 10.5)
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    curve = client.get_metric_history(by_name["b0"].info.run_id, "train_loss")
+    assert curve[-1].timestamp == 1_004_000  # the last step is at the end of the training
+
+
+def test_views_list_the_scores_first(tmp_path):
+    write_model(tmp_path / "models", "b0", "k0")
+    write_report(tmp_path / "reports")
+    send(tmp_path, {"train_multi": tmp_path / "models"}, scores={"train_multi": {"accuracy_pct": 51.0}})
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    tags = client.get_experiment_by_name("ci").tags
+    for view in VIEWS:
+        state = json.loads(json.loads(tags[f"mlflow.sharedViewState.{view.key}"])["state"])
+        assert state["selectedColumns"][:4] == [f"metrics.`{name}`" for name in SCORES]
+        assert len(runs(tmp_path, state["searchFilter"])) == 1
+        assert f"viewStateShareKey={view.key}" in tags["mlflow.note.content"]
+    client.set_experiment_tag(client.get_experiment_by_name("ci").experiment_id, "mlflow.note.content", "ours")
+    write(tmp_path, b0="k0")
+    assert client.get_experiment_by_name("ci").tags["mlflow.note.content"] == "ours"
+
+
+def test_runs_of_the_earlier_layout_are_superseded(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "LAYOUT", 2)
+    write(tmp_path, b0="k0")
+    monkeypatch.undo()
+    assert write(tmp_path, b0="k0") == {"new_n": 1, "kept_n": 0, "superseded_n": 3}
+    assert len(runs(tmp_path, "tags.current = 'true' and tags.kind = 'training'")) == 1
 
 
 def test_sweep_run_has_metrics_over_steps(tmp_path):
     write_report(tmp_path / "reports")
     curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
-    publish({}, curves, tmp_path / "reports", scene="ci", root=tmp_path)
-    publish({}, curves, tmp_path / "reports", scene="ci", root=tmp_path)
+    send(tmp_path, curves=curves)
+    send(tmp_path, curves=curves)
     (run,) = runs(tmp_path, "tags.stage = 'sweep_pokes' and tags.current = 'true'")
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     history = client.get_metric_history(run.info.run_id, "adapted.accuracy_pct")
@@ -183,7 +245,7 @@ def publish_state(root: Path, old: bool, reported: bool = True) -> dict:
     write_model(root / "models", "b0", "k0" if old else "k9", accuracy_pct=50.0 if old else 51.0)
     if reported:
         write_report(root / "reports", accuracy_pct=50.0 if old else 51.0)
-    return publish({"train_multi": root / "models"}, CURVES[old], root / "reports", scene="ci", root=root)
+    return send(root, {"train_multi": root / "models"}, CURVES[old])
 
 
 def current(root: Path) -> set[str]:

@@ -14,6 +14,7 @@ from pipeline.manage.add import RAW
 from pipeline.manage.compare import Echo, print_comparison, read_folder, read_revision
 from pipeline.manage.registry import REGISTRY
 from pipeline.stage import say
+from pipeline.tracking import PUBLISH
 from reskin import io
 from reskin.errors import SchemaError
 
@@ -42,11 +43,11 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         _git(root, "clone", "--quiet", ".", str(clone))
         _bring_recordings(root, clone, names)
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
-        environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
+        environment = {**QUIET, **os.environ, PUBLISH: "0", "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
             _clear(clone / "reports" / name)  # otherwise committed reports could pass as new ones
-        # --force: every stage runs, even if this machine's cache contains its outputs. Stage publish does not run.
+        # --force: every stage runs, even if this machine's cache contains its outputs.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
             with io.replacing(root / VERIFIED / name) as folder:

@@ -45,10 +45,12 @@ from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
-from pipeline.tracking import Curves, TrackingUnavailable, metrics_of
+from pipeline.tracking import Curves, Results, TrackingUnavailable, metrics_of, publishing, read_times, scores_link
 from pipeline.tracking import publish as write_runs
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.choice import choose, fingerprint, to_record
+from pipeline.training.final import EXPERIMENT as FINAL_EXPERIMENT
+from pipeline.training.final import FILE as FINAL_FILE
 from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
@@ -186,17 +188,41 @@ def write_index(reports: Path) -> None:
     io.write_text(reports / "index.html", index([numbers for numbers in results if "described" in numbers], headlines))
 
 
-def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
+def publish(settings: Settings, indentations: Path, models: Path, results: Path, reports: Path) -> None:
     """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
+    if not publishing():
+        return
     scene, name = planned_scene(settings), settings.scene
-    folders = {stage: models / stage for stage in scene.model_stages}
     # Results of `dvc exp` are in another MLflow experiment than the results of the checkout.
     experiment = f"{name} (dvc exp)" if is_experiment() else name
     try:
-        counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
-        say(f"{experiment}: MLflow runs {counts}")
+        found = published_results(scene, name, indentations, models, results, reports)
+        say(write_scene(found, experiment, home(), register=not is_experiment()))
     except TrackingUnavailable as error:
         say(f"warning: {name} is not in MLflow: {error}")
+
+
+def published_results(
+    scene: Scene, name: str, indentations: Path, models: Path, results: Path, reports: Path
+) -> Results:
+    """Collect what the stages of a scene wrote, for MLflow."""
+    scores_file = reports / "scores.json"
+    table_2 = io.read_json(scores_file).get("table2", {}) if scores_file.exists() else {}
+    return Results(
+        models={stage: models / stage for stage in scene.model_stages},
+        curves=read_curves(scene, results),
+        reports=reports,
+        scores={EXPERIMENTS[TABLE_2[row]].stage: means for row, means in table_2.items() if row in TABLE_2},
+        final=models / FINAL_EXPERIMENT / FINAL_FILE,
+        readings=sorted(indentations.glob("*.parquet")),
+        times=read_times(name),
+    )
+
+
+def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
+    """Write missing runs of a scene to MLflow; return a sentence that says how many, and where they can be seen."""
+    counts = write_runs(results, scene=experiment, root=root, register=register)
+    return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
 
 
 def read_curves(scene: Scene, results: Path) -> Curves:

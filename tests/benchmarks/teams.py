@@ -144,7 +144,7 @@ def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) ->
         for skin_i in (1, 2):
             ana.add(skin_i)
         ran = ana.repro()
-        require(ran["train_multi"] == ran["publish"] == 1, f"ran {ran}")
+        require(ran["train_multi"] == ran["report"] == 1, f"ran {ran}")
         note(f"{sum(ran.values())} stages ran")
         ana.commit("Add two skins")
     for remote in (REMOTE, "folder"):

@@ -19,7 +19,7 @@ ADDRESS_SPACE_MAX = 100 * 2**20  # bytes of address space
 
 def address(stage: str) -> str:
     """Return DVC's name of a stage: `stage@scene`."""
-    return stage if stage == "code" else f"{stage}@{SCENE}"
+    return stage if stage == "code" else f"{'report' if stage == 'publish' else stage}@{SCENE}"
 
 
 def run_and_kill(checkout: Checkout, stage: str, part: float) -> Result | None:

@@ -1,0 +1,84 @@
+"""Views of MLflow's table of runs: columns, filter and links to them.
+
+MLflow 3.17 offers no other way to choose the columns that everybody sees first. A view is a tag of an experiment; the
+button *Views* on the experiment's page lists it, and a link can open it. Without a view, the table shows no metric.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")  # metrics of every training run, and of its stage
+TRAIN_S = "train_s"
+TAG, NOTE = "mlflow.sharedViewState.", "mlflow.note.content"
+UI = "http://127.0.0.1:5000"  # where `mlflow ui` listens by default
+WIDTHS = {"name": 300, "metric": 120, "other": 130}  # px
+
+
+@dataclass(frozen=True)
+class View:
+    """A view: its key in links, its title, the current runs that it lists, and its columns beside the scores."""
+
+    key: str
+    title: str
+    filter: str
+    columns: tuple[str, ...]
+
+    def state(self) -> str:
+        """Return the view in the form in which MLflow's page saves it."""
+        metrics = [_column("metrics", name) for name in (*SCORES, TRAIN_S)]
+        columns = [*metrics, *self.columns]
+        widths = dict.fromkeys(metrics, WIDTHS["metric"]) | dict.fromkeys(self.columns, WIDTHS["other"])
+        name = _column("attributes", "Run Name")
+        state = {
+            "searchFilter": f"{self.filter} and tags.current = 'true'",
+            "orderByKey": _column("attributes", "Created"),
+            "orderByAsc": False,
+            "selectedColumns": columns,
+            "columnOrder": [name, *columns],
+            "columnWidths": {name: WIDTHS["name"]} | widths,
+        }
+        return json.dumps(state)
+
+
+def _column(kind: str, name: str) -> str:
+    """Return MLflow's name of a column.
+
+    >>> _column("metrics", "r2_f")
+    'metrics.`r2_f`'
+    """
+    return f"{kind}.`{name}`"
+
+
+TRAININGS = View(
+    "scores",
+    "Scores of each training run",
+    "tags.kind = 'training'",
+    (_column("params", "method"), _column("tags", "board")),
+)
+STAGES = View("stages", "Mean scores of each stage", "tags.kind = 'stage' and metrics.accuracy_pct >= 0", ())
+VIEWS = (TRAININGS, STAGES)
+
+
+def experiment_tags(experiment_id: str, created_ms: int) -> Iterator[tuple[str, str]]:
+    """Yield the tags of an experiment that define its views, and its description with links to them."""
+    for i, view in enumerate(reversed(VIEWS)):  # the latest view is listed first
+        made_ms = created_ms + i
+        saved = {"name": view.title, "createdAt": made_ms, "updatedAt": made_ms, "state": view.state()}
+        yield f"{TAG}{view.key}", json.dumps(saved)
+    links = ", ".join(f"[{view.title.lower()}]({link(experiment_id, view, host='')})" for view in VIEWS)
+    yield NOTE, f"Open {links}."
+
+
+def link(experiment_id: str, view: View = TRAININGS, *, host: str = UI) -> str:
+    """Return the address of a view on an MLflow server."""
+    # Without a workflow, MLflow's page shows the menus for language models.
+    query = f"workflowType=machine_learning&viewStateShareKey={view.key}"
+    return f"{host.rstrip('/')}/#/experiments/{experiment_id}/runs?{query}"
+
+
+def missing_tags(existing: Mapping[str, str], experiment_id: str, created_ms: int) -> Iterator[tuple[str, str]]:
+    """Yield the tags that an experiment lacks; a description that somebody has edited is kept."""
+    for name, value in experiment_tags(experiment_id, created_ms):
+        if existing.get(name) != value and not (name == NOTE and existing.get(name)):
+            yield name, value
