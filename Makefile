@@ -45,7 +45,7 @@ $(STAMP): pyproject.toml constraints.txt
 repro: $(STAMP)
 	$(BIN)/reskin scenes check
 	$(BIN)/dvc repro
-	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage publish if all results equal those in dvc.lock
+	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage report if all results equal those in dvc.lock
 	@$(BIN)/reskin summary
 
 # Three workers, for two cores or more: tests of live boards mostly wait.
@@ -75,7 +75,7 @@ lint: $(STAMP)
 
 ui: $(STAMP)
 	$(BIN)/reskin publish
-	$(BIN)/mlflow ui --backend-store-uri sqlite:///mlflow.db
+	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
 	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py -s -q -p no:xdist

@@ -42,6 +42,7 @@ CHAMPION = "champion"  # alias of the version of a registered model to use
 UNIVERSAL = "reskin-universal"  # registered name of the universal model
 UNIVERSAL_EXPERIMENT = "universal model"
 LAYOUT = 3  # version of the content of MLflow runs; runs of older versions are written again
+DIGITS_N = 6  # significant digits of metrics, as in numbers.json; MLflow's page shows all digits
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
 TIMEOUT_S = 2.0  # time in which an HTTP server must answer
 LOCK_TIMEOUT_S = 5.0  # how long to wait for a locked SQLite store; UIs and other writers lock it for much shorter
@@ -319,14 +320,19 @@ class Publisher:
     ) -> None:
         """Write metrics, given as rows (name, value, step), parameters and tags to a run.
 
-        The points of a curve are spread over the run's duration, in proportion to their steps.
+        Metrics are rounded. The points of a curve are spread over the run's duration, in proportion to their steps.
         """
         from mlflow.entities import Metric, Param, RunTag
 
         rows = list(rows)
         last_step = max((step for _, _, step in rows), default=0) or 1
         metrics = [
-            Metric(name, value, round(span.start_ms + 1e3 * span.duration_s * step / last_step), step)
+            Metric(
+                name,
+                float(f"{value:.{DIGITS_N}g}"),
+                round(span.start_ms + 1e3 * span.duration_s * step / last_step),
+                step,
+            )
             for name, value, step in rows
         ]
         texts = [Param(name, str(value)[:500]) for name, value in (params or {}).items()]

@@ -26,6 +26,7 @@ from ruamel.yaml import YAML
 
 import reskin
 from deploy import servers
+from pipeline.pyfunc import channel_names
 from tests.benchmarks.steps import ROOT, Steps, end_on_signals, require
 
 SCENE = "team"
@@ -207,7 +208,7 @@ def pull_merge(steps: Steps, ana: Clone) -> None:
 
 def search_runs(tracking: str) -> pd.DataFrame:
     mlflow.set_tracking_uri(tracking)
-    return mlflow.search_runs(experiment_names=[SCENE])
+    return mlflow.search_runs(search_all_experiments=True)
 
 
 def share_by_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, database: str) -> int:
@@ -227,7 +228,8 @@ def share_by_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, databas
     with steps.step("load a model from the server and from its file") as note:
         run_id, name = current.iloc[0][["run_id", "tags.mlflow.runName"]]
         pokes = np.random.default_rng(0).normal(0, 50, (5, 15)).astype(np.float32)
-        theirs = np.asarray(mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict(pokes))
+        named = pd.DataFrame(pokes, columns=channel_names(15))
+        theirs = mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict(named).to_numpy()
         ours = reskin.load_model(ben.folder / f"data/models/{SCENE}/train_multi/{name}.safetensors")
         require(np.array_equal(theirs, ours.zero(np.zeros(15)).predict(pokes)), "predictions differ")
         note("same predictions")

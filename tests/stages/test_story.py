@@ -21,6 +21,7 @@ import pytest
 from ruamel.yaml import YAML
 
 import reskin
+from pipeline.pyfunc import channel_names
 from pipeline.report.checklist import NOT_REACHED, NOT_RUN, read_rows, resolve
 from pipeline.report.figures import table2_figure
 from pipeline.report.formatting import to_markdown
@@ -100,7 +101,7 @@ def test_first_tables_have_all_numbers_and_their_source(story, numbers):
 def test_stages_print_their_position_in_the_run(story):
     order = json.loads((story / ".reskin/order.json").read_text())["stages"]
     output = (story / OUTPUT).read_text()
-    numbers = [int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)]
+    numbers = {int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)}
     assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, prints nothing
 
 
@@ -332,8 +333,26 @@ def test_mlflow_model_predicts_like_the_saved_model(story, monkeypatch):
     run = client.search_runs([client.get_experiment_by_name("ci").experiment_id], query)[0]
     ours = reskin.load_model(story / f"data/models/ci/train_multi/{run.info.run_name}.safetensors").zero(np.zeros(15))
     db_uT = np.random.default_rng(0).normal(0, 300, (5, 15))
-    theirs = mlflow.pyfunc.load_model(f"runs:/{run.info.run_id}/model").predict(pd.DataFrame(db_uT))
+    model = mlflow.pyfunc.load_model(f"runs:/{run.info.run_id}/model")
+    theirs = model.predict(pd.DataFrame(db_uT, columns=channel_names(15)))
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
+
+
+def test_report_publishes_runs_that_last_as_long_as_their_training(story):
+    client = mlflow.MlflowClient(f"sqlite:///{story / 'mlflow.db'}")
+    query = "tags.kind = 'training' and tags.stage = 'train_multi' and tags.current = 'true'"
+    found = client.search_runs([client.get_experiment_by_name("ci").experiment_id], query)
+    timed = json.loads((story / ".reskin/seconds/ci/train_multi.json").read_text())
+    seconds = {training["name"]: training["train_s"] for training in timed}
+    assert {training.info.run_name for training in found} == set(seconds)
+    for training in found:
+        name = training.info.run_name
+        assert (training.info.end_time - training.info.start_time) / 1e3 == pytest.approx(seconds[name], abs=0.002)
+        card = json.loads((story / f"data/models/ci/train_multi/{name}.json").read_text())
+        curve = client.get_metric_history(training.info.run_id, "train_loss")
+        assert [point.step for point in curve] == card["curve_steps"]
+    assert client.get_model_version_by_alias("reskin-ci", "champion")
+    assert client.get_model_version_by_alias("reskin-universal", "champion")
 
 
 @slow
@@ -399,7 +418,7 @@ def test_killed_stage_keeps_finished_folds(story):
 
 def test_missing_tracking_server_is_reported_quickly(story):
     start_s = time.monotonic()
-    arguments = ["--scene", "ci", "--models", "data/models/ci",
+    arguments = ["--scene", "ci", "--indentations", "data/indentations/ci", "--models", "data/models/ci",
              "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *arguments, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
