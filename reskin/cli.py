@@ -10,10 +10,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import typer
 from typer import Argument, Option
@@ -72,6 +72,10 @@ MODEL = (
 )
 EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
 NEW_DAY = "The calibration was made on an earlier day, so the skin may now slide differently (docs/live.md)."
+USUAL_COUNTS = {  # counts of `predict` that are not faults
+    "rate_hz", "duration_s", "readings_n", "quiet_start_s", "noise_uT", "contact_readings_n", "contacts_n",
+    "force_max_N", "bytes_n", "frames_n", "frame_bytes_n", "rows_read_n", "rows_n",
+}  # fmt: skip
 LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
@@ -335,10 +339,21 @@ def predict(
     from reskin.predicting import warnings
 
     counts = write(log, model, out, rate_hz=rate_hz, external_uT=external_uT, new_day=new_day)
-    numbers = {key: count for key, count in counts.items() if not isinstance(count, list)}
-    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in numbers.items()))
+    typer.echo(f"wrote {out}: {_describe_log(counts)}")
     for sentence in warnings(counts):
         typer.echo(sentence)
+
+
+def _describe_log(counts: Mapping[str, Any]) -> str:
+    """Describe the log that `predict` read: its contacts, then all faults and doubts that occurred."""
+    described = (
+        f"{counts['readings_n']} readings in {counts['duration_s']:.1f} s ({counts['rate_hz']:.1f} Hz), "
+        f"{counts['contacts_n']} contacts in {counts['contact_readings_n']} of them"
+    )
+    if "force_max_N" in counts:
+        described += f", up to {counts['force_max_N']:.2f} N"
+    faults = {key: n for key, n in counts.items() if key not in USUAL_COUNTS and not isinstance(n, list) and n}
+    return "; ".join([described, *(f"{key} {n:.6g}" for key, n in faults.items())])
 
 
 @app.command(rich_help_panel=RECORDINGS)

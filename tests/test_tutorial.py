@@ -54,5 +54,6 @@ def test_writing_replaces_only_outputs():
 
 
 def test_shown_output_hides_the_folder_and_marks_what_is_left_out(tmp_path):
-    step = Step("sh", "", "", {"last": "1"})
-    assert shown(f"one\ntwo {tmp_path}/a\n", step, tmp_path) == "[...]\ntwo /home/me/reskin/a\n"
+    step = Step("sh", "", "", {"from": "two", "to": "three"})
+    output = f"one\ntwo\none\ntwo {tmp_path}/a\nthree\nfour\n"
+    assert shown(output, step, tmp_path) == "[...]\ntwo /home/me/reskin/a\nthree\n[...]\n"

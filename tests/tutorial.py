@@ -8,7 +8,7 @@ step has options, separated by semicolons:
 
 * `until TEXT`: run in the background; the output ends with the first line that contains TEXT
 * `stop`: with `until`, then press Ctrl-C
-* `last N`: show only the last N lines
+* `from TEXT`, `to TEXT`: show only the lines from the last one that begins with TEXT, and to the first one after it
 * `slow`: a step that trains, or that only such steps need
 * `within P %`: the numbers of the output may differ by P %; without this option, by `TOLERANCE_PCT`
 
@@ -44,6 +44,8 @@ HTTP_PORT = "8765"  # port on the page; the test uses a free one, because severa
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
 NUMBER = re.compile(r"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 OPTIONAL = (  # parts of lines that occur only if the machine is busy
+    re.compile(r"; [a-z ]+(?:: [a-z ]+)? \(\d+, [\d.]+ s\)"),  # alarms
+    re.compile(r", skipped_\w+ \d+"),
     re.compile(r"; \d+ touches left out: [^;\n]*"),
     re.compile(r", \d+ (?:without a no-load dwell before them|out of order)"),
 )
@@ -106,8 +108,12 @@ def shown(output: str, step: Step, folder: Path) -> str:
     """Return an output as the page shows it: with another folder and terminal, and shortened if the step says so."""
     output = re.sub(r"/dev/pts/\d+", "/dev/pts/3", output).replace(str(folder), "/home/me/reskin").replace("\r", "\n")
     lines = [line.rstrip() for line in output.splitlines() if line.strip()]
-    if "last" in step.options and len(lines) > (kept_n := int(step.options["last"])):
-        lines = [CUT, *lines[-kept_n:]]
+    if "from" in step.options:
+        first = max(i for i, line in enumerate(lines) if line.startswith(step.options["from"]))
+        lines = [CUT, *lines[first:]]
+    if "to" in step.options:
+        last = next(i for i, line in enumerate(lines) if i > 1 and line.startswith(step.options["to"]))
+        lines = [*lines[: last + 1], CUT]
     return "".join(f"{line}\n" for line in lines)
 
 

@@ -188,8 +188,11 @@ def simulate(
     capture = simulate_capture(simulation, protocol, board=board or first_board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
-    presses_n = len(points_mm()) if robot else None
-    return replace(script, true_contacts=true_contacts_of(capture), presses_per_pass_n=presses_n)
+    script = replace(script, true_contacts=true_contacts_of(capture))
+    if robot:  # frames are sent one by one, so that each row of the robot's log has the time of its frame
+        even_s = np.arange(len(script)) / ROBOT_RATE_HZ
+        script = replace(script, t_s=even_s, presses_per_pass_n=len(points_mm()))
+    return script
 
 
 def true_contacts_of(capture: SimulatedCapture) -> Float64[np.ndarray, "f 3"] | None:
