@@ -137,7 +137,7 @@ def _limit(axes: Any, metric: str) -> None:
         axes.axvline(0, color="0.6", linewidth=0.8)
     else:
         axes.set_xlim(0, 1.15 * (100.0 if metric == "accuracy_pct" else high))
-    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes.set_xticks([tick for tick in axes.get_xticks() if axes.get_xlim()[0] <= tick <= RANGES[metric][1]])
     axes.grid(axis="x", alpha=0.25)
 
