@@ -293,7 +293,7 @@ def error_grids(
         for experiment in table["question"].unique().to_pylist():
             wanted = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
             true_mm, predicted_mm = (_places(table.filter(wanted), side) for side in ("true", "predicted"))
-            title = f"Position error: {HELD_OUT.get(experiment, experiment)} (scene {scene})"
+            title = f"Position error: {HELD_OUT.get(experiment, experiment)}; scene {scene}"
             yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title, outline=outline)
 
 
