@@ -137,7 +137,7 @@ def _limit(axes: Any, metric: str) -> None:
         axes.axvline(0, color="0.6", linewidth=0.8)
     else:
         axes.set_xlim(0, 1.15 * (100.0 if metric == "accuracy_pct" else high))
-    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
     axes.set_xticks([tick for tick in axes.get_xticks() if axes.get_xlim()[0] <= tick <= RANGES[metric][1]])
     axes.grid(axis="x", alpha=0.25)
 
@@ -293,7 +293,7 @@ def error_grids(
         for experiment in table["question"].unique().to_pylist():
             wanted = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
             true_mm, predicted_mm = (_places(table.filter(wanted), side) for side in ("true", "predicted"))
-            title = f"Position error: {HELD_OUT.get(experiment, experiment)} (scene {scene})"
+            title = f"Position error: {HELD_OUT.get(experiment, experiment)}; scene {scene}"
             yield f"error_grid_{experiment}.svg", error_grid(true_mm, predicted_mm, title=title, outline=outline)
 
 
