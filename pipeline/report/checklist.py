@@ -15,7 +15,7 @@ import pandas as pd
 from pipeline import statistics
 from pipeline.report import paper
 from pipeline.report.experiments import add_rows
-from pipeline.report.formatting import FEW_POINTS, Stat, gain, is_pooled, show, show_difference
+from pipeline.report.formatting import FEW_POINTS, Stat, gain, is_pooled, reworded, show, show_difference
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
@@ -34,13 +34,16 @@ PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less t
 NONE = "–"
 NOT_RUN = "not run in this scene"
 NOT_REACHED = "not reached in this scene"
-SHORT_OF = "not reached: "  # prefix of a note: our experiment was smaller than the paper's
+SHORT_OF = "smaller than the paper's: "  # prefix of a note on the size of our experiment
 ONE_SKIN = "our networks were trained on one skin each: not comparable"
 SETTING = "a setting of this scene, not a result"
 TARGET = "an earlier simulated skin was calibrated to this number: agreement is not evidence"
 EQUIVALENT = "equivalent to no difference: the whole interval is nearer to 0 than half of the paper's difference"
 # Paths of results that are comparable with the paper only if networks were trained on several skins.
 NEEDS_POOLING = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")
+# Verdicts on numbers: whether our interval over boards includes the paper's mean.
+AGREES, DIFFERS = "within interval", "significant difference"
+NO_INTERVAL = "not judged (no interval over boards)"
 DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules for differences, which are shown with a sign
 FAMILY = (
     "The claims of section 5 about accuracy form one family, which was listed before any run (`family` in "
@@ -50,12 +53,14 @@ FAMILY = (
     "A difference is equivalent to no difference if its whole interval is nearer to 0 than that."
 )
 MEANING = (
-    f"Only claims have a verdict. {VERDICTS} {FAMILY} Met: whether our mean meets the criterion. Slightly: the "
+    f"{reworded(VERDICTS)} A number of the paper that is not a claim is within interval "
+    "or a significant difference: our interval over boards includes the paper's mean, or not; the paper's own "
+    f"deviation is not considered. {FAMILY} Met: whether our mean meets the criterion. Slightly: the "
     f"accuracy changes by less than {FEW_POINTS:g} percentage points. Plateau: it changes by less than "
-    f"{PLATEAU_POINTS:g}. The reasons in the notes are assumptions, which no run has tested. See file: there is no "
-    "single number to compare, and the result is in the tables or figures named in the column `shown in`."
+    f"{PLATEAU_POINTS:g}. The reasons in the notes are assumptions, which no run has tested. See: there is no "
+    "single number to compare; the result is in the table or figure that is named."
 )
-CLAIMS_MEANING = f"{VERDICTS} {FAMILY}"
+CLAIMS_MEANING = f"{reworded(VERDICTS)} {FAMILY}"
 NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # the name of a number in the text of a reason
 
 
@@ -96,6 +101,7 @@ class Row(Strict):
         "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
         "setting", "target", "view",
     ] = "near"  # fmt: skip
+    signs: tuple[str, str] | None = None  # what a negative and a positive number mean, in words
     family: bool = False  # whether the claim belongs to the family whose p-values are adjusted by Holm's method
     reach: Reach | None = None
     only: Literal["recorded", "simulated"] | None = None  # the only source whose scenes show the row
@@ -158,9 +164,9 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
                 "result": row.what,
                 "paper": row.says if printed is None else _show(row, printed),
                 "ours": _show_ours(row, ours),
-                "verdict": judgement.verdict,
+                "verdict": reworded(judgement.verdict),
                 "criterion": judgement.criterion,
-                "met": judgement.met,
+                "met": reworded(judgement.met),
                 "paper in our interval": _paper_in_interval(printed, ours),
                 "p (Holm)": NONE if judgement.p_adjusted is None else f"{judgement.p_adjusted:.2g}",
                 "note": ". ".join(notes) or NONE,
@@ -285,23 +291,30 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
 def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
     """Judge a claim about accuracy that must hold for every number of training skins."""
     verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
+    by_number = ", ".join(f"{skins_n} {verdict}" for skins_n, verdict in verdicts.items())
     return Judgement(
         statistics.combine_verdicts(list(verdicts.values())),
         "gain above 0 at every number of training skins",
         _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
-        notes=("by number of skins: " + ", ".join(f"{skins_n} {verdict}" for skins_n, verdict in verdicts.items()),),
+        notes=(f"by number of skins: {reworded(by_number)}",),
     )
 
 
 def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
-    """Judge whether our mean is within one sd of the paper's, or within 10 % if the paper gives no sd."""
+    """Judge whether our interval includes the paper's mean.
+
+    Also judge whether our mean is within one sd of the paper's, or within 10 % if the paper gives no sd.
+    """
     value, mean = mean_of(ours), mean_of(printed)
     if value is None or mean is None:
         return Judgement()
     tolerance, criterion = NEAR * abs(mean), f"within {100 * NEAR:g} % of the paper's"
     if isinstance(printed, tuple):
         tolerance, criterion = printed[1], "within the paper's sd"
-    return Judgement(NONE, criterion, _yes(abs(value - mean) <= tolerance), notes=(TARGET,) if target else ())
+    inside = {"yes": AGREES, "no": DIFFERS}.get(_paper_in_interval(printed, ours))
+    few = FEW_BOARDS if isinstance(ours, Mapping) and "values" in ours else NO_INTERVAL
+    met = _yes(abs(value - mean) <= tolerance)
+    return Judgement(inside or few, criterion, met, notes=(TARGET,) if target else ())
 
 
 def sizeable(printed: float | None) -> float:
@@ -366,6 +379,8 @@ def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
     if row.reach is None or ours is None:
         return []
     ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)
+    if ours_n is None:
+        return []
     return [f"{SHORT_OF if ours_n < paper_n else ''}{ours_n:,.0f} {row.reach.of} (paper: {paper_n:,.0f})"]
 
 
@@ -379,12 +394,18 @@ def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[
 
 def _show_ours(row: Row, ours: Any) -> str:
     if ours is None:
-        return "see file" if row.shown and not row.ours else NONE
+        return _see(row) if row.shown and not row.ours else NONE
     if isinstance(ours, bool):
         return _yes(ours)
     if isinstance(ours, int):
         return str(ours)
-    return "see file" if mean_of(ours) is None else _show(row, ours)
+    return _see(row) if mean_of(ours) is None else _show(row, ours)
+
+
+def _see(row: Row) -> str:
+    """Name the table or figure that shows a result which is not a single number."""
+    name = row.shown[0]
+    return f"see {'figure' if name.endswith('.svg') else 'table'} {name.removesuffix('.svg')}"
 
 
 def _show(row: Row, value: Any) -> str:
@@ -397,5 +418,8 @@ def _show(row: Row, value: Any) -> str:
     elif isinstance(value, tuple):
         text = "{:g} ± {:g}".format(*value)
     else:
-        text = show(value) if isinstance(value, Mapping) else f"{value:.4g}"
-    return f"{text} {unit}".strip()
+        text = show(value) if isinstance(value, Mapping) else f"{value:.3g}"
+    mean = mean_of(value)
+    meaning = f" ({row.signs[mean > 0]})" if row.signs and mean else ""
+    number, *uncertainty = text.split(" ", 1)
+    return " ".join(filter(None, [number, unit, *uncertainty])) + meaning

@@ -1,14 +1,16 @@
 """Scores as text (means, deviations, intervals, paired differences), rows of table 2, and tables as Markdown."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.statistics import negate
+from pipeline.statistics import UNDECIDED, negate
 
 # Keys `mean` and `n`; if known, also `sd`, and `ci95` ([low, high]) or `values` (one value per board, for few boards).
 Stat = Mapping[str, Any]
@@ -37,29 +39,93 @@ CONTROL = "Control: fine-tuned equally long, without the new skin's pokes (ours)
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
 # `way` and `labels_n` of the rows of experiment population in which the complete universal model has no labels.
 UNIVERSAL = ("universal", 0)
+INCONCLUSIVE = "inconclusive"
+DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
+
+
+def reworded(text: str) -> str:
+    """Replace the verdict `UNDECIDED`, as the results of experiments write it, by the word that reports show.
+
+    >>> reworded("undecided: +0.1"), reworded("Undecided: the interval includes the threshold.")
+    ('inconclusive: +0.1', 'Inconclusive: the interval includes the threshold.')
+    """
+    pairs = ((UNDECIDED, INCONCLUSIVE), (UNDECIDED.capitalize(), INCONCLUSIVE.capitalize()))
+    return reduce(lambda found, pair: re.sub(rf"\b{pair[0]}\b", pair[1], found), pairs, text)
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three digits, then its interval over boards or else its sd, and its sd over seeds."""
+    """Write a mean, then its interval over boards or else its sd, and its sd over seeds; see `decimals`."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
-        return f"{_three_digits(value['mean'])} {show_interval(value)}{_show_seeds(value)}"
+        return f"{_rounded_mean(value)} {show_interval(value)}{_show_seeds(value)}"
     return show_deviation(value)
 
 
 def show_deviation(value: Stat) -> str:
     """Write a mean with its standard deviations over the n values and over seeds, if these are known."""
-    over_n = f" ± {value['sd']:.2g}" if "sd" in value else ""
-    return f"{_three_digits(value['mean'])}{over_n}{_show_seeds(value)}"
+    over_n = f" ± {_rounded_sd(value, 'sd')}" if "sd" in value else ""
+    return f"{_rounded_mean(value)}{over_n}{_show_seeds(value)}"
 
 
 def show_interval(value: Stat) -> str:
     """Write the 95 % interval over boards, or the values of a few boards, without the mean."""
-    if "values" in value:
-        return f"({'; '.join(map(_three_digits, value['values']))})"
-    low, high = value["ci95"]
-    return f"[{_three_digits(low)}, {_three_digits(high)}]"
+    digits = decimals(value)
+    ends = [
+        three_digits(end) if digits is None else f"{end:z.{digits}f}"
+        for end in value["values" if "values" in value else "ci95"]
+    ]
+    return f"({'; '.join(ends)})" if "values" in value else f"[{', '.join(ends)}]"
+
+
+def show_with_unit(value: Stat | None, unit: str) -> str:
+    """Write a mean with its unit, then its uncertainty.
+
+    >>> show_with_unit({"mean": 78.7, "n": 6, "ci95": [72.1, 84.2]}, "%")
+    '78.7 % [72.1, 84.2]'
+    """
+    mean, *uncertainty = show(value).split(" ", 1)
+    return " ".join([mean, unit, *uncertainty]) if value else mean
+
+
+def decimals(value: Stat) -> int | None:
+    """Return the number of decimals at which the uncertainty of a mean has two significant digits.
+
+    The uncertainty is half of the interval over boards, half of the range of a few boards' values, or else the standard
+    deviation. The mean gets at most four significant digits, or three if there are few boards. If that would round an
+    end of the interval to 0, all get another digit, should it help. Returns None without an uncertainty, or if the
+    numbers are too small to be written without an exponent.
+
+    >>> decimals({"mean": 78.7, "n": 6, "ci95": [72.1234, 84.2234]}), decimals({"mean": 1234.5, "n": 3, "sd": 8.0})
+    (1, 0)
+    """
+    few = value.get("values")
+    low, high = (min(few), max(few)) if few else value.get("ci95", (0.0, 2 * value.get("sd", value.get("sd_seeds", 0))))
+    uncertainty = (high - low) / 2
+    if not np.isfinite(uncertainty) or uncertainty <= 0:
+        return None
+    largest = max(abs(value["mean"]), uncertainty)
+    digits = max(0, min(1 - _exponent(uncertainty), (2 if few else 3) - _exponent(largest)))
+    ends = [end for end in value.get("ci95", ()) if end and not float(f"{end:.{digits}f}")]
+    if ends and all(float(f"{end:.{digits + 1}f}") for end in ends):
+        digits += 1
+    return digits if digits <= DECIMALS_MAX else None
+
+
+def _exponent(value: float) -> int:
+    return int(np.floor(np.log10(value)))
+
+
+def _rounded_mean(value: Stat) -> str:
+    digits = decimals(value)
+    return three_digits(value["mean"]) if digits is None else f"{value['mean']:z.{digits}f}"
+
+
+def _rounded_sd(value: Stat, name: str) -> str:
+    """Write a standard deviation with the decimals of its mean, or with one digit if these would round it to 0."""
+    digits, sd = decimals(value), value[name]
+    text = f"{sd:.2g}" if digits is None else f"{sd:.{digits}f}"
+    return text if float(text) or not sd else f"{sd:.1g}"
 
 
 def show_digits(value: Stat, digits: int) -> str:
@@ -89,10 +155,11 @@ def gain(difference: Stat, metric: str) -> Stat:
 
 
 def _show_seeds(value: Stat) -> str:
-    return f" ± {value['sd_seeds']:.2g} (seeds)" if "sd_seeds" in value else ""
+    return f" ± {_rounded_sd(value, 'sd_seeds')} (seeds)" if "sd_seeds" in value else ""
 
 
-def _three_digits(value: float) -> str:
+def three_digits(value: float) -> str:
+    """Write a number with three significant digits; four if it is 100 or more."""
     return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
 
 

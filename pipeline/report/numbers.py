@@ -94,6 +94,7 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
             if method in models and other in models
         ],
         **_single(table, headline),
+        "protocol": _protocol(table, headline),
     }
     numbers = {name: value for name, value in numbers.items() if value}
     return numbers | _sweeps(table) | {"variants": _variants(table)}
@@ -145,6 +146,22 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
         for board, group in _groups(rows, "fold", sort=False)
     }
     return {REGISTERED: over_boards(rows, REGISTERED), "by_board": by_board}
+
+
+def _protocol(table: pd.DataFrame, headline: str) -> dict[str, dict[str, int]]:
+    """Count what networks were trained and tested on, by experiment: boards, skins, folds, seeds and rows per fold."""
+    counts = {}
+    names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
+    networks = select(table[table["question"].isin(names)], recipe=headline)
+    for experiment, rows in _groups(networks, "question", sort=False):
+        folds, skins = whole(rows), by_skin(rows)
+        counts[str(experiment)] = {
+            "folds_n": folds["fold"].nunique(), "seeds_n": folds["seed"].nunique(),
+            "boards_n": skins["board"].nunique(), "skins_n": skins["skin"].nunique(),
+        } | {
+            name: int(folds[name].median()) for name in ("trained_on_skins_n", "trained_on_rows_n", "rows_n")
+        }  # fmt: skip
+    return counts
 
 
 def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:

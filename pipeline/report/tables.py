@@ -22,17 +22,20 @@ from pipeline.report.formatting import (
     beside,
     models,
     n_of,
+    reworded,
     scored,
     scores,
     show,
     show_both,
     show_difference,
+    show_with_unit,
     table_2_rows,
     tabulate,
     to_markdown,
     universal_rows,
 )
 from pipeline.report.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
+from pipeline.report.protocol import protocol_table, protocols
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
 
@@ -156,6 +159,10 @@ CASES = {
     "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
+POLICIES = {
+    "initial": "once, at the start", "regular": "every {regular_n} contacts", "each": "before every contact",
+    "free": "whenever nothing touches",
+}  # fmt: skip
 LOCALISATION = "Localisation (within 1 mm, new skin)"  # the row that we add to table 1
 OURS = "ours, measured"
 NOT_GIVEN = "–"
@@ -175,7 +182,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["single_sensor"] = _single(numbers, source)
     if "hover" in numbers:
         tables["hover"] = _hover(numbers, source)
-    tables |= experiment_tables(numbers, source)
+    tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
         "audit": audit_table, "chosen": chosen_table, "verification": verification_table,
@@ -194,11 +201,20 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     if "described" in numbers:
         columns = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
         tables["skins"] = skins_table(columns)
+    if protocols(numbers):
+        tables["protocol"] = protocol_table(numbers, source)
     tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
     tables["checklist"] = checklist(numbers)
     claims = claims_table(tables["checklist"])
     return tables if claims.empty else tables | {"claims": claims}
+
+
+def _reworded(table: pd.DataFrame) -> pd.DataFrame:
+    """Write verdicts in the words of reports."""
+    texts = table.map(lambda cell: reworded(cell) if isinstance(cell, str) else cell)
+    texts.attrs = {name: reworded(note) for name, note in table.attrs.items()}
+    return texts
 
 
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
@@ -617,10 +633,10 @@ def measured(numbers: Numbers) -> dict[str, str]:
         policy = next(name for name in ("each", "regular", "initial", "free") if name in drift)
         last = drift[policy][-1]
         cells["Durable (> 50k contacts)"] = (
-            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, "
-            f"no-load policy {policy}"
+            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, {POLICIES[policy]}"
         )
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
     if best:
-        cells[LOCALISATION] = f"{show(numbers['table2'][best]['accuracy_pct'])} % ({best})"
+        accuracy = show_with_unit(numbers["table2"][best]["accuracy_pct"], "%")
+        cells[LOCALISATION] = f"{accuracy} ({models(numbers)[best].short})"
     return {row: f"{text}, {source}" for row, text in cells.items()}

@@ -290,7 +290,7 @@ def test_shear_table_has_both_splits():
     for mean, sd in SHEAR.values():
         assert f"{mean:g} ± {sd:g}" in text
     table = shear.tables(SHEAR_NUMBERS, "simulated")["shear"]
-    assert table["accuracy, % (ours)"].tolist() == ["96 ± 0.1 ± 0.02 (seeds)", "58 ± 0.1 ± 0.02 (seeds)"]
+    assert table["accuracy, % (ours)"].tolist() == ["96.00 ± 0.10 ± 0.02 (seeds)", "58.00 ± 0.10 ± 0.02 (seeds)"]
     assert "± (seeds) is the standard deviation over 3 network seeds" in text
     assert table["split"].tolist()[0] == "random readings held out (ours; the paper does not state its split)"
     assert "4590 readings of 54 dragged lines in 1 passes" in text
@@ -304,8 +304,8 @@ def test_manual_table_has_variants_and_differences():
     for variant, name in (("before", "before"), ("after", "adapted with hand pokes")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[variant]['accuracy_pct']:g}"
     difference = table.loc["with hand pokes minus before, on the same skin", "accuracy, % (ours)"]
-    assert difference == "not judged (fewer than 4 boards): +2 ± 0.1 ± 0.02 (seeds)"
-    assert table.loc["adapted with hand pokes", "accuracy, % (ours)"] == "83 ± 0.1 ± 0.02 (seeds)"
+    assert difference == "not judged (fewer than 4 boards): +2.00 ± 0.10 ± 0.02 (seeds)"
+    assert table.loc["adapted with hand pokes", "accuracy, % (ours)"] == "83.00 ± 0.10 ± 0.02 (seeds)"
     assert "over 3 network seeds" in to_markdown(manual.tables(MANUAL_NUMBERS, "simulated")["manual"])
     assert len(table) == 7
     without = {name: value for name, value in MANUAL_NUMBERS.items() if name != "control"}
@@ -318,11 +318,11 @@ def test_flexible_table_has_bias_and_differences():
     assert f"{FLEXIBLE['mse_xy_mm2']:g}" in text
     assert "30 % less; in the paper it is 80 % less" in text
     table = flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"]
-    assert table["bias of F, N"].tolist() == [f"{mean} ± 0.1 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
+    assert table["bias of F, N"].tolist() == [f"{mean} ± 0.10 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
     assert "over 3 network seeds" in text
     text = texts_of(flexible.figures(FLEXIBLE_NUMBERS, FORCES, "simulated")["flexible.svg"])
-    assert "bias +0.96 ± 0.1 ± 0.02 (seeds) N" in text
-    assert "bias -0.83 ± 0.1 ± 0.02 (seeds) N" in text
+    assert "bias +0.96 ± 0.10 ± 0.02 (seeds) N" in text
+    assert "bias -0.83 ± 0.10 ± 0.02 (seeds) N" in text
 
 
 def test_direction_networks_are_extra_rows():

@@ -46,6 +46,12 @@ def cost(seconds: float = 1.0) -> dict:
     }  # fmt: skip
 
 
+NETWORKS = {
+    "folds_n": 2, "seeds_n": 3, "boards_n": 2, "skins_n": 4, "trained_on_skins_n": 2, "trained_on_rows_n": 7020,
+    "rows_n": 780,
+}  # fmt: skip
+
+
 def all_experiments(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
@@ -71,6 +77,7 @@ def all_experiments(source: str = "simulated") -> dict:
             "registered": scores(),
             "by_board": {"b0": {"trained_on_skins_n": 15, "as_labelled": plain, "registered": plain}},
         },
+        "protocol": {experiment: dict(NETWORKS) for experiment in ("single_random", "transfer", "lobo", "adapt")},
         "table2": {method: scores() for method in ("single", "multi", "triplet", "adapted")},
         "adapt": {"pokes_n": 390, "control": scores()},
         "paired": [

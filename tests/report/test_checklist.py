@@ -9,11 +9,15 @@ from scipy.stats import t
 
 from pipeline.report import paper
 from pipeline.report.checklist import (
+    AGREES,
+    DIFFERS,
     EQUIVALENT,
+    NO_INTERVAL,
     NOT_REACHED,
     NOT_RUN,
     ONE_SKIN,
     SETTING,
+    SHORT_OF,
     TARGET,
     Judgement,
     Row,
@@ -25,6 +29,7 @@ from pipeline.report.checklist import (
     read_rows,
     resolve,
 )
+from pipeline.report.formatting import INCONCLUSIVE
 from pipeline.scenes import ANALYSES
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED
 from reskin.errors import SchemaError
@@ -85,7 +90,7 @@ def test_missing_experiment_is_not_run():
     numbers = all_experiments()
     del numbers["shear"]
     shear = line(numbers, "shear-mse_xy_mm2")
-    assert (shear["note"], shear["shown in"], shear["paper"]) == (NOT_RUN, "–", "0.085 ± 0.006 mm²")
+    assert (shear["note"], shear["shown in"], shear["paper"]) == (NOT_RUN, "–", "0.085 mm² ± 0.006")
     assert set(checklist(numbers)["source"]) == {"simulated"}
 
 
@@ -99,7 +104,32 @@ def test_number_is_met_within_the_papers_sd_or_ten_percent(mean, sd, ours, path)
     assert (alone.criterion, alone.met) == (
         "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
     )  # fmt: skip
-    assert judgement.verdict == alone.verdict == "–"
+    assert judgement.verdict == alone.verdict == NO_INTERVAL  # the standard deviation is not an interval over boards
+
+
+@pytest.mark.parametrize(("printed", "verdict"), [(80.0, AGREES), (70.0, DIFFERS), ((85.0, 3.0), DIFFERS)])
+def test_number_is_judged_by_whether_our_interval_includes_the_papers(printed, verdict):
+    assert judge_value(over_boards(75.0, 84.0), printed).verdict == verdict
+    few = {"mean": 80.0, "n": 2, "values": [75.0, 85.0]}
+    assert judge_value(few, printed).verdict == FEW_BOARDS
+
+
+@pytest.mark.parametrize(("bias_N", "meaning"), [(-0.02642, "under-estimated"), (0.02642, "over-estimated")])
+def test_sign_of_a_bias_is_explained(bias_N, meaning):
+    numbers = all_experiments()
+    numbers["drift"]["late"]["bias_N"] = bias_N
+    bias = line(numbers, "figure-5b")
+    assert bias["ours"] == f"{bias_N:.3g} N ({meaning})"
+    assert bias["met"] == ("yes" if bias_N > 0 else "no")
+
+
+def test_protocol_is_beside_the_papers():
+    numbers = all_experiments()
+    assert line(numbers, "single-accuracy_pct")["note"].startswith(
+        f"{SHORT_OF}7,020 training readings (paper: {paper.SINGLE_TRAIN_N:,})"
+    )
+    del numbers["protocol"]  # results of an earlier version
+    assert "readings" not in line(numbers, "single-accuracy_pct")["note"]
 
 
 @pytest.mark.parametrize(
@@ -173,7 +203,7 @@ def test_rule_over_counts_fails_if_one_count_fails():
     ]
     judgement = judge_value(sweep, rule="each")
     assert (judgement.verdict, judgement.met) == (UNDECIDED, "yes")
-    assert judgement.notes == ("by number of skins: 1 supported, 6 undecided, 15 supported",)
+    assert judgement.notes == ("by number of skins: 1 supported, 6 inconclusive, 15 supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
     assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
@@ -190,9 +220,19 @@ def test_value_to_which_the_simulation_is_calibrated_is_not_evidence():
 def test_every_claim_has_a_verdict():
     table = checklist(all_experiments())
     claims = table["result"].str.startswith("claim")
-    assert set(table.loc[claims, "verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS}
+    of_claims = {SUPPORTED, CONTRADICTED, INCONCLUSIVE, FEW_BOARDS}
+    assert set(table.loc[claims, "verdict"]) <= of_claims
     assert claims.sum() > 20
-    assert set(table["verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS, "–"}
+    assert set(table["verdict"]) <= {
+        SUPPORTED,
+        CONTRADICTED,
+        INCONCLUSIVE,
+        FEW_BOARDS,
+        NO_INTERVAL,
+        AGREES,
+        DIFFERS,
+        "–",
+    }
 
 
 def test_claim_beyond_the_range_of_a_sweep_is_not_reached():
@@ -221,11 +261,11 @@ def test_short_run_is_noted_as_not_reached():
     numbers = all_experiments()
     assert line(numbers, "figure-5b")["note"] == "45,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["contacts_n"] = 18_000
-    assert line(numbers, "figure-5b")["note"] == "not reached: 18,000 contacts (paper: 45,000)"
+    assert line(numbers, "figure-5b")["note"] == f"{SHORT_OF}18,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["bias_N"] = -0.1
     bias = line(numbers, "figure-5b")
     assert bias["met"] == "no"
-    assert bias["note"].startswith("not reached: 18,000 contacts (paper: 45,000). The paper explains")
+    assert bias["note"].startswith(f"{SHORT_OF}18,000 contacts (paper: 45,000). The paper explains")
     del numbers["drift"]
     assert line(numbers, "figure-5b")["note"] == NOT_RUN
 
@@ -281,7 +321,7 @@ def test_p_values_of_a_family_of_claims_are_corrected_by_holm():
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
     # Three claims: 0.01 becomes 0.03; 0.03 and 0.04 become 0.06, not significant, although the intervals exclude 0.
-    assert table["verdict"].tolist() == [SUPPORTED, UNDECIDED, UNDECIDED, SUPPORTED]
+    assert table["verdict"].tolist() == [SUPPORTED, INCONCLUSIVE, INCONCLUSIVE, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
 

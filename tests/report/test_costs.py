@@ -310,5 +310,5 @@ def test_reference_methods_have_times_and_errors():
     took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
     found = learning_times({"rivals": {"methods": methods}}, {"reference_methods": took})
     (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
-    assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 0.1")
+    assert (line["method"], line["accuracy, %"]) == ("map", "40.00 ± 0.10")
     assert (line["until ready, s"], line["per reading, µs"]) == ("3", "50")

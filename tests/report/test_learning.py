@@ -69,7 +69,7 @@ def test_paired_table_has_the_papers_difference_of_means():
     assert table["accuracy, % (ours)"].tolist() == [
         "+55 [40, 70]",
         "-3.4 [-4.4, -2.4]",
-        "+6 [5, 7]",
+        "+6.0 [5.0, 7.0]",
         "+0.1 [-2.9, 3.1]",
     ]
     # Differences of means in the paper's table 2: 81.03 - 84.43 and 87.00 - 81.03; the paper has no control.
@@ -100,7 +100,7 @@ def test_table_2_rows_follow_the_paper():
         "87 ± 11.81",
         "–",
     ]
-    assert table["accuracy, % (ours)"].tolist()[-1] == "82 ± 1"
+    assert table["accuracy, % (ours)"].tolist()[-1] == "82.0 ± 1.0"
 
 
 def test_other_number_of_pokes_is_stated():
@@ -112,7 +112,7 @@ def test_other_number_of_pokes_is_stated():
 def test_sweeps_are_sorted_by_count():
     table = sweep_pokes_table([{"pokes_n": n, **row(80.0 + n / 100)} for n in (390, 0, 65)], "simulated")
     assert table["pokes"].tolist() == ["0", "65", "390"]
-    assert table["accuracy, % (ours)"].tolist() == ["80 ± 1", "80.7 ± 1", "83.9 ± 1"]
+    assert table["accuracy, % (ours)"].tolist() == ["80.0 ± 1.0", "80.7 ± 1.0", "83.9 ± 1.0"]
     assert table["accuracy, % (paper, table 2)"].tolist() == ["81.03 ± 12.86", "–", "87 ± 11.81"]
     rows = [{"method": m, "skins_n": n, **row(n)} for m in ("adapted", "multi") for n in (15, 3)]
     table = sweep_sensors_table(rows, "simulated")
@@ -133,9 +133,9 @@ def test_labels_table_has_both_scores():
     one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
     (line,) = labels_table([one], "recorded").to_dict("records")
     assert line == {
-        "method": "ridge", "inputs": "shape", "labels": "20", "source": "recorded", "accuracy, %": "30 ± 1",
-        "MSE_xy, mm²": "0.5 ± 1", "MSE_F, N²": "–", "R² of F": "–", "accuracy, % (registered)": "42 ± 1",
-        "MSE_xy, mm² (registered)": "0.2 ± 1", "n": "6",
+        "method": "ridge", "inputs": "shape", "labels": "20", "source": "recorded", "accuracy, %": "30.0 ± 1.0",
+        "MSE_xy, mm²": "0.5 ± 1.0", "MSE_F, N²": "–", "R² of F": "–", "accuracy, % (registered)": "42.0 ± 1.0",
+        "MSE_xy, mm² (registered)": "0.2 ± 1.0", "n": "6",
     }  # fmt: skip
     uncertain = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
     (_, line) = labels_table([one, uncertain], "recorded").to_dict("records")

@@ -102,14 +102,25 @@ def test_multi_minus_single_uses_skins_of_both():
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
+def test_protocol_counts_what_networks_were_trained_and_tested_on():
+    counts = numbers(board_cards("lobo", 80.0))["protocol"]
+    assert counts.keys() == {"lobo"}
+    cards = board_cards("lobo", 80.0)
+    assert counts["lobo"]["folds_n"] == len({one["fold"] for one in cards})
+    assert counts["lobo"]["seeds_n"] == len({one["seed_i"] for one in cards})
+    assert counts["lobo"]["skins_n"] == len({skin for one in cards for skin in one["scores"]["by_skin"]})
+    assert counts["lobo"]["trained_on_skins_n"] == len(cards[0]["train_skins"])
+    assert counts["lobo"]["trained_on_rows_n"] == cards[0]["train_rows_n"]
+
+
 def test_missing_experiment_has_no_numbers():
     assert numbers([]) == {"variants": {}}
-    assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
+    assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "protocol", "variants"}
     without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
-    assert without.keys() == {"table2", "lobo", "paired", "variants"}
+    assert without.keys() == {"table2", "lobo", "paired", "protocol", "variants"}
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
     alone = numbers(adapted_cards("paper", 78.0, 1.0))
-    assert alone.keys() == {"table2", "adapt", "variants"}
+    assert alone.keys() == {"table2", "adapt", "protocol", "variants"}
     assert alone["adapt"] == {"pokes_n": 390}  # there is no control
     assert "null" not in json.dumps(numbers())
 

@@ -1,7 +1,9 @@
 """Tests of the report's tables: our numbers, numbers of the paper, source."""
 
 import json
+import re
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from hypothesis import given
@@ -78,7 +80,7 @@ def test_rows_before_touch_follow_the_row_of_their_split():
     predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
     table = make_tables(shown | before_touch_numbers([predicted]))["single_sensor"]
-    assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15", "98"]
+    assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15.0", "98.0"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
     assert "without the field change" in table.attrs["meaning"]
@@ -152,7 +154,7 @@ def test_table_2_has_the_papers_numbers():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
         assert f"{value[0]:g} ± {value[1]:g}" in text  # with the digits that the paper prints
-    assert "85 ± 7.1" in text
+    assert "85.0 ± 7.1" in text
 
 
 def test_one_training_skin_is_not_called_pooled():
@@ -176,13 +178,34 @@ def test_unknown_number_is_a_dash():
 
 
 def test_format_of_spread_over_seeds():
-    assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.7 ± 0.04 (seeds)"
-    assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1 ± 0.04 (seeds)"
+    assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.70 ± 0.04 (seeds)"
+    assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1.0 ± 0.04 (seeds)"
     boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
     assert show(boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
     few = {"mean": 85.0, "n": 2, "sd": 7.0, "values": [80.0, 90.0]}
-    assert (show(few), show_digits(few, 1)) == ("85 (80; 90)", "85.0 (80.0; 90.0)")
+    assert (show(few), show_digits(few, 1)) == ("85.0 (80.0; 90.0)", "85.0 (80.0; 90.0)")
     assert show_digits(boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
+
+
+@given(
+    mean=st.floats(-200, 200),
+    half=st.floats(1e-4, 100),
+    asymmetry=st.floats(0.3, 0.7),
+)
+def test_uncertainty_decides_the_digits(mean, half, asymmetry):
+    value = {"mean": mean, "n": 6, "ci95": [mean - 2 * half * asymmetry, mean + 2 * half * (1 - asymmetry)]}
+    shown, low, high = (float(text) for text in re.sub(r"[\[\],]", "", show(value)).split())
+    unit = 10.0 ** -len(show(value).partition(" ")[0].partition(".")[2])
+    ends = zip((shown, low, high), (mean, *value["ci95"]), strict=True)
+    assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)  # all have the same number of decimals
+    digits = np.floor(np.log10(half / unit)) + 1  # of half of the interval
+    assert digits <= 3  # two, or three to keep an end from being rounded to 0
+    assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10  # fewer only if the mean already has four
+
+
+def test_end_of_an_interval_is_not_rounded_to_zero():
+    assert show({"mean": 2.09, "n": 6, "ci95": [0.0134, 4.17]}) == "2.09 [0.01, 4.17]"
+    assert show({"mean": 0.0335, "n": 6, "ci95": [-2e-5, 0.067]}) == "0.034 [0.000, 0.067]"  # no digit would help
 
 
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
@@ -230,7 +253,7 @@ def test_summary_starts_with_the_universal_model():
     numbers |= {"population": {"told": rows}}
     first = summary_table(numbers).iloc[0]
     assert "65 unlabelled pokes" in first[HELD_OUT]
-    assert first["accuracy, % (paper)"] == "91 [90, 92]"
+    assert first["accuracy, % (paper)"] == "91.0 [90.0, 92.0]"
     assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
 
 

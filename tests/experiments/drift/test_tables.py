@@ -45,8 +45,8 @@ DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 def test_table_has_a_row_per_window_with_all_policies(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
-    assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02 ± 0.0004"] * 2
-    assert table["accuracy, % (once at the start)"].tolist() == ["50 ± 1"] * 2
+    assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02000 ± 0.00040"] * 2
+    assert table["accuracy, % (once at the start)"].tolist() == ["50.0 ± 1.0"] * 2
     assert set(table["source"]) == {source}
 
 
@@ -135,7 +135,7 @@ def test_table_of_the_added_walk_has_a_row_per_step():
     }
     table = tables(numbers(wander=steps), "simulated")["drift_wander"]
     assert table["added walk, µT per contact"].tolist() == ["0", "0.5", "5"]
-    assert table["accuracy, % (once at the start)"].tolist() == ["90 ± 1.5", "89.5 ± 1.5", "85 ± 1.5"]
+    assert table["accuracy, % (once at the start)"].tolist() == ["90.0 ± 1.5", "89.5 ± 1.5", "85.0 ± 1.5"]
     assert "± is the standard deviation over 2 network seeds" in to_markdown(table)
     assert "After 10,000 contacts, with" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
     assert "drift_wander" not in tables(numbers(), "simulated")
