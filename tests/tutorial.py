@@ -40,7 +40,7 @@ STEP = re.compile(
 )
 LONG_S = 1800.0
 HTTP_PORT = "8765"  # port on the page; the test uses a free one, because several tests may run at the same time
-# Outputs contain times of arrival and depend on them: a recording begins with another frame each time.
+# Outputs contain times of arrival. They also depend on these times: each recording begins with another frame.
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
 NUMBER = re.compile(r"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 OPTIONAL = (  # parts of lines that occur only if the machine is busy
@@ -105,7 +105,7 @@ def run(steps: Sequence[Step], folder: Path, say: Callable[[str], object] = lamb
 
 
 def shown(output: str, step: Step, folder: Path) -> str:
-    """Return an output as the page shows it: with another folder and terminal, and shortened if the step says so."""
+    """Return an output as the page shows it: with the page's folder and terminal, and shortened if the step says so."""
     output = re.sub(r"/dev/pts/\d+", "/dev/pts/3", output).replace(str(folder), "/home/me/reskin").replace("\r", "\n")
     lines = [line.rstrip() for line in output.splitlines() if line.strip()]
     if "from" in step.options:
@@ -211,7 +211,7 @@ def _without_optional(text: str) -> str:
 
 
 def write(text: str, done: Sequence[Done]) -> str:
-    """Return the page with the outputs of its steps; steps whose output the page does not show stay without."""
+    """Return the page with new outputs of its steps; steps without an output on the page do not get one."""
     outputs = iter(done)
 
     def replace_output(match: re.Match[str]) -> str:

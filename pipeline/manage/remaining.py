@@ -24,8 +24,8 @@ from reskin.config import read_yaml
 STATE = Path(".reskin/run.json")  # the current run: its process, its start, the planned stages and those that started
 LOCK = Path("dvc.lock")
 CODE, DIGESTS = "code", "data/code"  # the stage that writes digests of modules, and its output
-START_S = 1.5  # assumed: start of Python and DVC's own work, for each stage
-SIDE_BY_SIDE_N = 2  # trainings, by default
+START_S = 1.5  # assumed time per stage for the start of Python and DVC's own work
+SIDE_BY_SIDE_N = 2  # number of training runs at the same time, by default
 TRUSTED = 0.1  # fraction of the work after which the speed of this run counts as much as that of the recorded one
 
 
@@ -88,7 +88,7 @@ def _sentence(stage: str, run: Mapping[str, Any], now_s: float) -> str | None:
 
 
 def _duration(seconds: float) -> str:
-    """Write a duration with a unit that people use.
+    """Write a duration in seconds, minutes or hours, rounded to two digits or fewer.
 
     >>> [_duration(s) for s in (0.4, 42, 61, 250, 4000, 40000)]
     ['0 s', '40 s', '1.0 min', '4.2 min', '67 min', '11 h']
@@ -140,7 +140,7 @@ def _value(settings: Any, key: str) -> Any:
 
 
 def expected_seconds(root: Path, stages: Iterable[str]) -> dict[str, float | None]:
-    """Return the time that each stage takes without finished trainings, by the last report of its scene.
+    """Return the time that each stage takes if it reuses no training runs, according to the last report of its scene.
 
     The value of a stage is None if its scene has no report.
     """
@@ -161,15 +161,15 @@ def _expected_s(name: str, costs: Mapping[str, Mapping[str, Any]]) -> float | No
     scene = max(scenes, key=len)
     part = item.removeprefix(scene).strip("-")
     cost = costs[scene].get(f"{stage}-{part}" if part else stage)
-    if cost is None:  # its cost is not in the report, because it runs after it or takes no time worth mentioning
+    if cost is None:  # not in the report, because the stage runs after it or takes very little time
         return START_S
     return START_S + _without_reuse_s(cost)
 
 
 def _without_reuse_s(cost: Mapping[str, Any]) -> float:
-    """Return the time that a stage takes if none of its trainings is finished before.
+    """Return the time that a stage takes if it reuses no training runs.
 
-    The processor time of the stage limits its own time, as a busy machine makes the elapsed time longer.
+    The stage's own time is at most its processor time, because a busy machine makes the elapsed time longer.
     """
     own_s = min(cost["seconds"], cost["cpu_s"])
     reused = cost["reused_n"] / cost["trainings_n"] if cost["trainings_n"] else 0.0
