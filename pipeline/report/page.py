@@ -3,21 +3,24 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup, escape
 from pydantic import Field
 
-from pipeline.report.checklist import ONE_SKIN
+from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
+from pipeline.report.checklist import CLAIM, ONE_SKIN
 from pipeline.report.costs import cost_tables
 from pipeline.report.experiments import add_sections
 from pipeline.report.figures import HEADLINE
 from pipeline.report.formatting import notes
+from pipeline.report.protocol import Protocol, protocols
 from pipeline.report.sentences import sentences
-from pipeline.report.tables import summary_table
 from pipeline.stages import is_stage, module_name
 from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
@@ -25,32 +28,49 @@ from reskin.errors import SchemaError
 
 Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
-NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no number
+PLACES_FILE = Path(__file__).with_name("places.yaml")
+SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that names the table or figure of a result
+SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
+SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
-OPEN = {
-    "table2",
-    "labels",
-    "claims",
-    "final_model",
-}  # tables that are unfolded when the page loads; all others are folded
+# Tables that are unfolded when the page loads; all others are folded.
+OPEN = {"table1", "table2", "labels", "claims", "final_model"}
+WHOLE = ("verdicts", "checklist")  # sections of the whole list of claims or results
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
-SUMMARY = "Main scores on held-out boards"
+EFFORTS = "Scores on new skins, by model and by what the model needs of the new skin"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
 # No line break is allowed between a number and its deviation, or between an interval and its unit.
-UNBROKEN = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
+UNBROKEN = re.compile(
+    r"(?<=\d) ± (?=\d)|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?"
+)
+SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 LONG = 40  # characters; a column with a longer cell is wide
+NO_VALUE = ("–", "")  # cells that are not shown if the rows of a table are stacked
+# Widths of a table in rem: a table that is wider than its place on the screen is shown with its rows stacked.
+STEPS_REM = (18, 22, 26, 30, 36, 42, 48, 54, 60, 65, 70, 76, 90, 110, 140)
+CHARACTER_REM, PADDING_REM = 0.52, 1.0  # widths of a character and of a cell's padding
+SHORT_LINE, LONG_LINE = 14, 20  # characters in a line of a short cell and of a long one, if it is wrapped
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
 LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; in these files, 1 px means 1 pt
 PX_PER_PT = 4 / 3
 WIDE_PT = 500.0  # a wider figure gets its own row
 LEGIBLE_PX = 8.0  # smallest legible letters; a figure scrolls before its letters become smaller
 NARROW_PX = 340.0  # width of a phone's screen
+
+
+class Place(Strict):
+    """A table or figure of the paper: its name there, what it shows, and the tables and figures that show it here."""
+
+    id: str
+    name: str
+    what: str
+    shown: tuple[str, ...] = ()
 
 
 class Section(Strict):
@@ -73,6 +93,7 @@ class Section(Strict):
 class Drawing:
     """A figure on the page: its file, its size, and the width below which its letters become illegible."""
 
+    id: str
     file: str
     width_px: int
     height_px: int
@@ -88,45 +109,93 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Table:
-    """A table on the page; `looks` has the style of each column: `number` (aligned right), `text` or `text long`."""
+    """A table on the page; `looks` has the style of each column: `number` (aligned right), `text` or `text long`.
 
+    In a place narrower than `width_rem`, the rows of the table are stacked.
+    """
+
+    id: str
     name: str
     caption: str
     columns: list[str]
     looks: list[str]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     notes: list[str]
+    width_rem: int
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes: its name, counts of captures, main scores and headline figure."""
+    """A scene on the page of all scenes: its name, what it is, counts of captures, its answers and headline figure."""
 
     scene: str
     about: str
-    summary: Table | None
+    counts: str
+    answers: Answers
+    efforts: Table | None
     figure: Drawing | None
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
     """Render the page of a scene, which is the same for every repeat of a run; `figures`: SVG text by file name."""
-    source, summary = numbers["provenance"]["source"], summary_table(numbers)
-    drawings = {name: measure(f"figures/{name}", text) for name, text in figures.items()}
+    source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
+    drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
     drawings = describe(drawings, sentences(numbers))
     checklist = tables.get("checklist", pd.DataFrame())
+    answered, ran = answers(numbers), protocols(numbers)
+    sections = arrange(tables, drawings)
     return template("page.html").render(
         scene=numbers["provenance"]["scene"],
         source=source,
         about=about(numbers),
-        summary=None if summary is None else lay_out("summary", SUMMARY, summary),
+        answers=answered,
+        efforts=efforts_table("efforts", answered),
+        levels=LEVELS,
+        brackets=IN_BRACKETS,
+        places=[place_on_page(place, ids) for place in read_places()],
         sections=[
-            _fill(section, tables, drawings, source)
-            | {"beside": beside_paper(section, checklist), "stages": stages_of(section, checklist)}
-            for section in arrange(tables, drawings)
+            _fill(section, tables, drawings, source, ids)
+            | {
+                "beside": beside_paper(section, checklist, ids),
+                "stages": stages_of(section, checklist),
+                "ran": _ran(section, ran),
+            }
+            for section in sections
         ],
         saved=[*tables],
         opened=OPEN,
     )
+
+
+def read_places() -> list[Place]:
+    """Read the tables and figures of the paper, in its order."""
+    return [parse(Place, entry, f"places, entry {entry['id']}") for entry in read_yaml(PLACES_FILE)]
+
+
+def ids_of(names: Iterable[str]) -> dict[str, str]:
+    """Return the id of each table and figure on a page; those that show one of the paper's have the paper's name."""
+    papers: dict[str, str] = {}
+    shown = list(names)
+    for place in read_places():
+        if name := next((name for name in place.shown if name in shown), None):
+            papers[name] = place.id
+    own = {name: f"{name.removesuffix('.svg')}-{'figure' if name.endswith('.svg') else 'table'}" for name in shown}
+    return own | papers
+
+
+def place_on_page(place: Place, ids: Mapping[str, str]) -> dict[str, Any]:
+    """Return a table or figure of the paper, and whether the page shows it."""
+    return {"id": place.id, "name": place.name, "what": place.what, "here": place.id in ids.values()}
+
+
+def _ran(section: Section, ran: Sequence[Protocol]) -> list[Protocol]:
+    return [protocol for protocol in ran if protocol.section == section.key]
+
+
+def efforts_table(name: str, answered: Answers) -> Table | None:
+    """Tabulate the scores behind the answers of a scene; None if no board was held out."""
+    cells = [effort.cells for effort in answered.efforts]
+    return lay_out(name, EFFORTS, pd.DataFrame(cells)) if cells else None
 
 
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
@@ -136,7 +205,8 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
-    drawings = {name: measure(name, text) for name, text in costs.items() if name.endswith(".svg")}
+    ids = ids_of([*tables, *costs])
+    drawings = {name: measure(name, text, ids[name]) for name, text in costs.items() if name.endswith(".svg")}
     drawings = describe(drawings, sentences(numbers))
     provenance = pd.DataFrame(
         {
@@ -151,39 +221,71 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
         scene=numbers["provenance"]["scene"],
         source=source,
         provenance=lay_out("provenance", "Provenance", provenance),
-        sections=[_fill(section, tables, drawings, source) for section in arrange(tables, drawings)],
+        sections=[_fill(section, tables, drawings, source, ids) for section in arrange(tables, drawings)],
     )
 
 
-def index(results: Sequence[Mapping[str, Any]], headlines: Mapping[str, str]) -> str:
-    """Render the page of all scenes, with recorded scenes first. `headlines`: headline figures by scene."""
+def index(
+    results: Sequence[Mapping[str, Any]], headlines: Mapping[str, str], described: Mapping[str, str] | None = None
+) -> str:
+    """Render the page of all scenes, with recorded scenes first.
+
+    headlines: headline figures by scene. described: what a scene is, by scene.
+    """
     kinds = []
     for source, title in KINDS.items():
-        entries = [_entry(numbers, headlines) for numbers in results if numbers["provenance"]["source"] == source]
+        entries = [
+            _entry(numbers, headlines, described or {})
+            for numbers in results
+            if numbers["provenance"]["source"] == source
+        ]
         if entries:
-            entries.sort(key=lambda entry: (entry.summary is None, entry.scene))  # scenes with a summary first
+            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))  # scenes that hold out boards first
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
-    return template("page.index.html").render(kinds=kinds)
+    return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
 
 
-def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str]) -> Entry:
-    scene = str(numbers["provenance"]["scene"])
-    summary = summary_table(numbers)
-    table = None if summary is None else lay_out(f"summary-{scene}", SUMMARY, summary)
-    figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene]) if scene in headlines else None
-    return Entry(scene, counts_of(numbers), table, figure)
+def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str], described: Mapping[str, str]) -> Entry:
+    scene, answered = str(numbers["provenance"]["scene"]), answers(numbers)
+    figure = None
+    if scene in headlines:
+        figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene], f"{scene}-figure")
+    efforts = efforts_table(f"efforts-{scene}", answered)
+    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure)
+
+
+def about_scene(text: str) -> str:
+    """Return what a scene is: the first sentence of the comment at the top of its YAML file.
+
+    >>> about_scene("# Scene ini: two boards, pressed\\n# by a printer. One is new.\\nsource: recorded")
+    'Two boards, pressed by a printer.'
+    """
+    lines = takewhile(lambda line: line.startswith("#"), text.splitlines())
+    comment = " ".join(line.lstrip("# ") for line in lines)
+    sentence = re.sub(r"^Scene \w+(, [^:]*)?:? ", "", SENTENCE_END.split(comment)[0])
+    return sentence[:1].upper() + sentence[1:]
 
 
 def template(name: str) -> Template:
     """Load a Jinja template from the folder of this module."""
     environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
     environment.tests["number_text"] = NUMBER.fullmatch
+    environment.tests["no_value"] = lambda cell: cell in NO_VALUE
     environment.filters["unbroken"] = unbroken
+    environment.filters["code"] = show_code
+    environment.globals["steps_rem"] = STEPS_REM
     return environment.get_template(name)
+
+
+def show_code(text: str) -> Markup:
+    """Mark what is between backquotes as code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def unbroken(text: str) -> str:
     """Use non-breaking spaces between a number and its deviation, and within an interval and its unit."""
+    if isinstance(text, Markup):
+        return text
     return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)
 
 
@@ -219,14 +321,18 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
     return f"Main captures: {captures_n:,}, with {listed}."
 
 
-def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
+def beside_paper(section: Section, checklist: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table | None:
     """Tabulate the checklist rows of a section that contain a number of ours; rows with verdicts come first."""
-    rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NO_NUMBER and row["note"] != ONE_SKIN]
+    rows = [row for row in _rows_of(section, checklist) if _has_number(row["ours"]) and row["note"] != ONE_SKIN]
     if not rows:
         return None
-    rows.sort(key=lambda row: row["verdict"] in NO_NUMBER)
+    rows.sort(key=lambda row: (not row["result"].startswith(CLAIM), row["verdict"] in NO_VALUE))
     columns = ["result", "ours", "paper", "verdict", "note"]
-    return lay_out(f"beside-{section.key}", "Comparison with the paper", pd.DataFrame(rows[:BESIDE_N])[columns])
+    return lay_out(f"beside-{section.key}", "Comparison with the paper", pd.DataFrame(rows[:BESIDE_N])[columns], ids)
+
+
+def _has_number(cell: str) -> bool:
+    return cell not in NO_VALUE and not cell.startswith(SEE)
 
 
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
@@ -237,14 +343,14 @@ def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]
 
 def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
     """Select the checklist rows whose tables or figures the section shows."""
-    if section.key == "checklist" or checklist.empty:
+    if section.key in WHOLE or checklist.empty:
         return []
     cells = checklist.astype(str)
     rows = (dict(zip(cells.columns, row, strict=True)) for row in cells.itertuples(index=False))
     return [row for row in rows if section.captions.keys() & set(row["shown in"].split(", "))]
 
 
-def measure(file: str, svg: str) -> Drawing:
+def measure(file: str, svg: str, id: str) -> Drawing:
     """Read the size of a figure from its SVG text, and compute the smallest legible width, in CSS pixels."""
     size = SVG_SIZE_PT.search(svg)
     if size is None:
@@ -253,7 +359,7 @@ def measure(file: str, svg: str) -> Drawing:
     smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)
     least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt
     width_px, height_px = (round(PX_PER_PT * side_pt) for side_pt in (width_pt, height_pt))
-    return Drawing(file, width_px, height_px, round(least_px), width_pt > WIDE_PT)
+    return Drawing(id, file, width_px, height_px, round(least_px), width_pt > WIDE_PT)
 
 
 def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
@@ -261,11 +367,64 @@ def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dic
     return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
 
 
-def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
-    """Prepare a table for the page: how its columns look, its cells as text, and its notes."""
-    cells = table.fillna("").astype(str)
+def lay_out(name: str, caption: str, table: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table:
+    """Prepare a table for the page: how its columns look, its cells as text, its notes and its width.
+
+    A column `source` with one value is moved to the caption. Tables with verdicts have one column on how each verdict
+    came about, instead of several. `ids`: ids of the tables and figures on the page, to which cells link.
+    """
+    cells = table.fillna("")
+    if "source" in cells and cells["source"].nunique() == 1:
+        caption = f"{caption} ({cells['source'].iloc[0]})"
+        cells = cells.drop(columns="source")
+    if "criterion" in cells:
+        cells = _explain_verdicts(cells)
+    cells = cells.astype(str)
+    shown_in = [cell.split(", ")[0] for cell in cells.pop(SHOWN_IN)] if SHOWN_IN in cells else [""] * len(cells)
     looks = [_look(cells[title]) for title in cells.columns]
-    return Table(name, caption, [*map(str, cells.columns)], looks, [*cells.itertuples(index=False)], notes(table))
+    rows = [*cells.itertuples(index=False, name=None)]
+    columns = [*map(str, cells.columns)]
+    width_rem = _width_rem(columns, rows)
+    if "ours" in columns:
+        i, ids = columns.index("ours"), ids or {}
+        rows = [(*row[:i], link(row[i], shown, ids), *row[i + 1 :]) for row, shown in zip(rows, shown_in, strict=True)]
+    return Table((ids or {}).get(name, name), name, caption, columns, looks, rows, notes(table), width_rem)
+
+
+def link(result: str, shown_in: str, ids: Mapping[str, str]) -> str:
+    """Link a result of the checklist to the table or figure of the page that shows it, if the page has it."""
+    seen = SEEN.fullmatch(result)
+    name = seen["name"] + ".svg" * (seen["kind"] == "figure") if seen else shown_in
+    if name not in ids or result in NO_VALUE:
+        return result
+    return Markup(f'<a href="#{ids[name]}">{escape(unbroken(result))}</a>')
+
+
+def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
+    """Join the columns on how a verdict came about: criterion, p-value and notes."""
+    parts = {"criterion": "{}", "p (Holm)": "p = {} (Holm)", "note": "{}"}
+    why = [
+        "; ".join(text.format(row[name]) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
+        for row in cells.to_dict("records")
+    ]
+    shown = cells.drop(columns=[*parts, "met", "paper in our interval", "stage"], errors="ignore")
+    position = list(shown.columns).index("verdict") + 1
+    shown.insert(position, "criterion and notes", why)
+    first = next(title for title in ("claim", "result") if title in shown)
+    return shown[[first, *(title for title in shown if title != first)]]
+
+
+def _width_rem(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> int:
+    """Estimate the smallest width, in rem, at which a table is easy to read as a table."""
+    width_rem = 0.0
+    for i, title in enumerate(columns):
+        cells = [row[i] for row in rows]
+        word = max(len(word) for text in (title, *map(unbroken, cells)) for word in text.split(" "))
+        cell = max(map(len, cells), default=0)
+        line = LONG_LINE if cell > LONG else SHORT_LINE
+        nowrap = max((len(text) for text in cells if NUMBER.fullmatch(text)), default=0)
+        width_rem += CHARACTER_REM * max(word, nowrap, min(cell, line)) + PADDING_REM
+    return next((step for step in STEPS_REM if step >= width_rem), STEPS_REM[-1])
 
 
 def _look(cells: "pd.Series[str]") -> str:
@@ -275,7 +434,11 @@ def _look(cells: "pd.Series[str]") -> str:
 
 
 def _fill(
-    section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
+    section: Section,
+    tables: Mapping[str, pd.DataFrame],
+    figures: Mapping[str, Drawing],
+    source: str,
+    ids: Mapping[str, str],
 ) -> dict[str, Any]:
     """Prepare a section for the template: heading, sentence, and those tables and figures that exist in this report."""
     captions = section.tables | section.folded
@@ -283,6 +446,6 @@ def _fill(
         "key": section.key,
         "title": section.title,
         "sentence": section.sentence,
-        "tables": [lay_out(name, text, tables[name]) for name, text in captions.items() if name in tables],
+        "tables": [lay_out(name, text, tables[name], ids) for name, text in captions.items() if name in tables],
         "figures": [(figures[name], f"{text} ({source})") for name, text in section.figures.items() if name in figures],
     }

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 import pyarrow as pa
 
-from pipeline import PLAN
+from pipeline import PLAN, SCENES
 from pipeline.executors import make_executor
 from pipeline.provenance import (
     COSTS,
@@ -38,7 +38,7 @@ from pipeline.report.numbers import (
     split,
     sweep_curves,
 )
-from pipeline.report.page import index, page, run_page
+from pipeline.report.page import about_scene, index, page, run_page
 from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, table_2_summary, table_texts
 from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
@@ -185,7 +185,10 @@ def write_index(reports: Path) -> None:
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
     files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
     headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
-    io.write_text(reports / "index.html", index([numbers for numbers in results if "described" in numbers], headlines))
+    settings = (Path(SCENES) / f"{numbers['provenance']['scene']}.yaml" for numbers in results)
+    about = {file.stem: about_scene(file.read_text(encoding="utf-8")) for file in settings if file.exists()}
+    shown = [numbers for numbers in results if "described" in numbers]
+    io.write_text(reports / "index.html", index(shown, headlines, about))
 
 
 def publish(settings: Settings, indentations: Path, models: Path, results: Path, reports: Path) -> None:

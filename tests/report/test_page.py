@@ -1,6 +1,12 @@
+import html
+import json
+import os
 import re
+import shutil
+import subprocess
 from collections import Counter
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import pandas as pd
@@ -10,15 +16,18 @@ from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
     BESIDE_N,
+    EFFORTS,
     LEGIBLE_PX,
-    SUMMARY,
+    STEPS_REM,
     about,
+    about_scene,
     arrange,
     beside_paper,
     index,
     lay_out,
     measure,
     page,
+    read_places,
     read_sections,
     run_page,
     unbroken,
@@ -104,12 +113,79 @@ def test_links_lead_to_unique_ids(read):
     assert labels <= set(ids)
 
 
-def test_tables_scroll_and_name_their_columns(read):
+def test_tables_name_their_columns(read):
     tables = read.all("table")
     assert len(tables) > 8
-    assert all(above[-1] == "div.box" for _, above in tables)
+    assert all(above[-1].startswith("div.box") for _, above in tables)
     assert len(read.all("caption")) == len(tables)
     assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
+
+
+def test_stacked_rows_keep_their_labels_and_roles(read):
+    """In a narrow place, the rows of a table are stacked: each cell is labelled, and roles restore the table."""
+    widths = {above[-1].rpartition(" ")[2] for _, above in read.all("table")}
+    stacked = set(re.findall(r"\n[.](w\d+) tbody tr {", render()))
+    assert widths <= stacked == {f"w{rem}" for rem in STEPS_REM}
+    cells = read.all("td")
+    assert len(cells) > 100
+    assert all(attributes["data-label"].strip() and attributes["role"] == "cell" for attributes, _ in cells)
+    roles = {"table": "table", "tbody": "rowgroup", "thead": "rowgroup", "tr": "row"}
+    assert all(attributes["role"] == role for tag, role in roles.items() for attributes, _ in read.all(tag))
+
+
+def test_wider_tables_are_stacked_at_larger_widths():
+    row = {f"column {i}": "12.3 [10.1, 14.5]" for i in range(9)}
+    widths = [lay_out("t", "T", pd.DataFrame([dict([*row.items()][:n])])).width_rem for n in range(1, 10)]
+    assert widths == sorted(widths)
+    assert 20 < widths[2] < widths[8] < 90
+
+
+def test_each_table_and_figure_of_the_paper_is_linked_from_the_top():
+    places = read_places()
+    shown = {name: SVG.format(300) for place in places for name in place.shown if name.endswith(".svg")}
+    tables = {name: pd.DataFrame({"a": ["1"]}) for place in places for name in place.shown if name not in shown}
+    text = page(split(all_experiments())[0], tables | {"checklist": checklist(all_experiments())}, shown)
+    read, bar = Reader(text), text[text.index('<nav class="places"') :].partition("</nav>")[0]
+    assert text.index(bar) < text.index("<main>")
+    links = dict(re.findall(r'<a href="#([^"]+)"><b>([^<]+)</b>', bar))
+    assert {f"table-{i}" for i in (1, 2)} | {f"figure-{i}{letter}" for i in (4, 5, 6) for letter in "ab"} <= set(links)
+    ids = {attributes["id"]: tag for tag, attributes, _ in read.elements if "id" in attributes}
+    assert all(ids[place.id] == ("details" if place.shown[0] in tables else "figure") for place in places)
+    assert all(link.startswith("#") for link in re.findall('href="([^"]+)"', bar))
+    # The page of a scene without one of them says so, and has no link to it.
+    assert 'href="#figure-4a"' not in render()
+    assert "not in this scene" in render()
+
+
+def test_first_section_answers_for_place_and_force(read):
+    main = render().partition("<main>")[2]
+    first = main.partition("</section>")[0]
+    assert 'id="answer"' in first
+    assert [word for word in ("Place", "Force") if f'<span class="quantity">{word}</span>' in first] == [
+        "Place",
+        "Force",
+    ]
+
+
+def test_headings_are_in_order(read):
+    levels = [int(tag[1]) for tag, _, _ in read.elements if re.fullmatch(r"h[1-6]", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+
+
+def test_results_link_to_the_table_or_figure_that_shows_them():
+    rows = {"result": ["a", "b", "c"], "ours": ["see table drift", "see figure gone", "90 %"]}
+    rows |= {"criterion": ["–"] * 3, "verdict": ["–"] * 3, "shown in": ["drift", "gone.svg", "drift.svg, drift"]}
+    table = lay_out("checklist", "C", pd.DataFrame(rows), {"drift": "drift-table", "drift.svg": "figure-5a"})
+    ours = [row[table.columns.index("ours")] for row in table.rows]
+    assert ours == ['<a href="#drift-table">see table drift</a>', "see figure gone", '<a href="#figure-5a">90 %</a>']
+
+
+def test_what_ran_is_beside_what_the_paper_ran():
+    text = render()
+    single = text[text.index('<section id="single"') :].partition("</section>")[0]
+    assert single.index("45,000 for training") < single.index("7,020 readings") < single.index("<details")
 
 
 def test_figures_have_text_alternatives(read):
@@ -129,16 +205,16 @@ def test_order_of_figures_results_and_tables():
 
 def test_smallest_width_of_a_figure_is_legible():
     letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
-    drawing = measure("figures/a.svg", letters)
+    drawing = measure("figures/a.svg", letters, "a")
     assert (drawing.width_px, drawing.height_px) == (400, 200)
     assert drawing.least_px == LEGIBLE_PX / 6 * 300  # the smallest text is 6 pt high in a figure 300 pt wide
     assert drawing.scrolls  # scrolls on a phone
-    assert not measure("figures/a.svg", letters.replace("6px", "9px")).scrolls
+    assert not measure("figures/a.svg", letters.replace("6px", "9px"), "a").scrolls
 
 
 def test_figure_without_size_is_an_error():
     with pytest.raises(SchemaError, match=r"figures/a\.svg: the SVG has no size"):
-        measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>')
+        measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>', "a")
 
 
 @pytest.mark.parametrize(
@@ -157,7 +233,7 @@ def test_numbers_are_not_broken_across_lines(text, kept):
 def test_summary_is_in_the_first_section():
     text = render(all_experiments())
     first = text.split("<section")[1]
-    assert text.count(SUMMARY) == first.count(SUMMARY) == 1
+    assert text.count(EFFORTS) == first.count(EFFORTS) == 1
 
 
 def test_section_about_lists_counts():
@@ -180,10 +256,10 @@ def test_results_with_verdicts_come_first():
 def test_incomparable_results_are_omitted():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
-    (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "not reached: 8,000 contacts"}])).rows
-    assert shown == ("r", "92 %", "90 %", "yes", "not reached: 8,000 contacts")
+    (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "smaller than the paper's: 8,000 contacts"}])).rows
+    assert shown == ("r", "92 %", "90 %", "yes", "smaller than the paper's: 8,000 contacts")
     assert beside_paper(section, pd.DataFrame([row | {"note": ONE_SKIN}])) is None
-    assert beside_paper(section, pd.DataFrame([row | {"note": "–", "ours": "see file"}])) is None
+    assert beside_paper(section, pd.DataFrame([row | {"note": "–", "ours": "see table drift"}])) is None
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
@@ -261,9 +337,10 @@ def luminance(colour: str) -> float:
 
 def test_contrast_meets_wcag():
     text = render()
-    light, dark = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
-    for theme in (light, light | dark):
-        pairs = [(ink, ground) for ink in ("ink", "soft", "link") for ground in ("paper",)] + [("ink", "band")]
+    light, dark, printed = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
+    for theme in (light, light | dark, light | printed, light | dark | printed):
+        inks = ("ink", "soft", "link", "yes", "partly", "no")
+        pairs = [(ink, ground) for ink in inks for ground in ("paper",)] + [("ink", "band"), ("soft", "band")]
         for ink, ground in pairs:
             assert contrast(theme[ink], theme[ground]) >= 4.5  # WCAG 2.2 AA
         for source in ("simulated", "recorded"):
@@ -306,8 +383,28 @@ def test_scenes_without_held_out_boards_come_last():
     one_board = {name: value for name, value in scene_numbers("there", "recorded").items() if name != "table2"}
     text = index([scene_numbers("here", "simulated"), one_board], {})
     recorded, simulated = text.split('<section id="simulated">')
-    assert f"{SUMMARY}</span>" in simulated
-    assert "No board was held out" in recorded
+    assert f"{EFFORTS}</span>" in simulated
+    assert "no board was held out" in recorded
+
+
+def test_index_says_what_a_scene_is_and_answers_for_place_and_force():
+    text = index([scene_numbers("here", "simulated")], {}, {"here": "Two boards, pressed by `a rig`."})
+    entry = text[text.index("Scene here") :].partition("</li>")[0]
+    assert "Two boards, pressed by <code>a rig</code>." in entry
+    assert "<small>simulated</small>" in entry
+    place, force = re.findall(r'<p class="line">(.*?)</p>', entry)
+    assert "Place" in place
+    assert "within 1 mm" in place
+    assert "Force" in force
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_scene_says_in_its_first_sentence_what_it_is(file):
+    about = about_scene(file.read_text(encoding="utf-8"))
+    assert about[0].isupper()
+    assert not about.startswith("Scene")
+    assert about.endswith(".")
+    assert 20 < len(about) < 250
 
 
 def test_index_needs_no_network_or_script():
@@ -317,3 +414,46 @@ def test_index_needs_no_network_or_script():
     assert all(address.startswith("here/") for address in addresses)
     assert "<script" not in text
     assert "url(" not in text
+
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
+# Frames of two widths show the page; the script writes the widths of the pages and of elements that are too wide.
+IN_FRAMES = """<!DOCTYPE html><body><script>
+const page = {page}, found = [];
+for (const px of [400, 1400]) {{
+  const frame = document.createElement("iframe");
+  frame.width = px; frame.height = 900; frame.srcdoc = page;
+  frame.onload = () => {{
+    const {{document: inside}} = frame.contentWindow, root = inside.documentElement;
+    inside.querySelectorAll("details").forEach((one) => one.open = true);
+    const boxes = [...inside.querySelectorAll(".box")].filter((box) => box.scrollWidth > box.clientWidth + 1);
+    found.push([px, root.scrollWidth - root.clientWidth, boxes.length]);
+    document.title = JSON.stringify(found);
+  }};
+  document.body.append(frame);
+}}
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}")
+@pytest.mark.parametrize("one", ["scene", "all scenes"])
+def test_nothing_is_wider_than_the_page(one, tmp_path):
+    wide = pd.DataFrame(
+        {f"column {i} of a wide table": ["78.7 [72.1, 84.2]", "a sentence of several words"] for i in range(14)}
+    )
+    scenes = index([scene_numbers("here", "simulated"), scene_numbers("there", "recorded")], {})
+    text = render(wide=wide) if one == "scene" else scenes
+    file = tmp_path / "frames.html"
+    file.write_text(IN_FRAMES.format(page=json.dumps(text).replace("</", r"<\/")), encoding="utf-8")
+    flags = (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--virtual-time-budget=20000",
+    )
+    command = [BROWSER, *flags, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", file.as_uri()]
+    shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    found = json.loads(html.unescape(re.search("<title>(.*?)</title>", shown)[1]))
+    assert sorted(found) == [[400, 0, 0], [1400, 0, 0]]  # no page and no table scrolls sideways

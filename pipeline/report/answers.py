@@ -1,0 +1,268 @@
+"""Answer, from the numbers of a scene, whether its models work on a skin that was not in training.
+
+The place and the force of a contact are answered separately, by what a user has to do with the new skin.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any
+
+from pipeline.report.formatting import Results, Stat, models, show, show_with_unit, three_digits, universal_rows
+from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
+
+PLACE, FORCE = "place", "force"
+YES, PARTLY, NO, UNTESTED = "yes", "partly", "no", "not tested"
+PLACE_PARTLY_PCT = 50.0  # assumed; the paper requires `PLACE_ACCURACY_MIN_PCT`
+FORCE_YES_R2, FORCE_PARTLY_R2 = 0.9, 0.5  # assumed; the paper states no requirement for the force on a new skin
+LEVELS = (
+    f"Place, yes: at least {PLACE_ACCURACY_MIN_PCT:g} % of readings are within 1 mm in x and in y, which is the "
+    f'paper\'s "1mm with 90% accuracy"; partly: at least {PLACE_PARTLY_PCT:g} %. Force, yes: R² is at least '
+    f"{FORCE_YES_R2:g}; partly: at least {FORCE_PARTLY_R2:g}. We chose all of these limits but the first. For a yes, "
+    "the whole interval has to be above the limit, or all boards, if there are fewer than four."
+)
+IN_BRACKETS = (
+    "[low, high]: 95 % interval over the held-out boards (Student's t); (a; b): the values of the boards, if there are "
+    "fewer than four; ±: standard deviation over pairs of a training skin and a tested skin."
+)
+SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the root of each squared error
+UNIVERSAL = "universal, "  # prefix of the methods in `labels` that are calibrated to the tested skin
+NOTHING, UNLABELLED = "nothing", "dozens of presses without labels"
+NONE_HELD_OUT = "no board held out"
+ANSWER, COMPARED = "answer", "compared"
+ADAPTED = "Multi-sensor with triplet loss, adapted"
+NETWORK = "Network of the paper, trained on the other boards"
+OURS = "Universal model (ours), trained on simulated skins"
+USABLE = {YES: " (usable)", PARTLY: " (partly usable)", NO: " (not usable)"}
+WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the first of these that the scene ran is shown
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The scores of a model on new skins, and what it needs of a new skin; `paper` has the paper's means.
+
+    `role`: `answer` if this model gives the answer of the scene, `compared` if a sentence compares it with the answer.
+    """
+
+    model: str
+    needs: str
+    scores: Mapping[str, Stat]
+    paper: Mapping[str, float]
+    labels_n: int = 0
+    role: str = ""
+
+    @property
+    def cells(self) -> dict[str, str]:
+        """The scores as text, by column."""
+        paper = [
+            f"{three_digits(self.paper['accuracy_pct'])} %" if "accuracy_pct" in self.paper else "",
+            *(f"{sqrt(self.paper[name]):.2f} {unit}" for name, unit in SQUARED.items() if name in self.paper),
+        ]
+        return {
+            "model": self.model,
+            "needed of the new skin": self.needs,
+            "place: within 1 mm": show_with_unit(self.scores.get("accuracy_pct"), "%"),
+            "place: rms error": show_with_unit(rms(self.scores.get("mse_xy_mm2")), "mm"),
+            "force: rms error": show_with_unit(rms(self.scores.get("mse_f_N2")), "N"),
+            "force: R²": show(self.scores.get("r2_f")),
+            "paper": ", ".join(filter(None, paper)) or "–",
+        }
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer for the place or the force of a contact: a level, the answer in short, and sentences with numbers."""
+
+    quantity: str
+    level: str
+    short: str
+    sentences: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The answers of a scene for place and force, what was tested, and the scores behind the answers."""
+
+    tested: str
+    place: Answer
+    force: Answer
+    efforts: tuple[Effort, ...] = ()
+
+
+def answers(numbers: Results) -> Answers:
+    """Answer whether the models of a scene work on skins that were not in training."""
+    efforts = tuple(_efforts(numbers))
+    if not efforts:
+        return _within_skin(numbers)
+    best = next(effort for effort in efforts if effort.role == ANSWER)
+    others = [effort for effort in efforts if effort.role == COMPARED]
+    return Answers(_tested(numbers, best), _place(best, others), _force(numbers, best, others), efforts)
+
+
+def rms(mse: Stat | None) -> Stat | None:
+    """Return the square root of a mean squared error, with its interval or the values of its boards.
+
+    Standard deviations are omitted, because that of the squared errors is not that of their square roots.
+
+    >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]})
+    {'mean': 0.5, 'n': 6, 'ci95': [0.4, 0.6]}
+    """
+    if mse is None:
+        return None
+    ends = {name: [sqrt(end) for end in mse[name]] for name in ("ci95", "values") if name in mse}
+    return {"mean": sqrt(mse["mean"]), "n": mse["n"]} | ends
+
+
+def in_words(percent: float) -> str:
+    """Write a percentage as a simple fraction.
+
+    >>> in_words(78.7), in_words(50.2), in_words(95.1), in_words(99.7), in_words(0.2)
+    ('about 4 in 5', 'about 1 in 2', 'about 19 in 20', 'nearly all', 'almost none')
+    """
+    simple = [(part, of) for of in (2, 3, 4, 5, 10, 20) for part in range(of + 1) if of < 20 or part in (1, 19)]
+    part, of = min(simple, key=lambda pair: abs(pair[0] / pair[1] - percent / 100))
+    return "nearly all" if part == of else f"about {part} in {of}" if part else "almost none"
+
+
+def level(stat: Stat, yes: float, partly: float) -> str:
+    """Return the level that a score reaches; a yes needs the whole interval, or all boards, at `yes` or above."""
+    if min(stat.get("ci95", stat.get("values", [stat["mean"]]))) >= yes:
+        return YES
+    return PARTLY if stat["mean"] >= partly else NO
+
+
+def _efforts(numbers: Results) -> Iterator[Effort]:
+    """Yield the models to show; the one that needs most of the new skin comes last."""
+    if numbers.get("labels"):
+        yield from _efforts_by_labels(numbers["labels"])
+        return
+    known, table2 = models(numbers), numbers.get("table2", {})
+    adapting = f"{numbers.get('adapt', {}).get('pokes_n', ADAPTED_POKES_N)} presses without labels"
+    rows = [row for row in ("single", "multi", "triplet", "adapted") if row in table2]
+    for row in rows:
+        title = ADAPTED if row == "adapted" else known[row].title
+        paper = {metric: mean for metric, (mean, _) in known[row].paper.items()}
+        needs = adapting if row == "adapted" else NOTHING
+        yield Effort(title, needs, table2[row], paper, role=ANSWER if row == rows[-1] else "")
+    for _, scores in universal_rows(numbers) if rows else ():
+        yield Effort(OURS, f"{scores['pokes_n']} presses without labels", scores, {}, role=COMPARED)
+
+
+def _efforts_by_labels(rows: Sequence[Mapping[str, Any]]) -> Iterator[Effort]:
+    """Yield the first network without labels, then the universal model, if there is one, by number of labels."""
+    by_method: dict[tuple[str, str], dict[int, Mapping[str, Any]]] = {}
+    for row in rows:
+        by_method.setdefault((row["method"], row["inputs"]), {})[row["labels_n"]] = row["as_labelled"]
+    network = next(iter(by_method))
+    chosen = next((key for key in by_method if key[0].startswith(UNIVERSAL)), network)
+    if chosen != network and 0 in by_method[network]:
+        paper = {metric: mean for metric, (mean, _) in TABLE_2["multi"].items()}
+        yield Effort(NETWORK, NOTHING, by_method[network][0], paper, role=COMPARED)
+    of_ours = f"Universal model (ours), {chosen[0].removeprefix(UNIVERSAL)}"
+    title, presses = (of_ours, UNLABELLED) if chosen != network else (NETWORK, NOTHING)
+    counts = sorted(by_method[chosen])
+    for labels_n in dict.fromkeys((counts[0], counts[len(counts) // 2], counts[-1])):
+        needs = f"{labels_n} presses with known place and force" if labels_n else presses
+        role = ANSWER if labels_n == counts[0] else COMPARED if labels_n == counts[-1] else ""
+        yield Effort(title, needs, by_method[chosen][labels_n], {}, labels_n, role)
+
+
+def _tested(numbers: Results, best: Effort) -> str:
+    lobo, source = numbers.get("protocol", {}).get("lobo"), numbers["provenance"]["source"]
+    boards = f"{lobo['boards_n']} {source} boards with {lobo['skins_n']} skins" if lobo else f"{source} boards"
+    held_out = f"Tested on {boards}; no tested board or skin was in training."
+    if source == "simulated":
+        held_out += " This is no evidence about real skins."
+    return f"{held_out} Model: {best.model}. It needs of the new skin: {best.needs}."
+
+
+def _place(best: Effort, others: Sequence[Effort]) -> Answer:
+    accuracy = best.scores.get("accuracy_pct")
+    if accuracy is None:
+        return Answer(PLACE, UNTESTED, "the recordings have no places")
+    error = show_with_unit(rms(best.scores.get("mse_xy_mm2")), "mm")
+    sentences = [
+        f"{show_with_unit(accuracy, '%')} of readings are within 1 mm in x and in y.",
+        f"rms error along x or y: {error}.",
+        f'The paper\'s requirement, "1mm with 90% accuracy": {_requirement(accuracy)}.',
+    ]
+    if best.paper:
+        paper_mm = sqrt(best.paper["mse_xy_mm2"])
+        sentences.append(f"Paper: {three_digits(best.paper['accuracy_pct'])} %; {paper_mm:.2f} mm.")
+    for other in others:
+        sentences.append(f"{_named(other)}: {show_with_unit(other.scores['accuracy_pct'], '%')} within 1 mm.")
+    reached = level(accuracy, PLACE_ACCURACY_MIN_PCT, PLACE_PARTLY_PCT)
+    return Answer(PLACE, reached, f"{in_words(accuracy['mean'])} readings are within 1 mm", tuple(sentences))
+
+
+def _requirement(accuracy: Stat) -> str:
+    """Say whether an accuracy reaches the paper's requirement, from its interval or the values of a few boards."""
+    ends, few = accuracy.get("ci95", accuracy.get("values", [accuracy["mean"]])), "ci95" not in accuracy
+    if min(ends) >= PLACE_ACCURACY_MIN_PCT:
+        return "reached on all boards" if few else "reached"
+    if max(ends) < PLACE_ACCURACY_MIN_PCT:
+        return "reached on no board" if few else "not reached"
+    return "reached on some boards" if few else "inconclusive, because the interval includes it"
+
+
+def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
+    explained, error = best.scores.get("r2_f"), rms(best.scores.get("mse_f_N2"))
+    if explained is None or error is None:
+        return Answer(FORCE, UNTESTED, "the recordings have no forces")
+    sentences = [f"{show_with_unit(error, 'N')} rms; R² {show(explained)}.", *_forces(numbers)]
+    constant = numbers.get("constant_force", {}).get("labels" if numbers.get("labels") else "table2")
+    if best.paper:
+        sentences.append(f"Paper: {sqrt(best.paper['mse_f_N2']):.2f} N, at forces that it does not state.")
+    for other in others:
+        r2 = other.scores["r2_f"]
+        shown = show_with_unit(rms(other.scores["mse_f_N2"]), "N")
+        sentences.append(f"{_named(other)}: {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
+    short = f"rms error {error['mean']:.2g} N"
+    if constant:
+        short += f", against {sqrt(constant['mse_f_N2']['mean']):.2g} N for always guessing the mean force"
+    if force_level(explained) == NO:
+        short = f"not usable; {short}"
+    return Answer(FORCE, force_level(explained), short, tuple(sentences))
+
+
+def force_level(explained: Stat) -> str:
+    """Return the level that R² of the force reaches."""
+    return level(explained, FORCE_YES_R2, FORCE_PARTLY_R2)
+
+
+def _named(effort: Effort) -> str:
+    return f"With {effort.labels_n} labelled presses" if effort.labels_n else effort.model
+
+
+def _forces(numbers: Results) -> list[str]:
+    described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
+    over_skins = described["over_skins"]
+    if not {"force_median_N", "force_max_N"} <= over_skins.keys():
+        return []
+    median_N, max_N = over_skins["force_median_N"]["mean"], over_skins["force_max_N"]["most"]
+    return [f"Tested forces: median {median_N:.2g} N, up to {max_N:.2g} N."]
+
+
+def _within_skin(numbers: Results) -> Answers:
+    """Answer for a scene that holds out no board: not tested, with the scores on skins that were in training."""
+    split = next((name for name in WITHIN_SKIN if name in numbers), None)
+    tested = "This scene holds out no board, so it does not test new skins."
+    if split is None:
+        return Answers(tested, Answer(PLACE, UNTESTED, NONE_HELD_OUT), Answer(FORCE, UNTESTED, NONE_HELD_OUT))
+    own = "Same skin, later readings"
+    skins = numbers.get("single_skins", {"": {name: stat["mean"] for name, stat in numbers[split].items()}})
+    places, forces = [], []
+    for skin, scores in skins.items():
+        seen = numbers.get("hover", {}).get(skin, {}).get("seen", False)
+        named = f"{skin}: " if skin else ""
+        magnetic = ", but the tip is sensed without touch too" if seen else ""
+        places.append(f"{named}{three_digits(scores['accuracy_pct'])} % within 1 mm{magnetic}")
+        if "mse_f_N2" in scores:
+            forces.append(f"{named}rms error {sqrt(scores['mse_f_N2']):.2g} N, R² {scores['r2_f']:.3f}")
+    return Answers(
+        tested,
+        Answer(PLACE, UNTESTED, NONE_HELD_OUT, (f"{own}: {'; '.join(places)}.",)),
+        Answer(FORCE, UNTESTED, NONE_HELD_OUT, (f"{own}: {'; '.join(forces)}.",))
+        if forces
+        else Answer(FORCE, UNTESTED, "the recordings have no forces"),
+    )
