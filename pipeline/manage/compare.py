@@ -21,9 +21,10 @@ from reskin.errors import ReskinError, SchemaError
 
 LABEL_N = 3  # a row of a list is named by at most this many of its leading texts and counts
 LISTED_N = 10  # number of largest differences to list
-# Verdicts at the beginning of cells; yes, no and inconclusive occur only in results from before 2026-11.
+# Verdicts at the beginning of cells; yes and no occur only in results from before 2026-11.
 VERDICT = re.compile(
-    r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
+    r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|within interval|significant difference|"
+    r"not judged \([^)]*\))(?![\w ])"
 )
 MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance that may explain a difference
 EXPECTED = (
