@@ -105,9 +105,20 @@ def typical_noload_uT(model: Universal) -> Float[np.ndarray, " ch"]:
 
 
 def _load_pyfunc(path: str) -> NetworkModel | UniversalModel:
-    """Load the model whose weights are in the file `path`; MLflow calls this function with the path in MLmodel."""
+    """Load the model whose weights are in the file `path`; MLflow calls this function with the path in MLmodel.
+
+    A first prediction is made here, because it compiles code and imports PyTorch: a server would answer its first
+    request late otherwise.
+    """
     file = Path(path)
-    return UniversalModel(file) if is_model(file) else NetworkModel(read_network(file))
+    model: NetworkModel | UniversalModel
+    if is_model(file):
+        model, channels_n = UniversalModel(file), load_universal(file=file).channels_n
+    else:
+        network = read_network(file)
+        model, channels_n = NetworkModel(network), network.card["input"]["channels_n"]
+    model.predict(pd.DataFrame(np.ones((1, channels_n))))
+    return model
 
 
 # --- Writing ---

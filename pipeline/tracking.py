@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.provenance import COSTS, SECONDS
 from pipeline.statistics import over_folds, tidy
-from pipeline.views import TRAIN_S, link, missing_tags
+from pipeline.views import TRAIN_S, UI, link, missing_tags
 from reskin import io
 from reskin.errors import ReskinError
 from reskin.metrics import METRICS
@@ -92,7 +92,9 @@ class Times:
 
 def read_times(scene: str) -> Times:
     """Read the times that stages recorded in the working directory; results of other machines have none."""
-    trainings, stages, by_key_s = {}, {}, {}
+    trainings: dict[tuple[str, str], Span] = {}
+    stages: dict[str, Span] = {}
+    by_key_s: dict[str, float] = {}
     for file in sorted((SECONDS / scene).glob("*.json")):
         for run in io.read_json(file):
             if "started_s" in run:  # files of earlier versions lack it
@@ -235,8 +237,8 @@ def scores_link(scene: str, root: Path) -> str:
     """Return the address of the view of the scores of a scene's training runs."""
     with _client(tracking_uri(root)) as client:
         server = server_uri() or ""
-        host = {"host": server} if server.startswith("http") else {}
-        return link(_experiment(client, scene, root), **host)
+        host = server if server.startswith("http") else UI
+        return link(_experiment(client, scene, root), host=host)
 
 
 class Publisher:
@@ -421,8 +423,9 @@ class Publisher:
         import numpy as np
 
         example_uT = self._read_example
-        fits = example_uT is not None and example_uT.shape[1] == channels_n
-        return example_uT if fits else np.empty((0, channels_n))
+        if example_uT is None or example_uT.shape[1] != channels_n:
+            return np.empty((0, channels_n))
+        return example_uT
 
     def write_final(self, weights: Path, *, register: bool) -> None:
         """Write the final model of a scene, which is trained on all boards; register it as `reskin-SCENE`.

@@ -32,7 +32,7 @@ class View:
         name = _column("attributes", "Run Name")
         state = {
             "searchFilter": f"{self.filter} and tags.current = 'true'",
-            "orderByKey": "attributes.start_time",
+            "orderByKey": _column("attributes", "Created"),  # by `attributes.start_time`, runs are hidden in stages
             "orderByAsc": False,
             "selectedColumns": columns,
             "columnOrder": [name, *columns],

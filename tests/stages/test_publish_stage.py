@@ -10,9 +10,8 @@ def test_numbers_and_curves_of_an_experiment(tmp_path):
     drift = {"skins_n": 1, "each": [{"contacts_n": 10, "accuracy_pct": 90.0}, {"contacts_n": 20, "accuracy_pct": 80.0}]}
     io.write_json(tmp_path / "drift.json", {"numbers": drift, "drawn": {"true_N": [1.0]}})
     curves = read_curves(parse_scene(scene_with("lobo", "drift"), "scene.yaml"), tmp_path)
-    assert curves == {
+    assert curves == {  # counts are no metrics
         "drift": [
-            ("drift", 0, {"skins_n": 1.0}),
             ("drift.each", 10, {"accuracy_pct": 90.0}),
             ("drift.each", 20, {"accuracy_pct": 80.0}),
         ]
