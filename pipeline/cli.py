@@ -18,7 +18,7 @@ from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
 if TYPE_CHECKING:
-    from pipeline.scenes import Plan
+    from pipeline.scenes import Plan, Source
 
 ROOT = Path()  # the checkout, which is the working directory
 
