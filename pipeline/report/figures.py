@@ -122,7 +122,8 @@ def _draw_scores(axes: Any, metric: str, y: np.ndarray, rows: Rows, **look: Any)
     axes.errorbar(means, drawn_y, xerr=lengths, **look)
     for mean, length, row_y in zip(means, lengths[1], drawn_y, strict=True):
         beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.5}
-        axes.annotate(f"{mean:.2g}", (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
+        shown = f"{mean:.2f}" if metric == "r2_f" else f"{mean:.2g}"
+        axes.annotate(shown, (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
 
 
 def _limit(axes: Any, metric: str) -> None:

@@ -43,21 +43,27 @@ def _execute(figure: Any) -> None:
 def _put_in_column(figure: Any, panels: Sequence[Any], *, beside: bool) -> None:
     """Limit the width of a figure; if its panels are `beside` each other, put them below each other."""
     heights_in = [_height_in(axes) for axes in panels]
-    wanted_in = [min(max(height, PANEL_IN[0]), PANEL_IN[1]) for height in heights_in] if beside else heights_in
     if beside:
-        _stack(figure, panels, wanted_in)
-    figure.set_figwidth(min(figure.get_figwidth(), WIDTH_IN))
-    for _ in range(STEPS_N):
-        for legend in figure.legends:
-            _narrow_legend(legend, figure.bbox.width)
+        heights_in = [min(max(height, PANEL_IN[0]), PANEL_IN[1]) for height in heights_in]
+        _stack(figure, panels, heights_in)
+    for _ in range(STEPS_N if beside or figure.get_figwidth() > WIDTH_IN else 0):
+        figure.set_figwidth(min(figure.get_figwidth(), WIDTH_IN))
+        _fit_texts(figure, panels)
         _execute(figure)
-        missing_in = sum(wanted_in) - sum(map(_height_in, panels))
+        missing_in = sum(heights_in) - sum(map(_height_in, panels))
         figure.set_figheight(max(figure.get_figheight() + missing_in, 1.0))
-        for axes in panels:
-            _turn_overlapping_labels(axes)
-        for text, width in _texts(figure):
-            _break_lines(text, width)
+    _fit_texts(figure, panels)
     _execute(figure)
+
+
+def _fit_texts(figure: Any, panels: Sequence[Any]) -> None:
+    """Break or turn texts that are longer than the figure's current layout allows."""
+    for legend in figure.legends:
+        _narrow_legend(legend, figure.bbox.width)
+    for axes in panels:
+        _turn_overlapping_labels(axes)
+    for text, width in _texts(figure):
+        _break_lines(text, width)
 
 
 def _stack(figure: Any, panels: Sequence[Any], heights_in: Sequence[float]) -> None:

@@ -1,5 +1,6 @@
 """One sentence below each figure: what it shows, with numbers from the results, or what to look for."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,8 @@ from pipeline.report.formatting import SHORT
 from pipeline.report.paper import TABLE_2
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
+# No line break is allowed between a number and its unit.
+UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
 MAPS = (
     "Look for places with large errors, for example at the edge of the skin or between the chips. All maps have the "
     "same scale of colours."
@@ -56,7 +59,7 @@ def sentences(numbers: Numbers) -> dict[str, str]:
     for key, write in WRITERS.items():
         if numbers.get(key):
             found |= write(numbers)
-    return found
+    return {name: UNIT.sub(NO_BREAK, sentence) for name, sentence in found.items()}
 
 
 def _table2(numbers: Numbers) -> dict[str, str]:

@@ -50,7 +50,7 @@ def test_stated_results_are_those_of_the_run(figure):
     before, after = sentences(numbers)[figure], sentences(changed)[figure]
     assert before != after
     assert "12" in after
-    assert ("too high" in before and "0.120 N too low" in after) or figure != "drift_force.svg"
+    assert ("too high" in before and "0.120\u00a0N too low" in after) or figure != "drift_force.svg"
 
 
 def test_unseen_boards_replace_table_2():
@@ -59,7 +59,7 @@ def test_unseen_boards_replace_table_2():
         row["mse_f_N2"] = {"mean": 4.0, "n": 2, "values": [4.0, 16.0]}
     written = sentences(numbers)
     assert "with 0 labels" in written[HEADLINE]
-    assert "3.0 N with 40" in written[FORCE]
+    assert "3.0\u00a0N with 40" in written[FORCE]
 
 
 def test_results_without_optional_parts():
