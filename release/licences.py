@@ -7,12 +7,14 @@ classifier or free text; an unknown statement counts as incompatible. This is no
 import re
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from release.constraints import OF_CUDA
 
 ROOT = Path(__file__).resolve().parents[1]
 # Licences that a program under MIT may import. They require notices; MPL also requires changes of its files.
@@ -81,9 +83,12 @@ def is_compatible(licence: str) -> bool:
     return any(all(COMPATIBLE.search(part) and not WITHHELD.search(part) for part in parts) for parts in alternatives)
 
 
-def incompatible(packages: dict[str, Distribution]) -> dict[str, str]:
-    """Return the packages with an unknown or incompatible licence, with that licence."""
-    licences = {name: licence_of(package) for name, package in packages.items()}
+def incompatible(packages: Mapping[str, Distribution]) -> dict[str, str]:
+    """Return the packages with an unknown or incompatible licence, with that licence.
+
+    NVIDIA's packages are left out: pip installs them with a torch for GPUs, and the project does not need them.
+    """
+    licences = {name: licence_of(package) for name, package in packages.items() if not name.startswith(OF_CUDA)}
     return {name: licence or "nothing" for name, licence in licences.items() if not is_compatible(licence)}
 
 

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import PathDistribution
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from pipeline.cli import app as checkout
 from release import constraints
 from release.constraints import render
 from release.licences import TOLERATED, closure, incompatible, is_compatible, wanted
+from reskin import io
 from reskin.cli import CHECKOUT_COMMANDS, add_checkout_commands
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, explaining, require
@@ -148,6 +150,16 @@ def test_supported_versions_of_python_are_the_same_everywhere():
 def test_licences_are_compatible():
     assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # also fails if an exception is no longer needed
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
+
+
+def test_packages_of_torch_for_gpus_are_not_judged(tmp_path):
+    def package(name: str) -> PathDistribution:
+        folder = tmp_path / f"{name}-1.dist-info"
+        io.write_text(folder / "METADATA", f"Name: {name}\nLicense: Proprietary\n")
+        return PathDistribution(folder)
+
+    packages = {name: package(name) for name in ("nvidia-cublas", "cuda-toolkit", "other")}
+    assert incompatible(packages) == {"other": "Proprietary"}
 
 
 @pytest.mark.parametrize(
