@@ -8,7 +8,6 @@ from typing import Any
 WIDTH_IN = 4.7  # greatest width of a figure whose panels are in one column
 LEGIBLE_PT = 8.0  # least size of letters; on a phone, a figure of this width is shown at about its size in points
 PANEL_IN = (1.3, 2.3)  # least and greatest height of a panel that was beside others
-STEPS_N = 2  # repetitions of the layout; each corrects the height of the figure
 EDGE_PT, HANDLE_PT = 10.0, 40.0  # width of a legend's edge, and of the edges and the handle of an entry
 SHORTEST_N = 12  # letters; shorter lines are not broken
 GAP_PT = 2.0  # least distance between the labels of neighbouring ticks
@@ -46,20 +45,27 @@ def _put_in_column(figure: Any, panels: Sequence[Any], *, beside: bool) -> None:
     if beside:
         heights_in = [min(max(height, PANEL_IN[0]), PANEL_IN[1]) for height in heights_in]
         _stack(figure, panels, heights_in)
-    for _ in range(STEPS_N if beside or figure.get_figwidth() > WIDTH_IN else 0):
-        figure.set_figwidth(min(figure.get_figwidth(), WIDTH_IN))
-        _fit_texts(figure, panels)
-        _execute(figure)
-        missing_in = sum(heights_in) - sum(map(_height_in, panels))
-        figure.set_figheight(max(figure.get_figheight() + missing_in, 1.0))
+    changed = beside or figure.get_figwidth() > WIDTH_IN
+    figure.set_figwidth(min(figure.get_figwidth(), WIDTH_IN))
+    for legend in figure.legends:
+        _narrow_legend(legend, figure.bbox.width)
+    if changed:
+        _set_heights(figure, panels, heights_in)  # before texts are broken into lines that depend on it
     _fit_texts(figure, panels)
+    if changed:
+        _set_heights(figure, panels, heights_in)
     _execute(figure)
+
+
+def _set_heights(figure: Any, panels: Sequence[Any], heights_in: Sequence[float]) -> None:
+    """Set the height of a figure such that its panels have these heights together."""
+    _execute(figure)
+    missing_in = sum(heights_in) - sum(map(_height_in, panels))
+    figure.set_figheight(max(figure.get_figheight() + missing_in, 1.0))
 
 
 def _fit_texts(figure: Any, panels: Sequence[Any]) -> None:
     """Break or turn texts that are longer than the figure's current layout allows."""
-    for legend in figure.legends:
-        _narrow_legend(legend, figure.bbox.width)
     for axes in panels:
         _turn_overlapping_labels(axes)
     for text, width in _texts(figure):

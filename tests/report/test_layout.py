@@ -28,18 +28,18 @@ def draw_row(figure):
         axes.plot([1, 2], [i, 3], "o-", label=f"a line with a long name, {i}")
         axes.set_xlabel("force / N")
         axes.tick_params(labelsize=5)
-    panels[0].set_ylabel("error / mm")
+    panels[0].set_ylabel("error of the force / mN")
     figure.legend(loc="outside right upper", ncols=3)
     figure.suptitle(TITLE, x=0.01, ha="left")
 
 
 def test_a_row_of_panels_becomes_a_column():
-    figure = laid_out(draw_row)
+    figure = laid_out(draw_row, height_in=5.0)
     boxes = [axes.get_window_extent() for axes in figure.axes]
     assert figure.get_figwidth() == WIDTH_IN
     assert all(upper.y0 > lower.y1 for upper, lower in pairwise(boxes))
     assert len({round(box.x0) for box in boxes}) == 1
-    assert [axes.get_ylabel() for axes in figure.axes] == ["error / mm"] * 3
+    assert [axes.get_ylabel() for axes in figure.axes] == ["error of the force / mN"] * 3
 
 
 def test_texts_are_inside_the_figure_and_legible():
