@@ -791,7 +791,9 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         title = f"After {last_n:,} contacts, with an added random walk of the field at rest ({source})"
         texts["drift_wander.svg"] = _draw_scores(numbers, numbers["wander"], "step_uT", title)
     if "late" in numbers:
-        texts["drift_force.svg"] = _draw_forces(numbers["late"], drawn["late"], source)
+        texts["drift_force.svg"] = _draw_forces(
+            numbers["late"], drawn["late"], _policies(numbers)[numbers["late"]["policy"]][0], source
+        )
     return texts
 
 
@@ -826,7 +828,7 @@ def _draw_scores(
         return svg(figure)
 
 
-def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], source: str) -> str:
+def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]], name: str, source: str) -> str:
     with drawing(5.2, 5.0) as figure:
         axes = figure.subplots()
         ends = min(0.0, *points["true_N"], *points["predicted_N"]), max(*points["true_N"], *points["predicted_N"])
@@ -838,9 +840,8 @@ def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]],
         text = (
             f"bias {late['bias_N']:+.3g} ± {late['bias_se_N']:.1g} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
-            f"no-load reading: policy {late['policy']}\n"
-            f"means over {len(late['network_bias_N'])} network(s)\n"
-            "points: first seed"
+            f"no-load reading: {name}\n"
+            f"mean of {len(late['network_bias_N'])} networks; points: the first"
         )
         axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=10)
         axes.legend(loc="lower right", frameon=False)
