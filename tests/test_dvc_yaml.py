@@ -65,7 +65,8 @@ def test_paths_of_commands_are_declared(name):
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
     declared = [*stage["deps"], *outs, *params]
-    paths = [word for word in stage["cmd"].split() if "/" in word]  # test_settings.py checks the keys of params
+    commands = stage["cmd"] if isinstance(stage["cmd"], list) else [stage["cmd"]]
+    paths = [word for command in commands for word in command.split() if "/" in word]
     unknown = [p for p in paths if not any(d == p or d.startswith(f"{p}/") or p.startswith(f"{d}/") for d in declared)]
     assert unknown == []
 

@@ -16,6 +16,7 @@ import traceback
 
 from dvc.repo import Repo, lock_repo
 from dvc.repo.reproduce import get_active_graph, plan_repro
+from dvc.stage import PipelineStage
 
 from tests.stages.checkout import DONE, FAILED
 
@@ -45,6 +46,11 @@ def run_stage(name: str, command: str) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
+
+
+def commands_of(stage: PipelineStage) -> list[str]:
+    """Return the commands of a stage, which DVC has as one text or as a list."""
+    return stage.cmd if isinstance(stage.cmd, list) else [stage.cmd]
 
 
 def preload(protocols: set[tuple[str, str]]) -> None:
@@ -85,7 +91,7 @@ def run_stages(names: list[str]) -> str:
             print(f"Running stage '{name}':", flush=True)
             for out in stage.outs:  # removes outputs first, as `dvc repro` does
                 out.remove()
-            if run_stage(name, stage.cmd):
+            if any(run_stage(name, command) for command in commands_of(stage)):
                 return FAILED
         with lock_repo(repo):
             for stage in stages.values():
