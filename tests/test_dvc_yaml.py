@@ -21,7 +21,8 @@ OTHERS = sorted(STAGES.keys() - {"code"})
 
 
 def test_every_stage_depends_on_its_code_digests():
-    assert {*all_stages(), "code"} == STAGES.keys()
+    # `publish` is the second command of stage report
+    assert {*all_stages(), "code"} - {"publish"} == STAGES.keys()
     assert {name: [dep for dep in STAGES[name]["deps"] if "code/" in dep] for name in OTHERS} == {
         name: [f"data/code/{name}"] for name in OTHERS
     }
