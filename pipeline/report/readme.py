@@ -195,7 +195,8 @@ def _simulated(scenes: Sequence[Numbers]) -> str:
         line = {"model": title}
         for metric, (name, digits) in SIMULATED_METRICS.items():
             for numbers in scenes:
-                size = SIZES[numbers["provenance"]["scene"]]
+                scene = numbers["provenance"]["scene"]
+                size = SIZES.get(scene, f"`{scene}`")
                 line[f"{name}: {size}"] = _compact(numbers["table2"].get(key, {}).get(metric), digits)
             line[f"{name}: the paper"] = f"{paper[metric][0]:.{digits}f}"
         lines.append(line)
