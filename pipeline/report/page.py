@@ -28,7 +28,7 @@ from reskin.errors import SchemaError
 
 Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
-PLACES_FILE = Path(__file__).with_name("places.yaml")
+PLACES_FILE = Path(__file__).with_name("page.places.yaml")
 SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that names the table or figure of a result
 SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
 SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
