@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn
@@ -86,9 +86,23 @@ def main() -> None:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         with explaining("reskin"):
             add_checkout_commands()
-            app()
+            app(args=with_default_simulation(sys.argv[1:]))
     except ReskinError as error:
         fail(error)
+
+
+def with_default_simulation(arguments: Sequence[str]) -> list[str]:
+    """Insert `nominal` after an option --emulate that has no value; Typer has no options with optional values.
+
+    >>> with_default_simulation(["live", "--emulate", "--http-port", "8000"])
+    ['live', '--emulate', 'nominal', '--http-port', '8000']
+    """
+    completed = []
+    for argument, following in zip(arguments, [*arguments[1:], "-"], strict=True):
+        completed.append(argument)
+        if argument == "--emulate" and following.startswith("-"):
+            completed.append("nominal")
+    return completed
 
 
 def fail(error: ReskinError) -> NoReturn:
@@ -263,7 +277,8 @@ def live(
     model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several networks are averaged.")] = None,
     replay: Annotated[str | None, Option(help="Folder of a capture to play, instead of a board.")] = None,
     emulate: Annotated[
-        str | None, Option(help="Simulation to play, instead of a board: nominal, or the YAML of a simulated scene.")
+        str | None,
+        Option(help="Simulation to play, instead of a board: nominal (default), or the YAML of a simulated scene."),
     ] = None,
     host: Annotated[
         str, Option(help="Address to listen on. 0.0.0.0: other machines can connect; the printed URL then has a token.")

@@ -7,6 +7,7 @@ import pytest
 
 from reskin import cli as commands
 from reskin.board import find
+from reskin.cli import with_default_simulation
 from reskin.errors import ParamsError
 from reskin.live.emulator import FAULTS, inject, parse_fault
 from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
@@ -89,3 +90,9 @@ def test_live_without_options_shows_all_boards(monkeypatch):
     assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)
     policies = [session.skin.fault_policy for session in shown["sessions"]]
     assert {(one.stuck, one.zeros) for one in policies} == {("flag", "drop")}
+
+
+def test_emulate_without_a_value_plays_the_nominal_simulation():
+    assert with_default_simulation(["live", "--emulate"]) == ["live", "--emulate", "nominal"]
+    given = ["live", "--emulate", "paper.yaml", "--host", "0.0.0.0"]
+    assert with_default_simulation(given) == given
