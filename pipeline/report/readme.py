@@ -227,16 +227,17 @@ def _recorded(numbers: Numbers) -> str:
 
 
 def _touches(numbers: Numbers) -> str:
-    """State which fraction of recorded presses the live page detects, and how often it detects a press without one."""
-    rows = [row for row in numbers.get("recorded_limits", {}).get("detection", {}).get("rows", ())
+    """State the range of forces, and how many touches the live page misses or reports without cause."""
+    detection = numbers.get("recorded_limits", {}).get("detection", {})
+    rows = [row for row in detection.get("rows", ())
             if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")]  # fmt: skip
     if not rows:
         return ""
     missed, false = max(100 - row["detected_pct"] for row in rows), max(row["false_alarm_pct"] for row in rows)
-    lightest = " and ".join(f"{row['smallest_N']:.1f} N" for row in rows)
+    ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     return (
-        f"On each of these boards, the live page misses at most {missed:.2g} % of the recorded touches (lightest: "
-        f"{lightest}), and reports a touch in at most {false:.2g} % of the readings without one."
+        f"Forces of the presses: {ranges}. On each board, the live page misses at most {missed:.2g} % of these touches, "
+        f"and reports a touch in at most {false:.2g} % of the readings without one."
     )
 
 
