@@ -236,8 +236,8 @@ def _touches(numbers: Numbers) -> str:
     missed, false = max(100 - row["detected_pct"] for row in rows), max(row["false_alarm_pct"] for row in rows)
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     return (
-        f"Forces of the presses: {ranges}. On each board, the live page misses at most {missed:.2g} % of these touches, "
-        f"and reports a touch in at most {false:.2g} % of the readings without one."
+        f"Forces of the presses: {ranges}. On each board, the live page misses at most {missed:.2g} % of these "
+        f"touches, and reports a touch in at most {false:.2g} % of the readings without one."
     )
 
 
