@@ -9,6 +9,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from pipeline import FLOW
@@ -55,7 +56,7 @@ TRAINED_ON = {
 }
 LABELS = {"0": "no label", "weight": "one known weight", "10": "10 labels", "40": "40 labels"}
 RECORDED_METRICS = {
-    "accuracy_pct": ("within 1 mm in x and y, %", 0), "median_error_N": ("median force error, N", 2),
+    "accuracy_pct": ("within 1 mm in x and y, %", 0), "mse_f_N2": ("force error (rms), N", 1),
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
@@ -214,7 +215,7 @@ def _recorded(numbers: Numbers) -> str:
     methods = list(dict.fromkeys(method for method, _ in rows if method.startswith(UNIVERSAL)))
     lines = [
         {"trained on": TRAINED_ON.get(method, method), "on new boards": title}
-        | {name: _compact(rows.get((method, labels), {}).get(metric), digits) for labels, name in LABELS.items()}
+        | {name: _compact(_readable(rows.get((method, labels)), metric), digits) for labels, name in LABELS.items()}
         for method in methods
         for metric, (title, digits) in RECORDED_METRICS.items()
     ]
@@ -224,6 +225,17 @@ def _recorded(numbers: Numbers) -> str:
         draws_n=numbers["random_presses"]["draws_n"], touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
+
+
+def _readable(row: Numbers | None, metric: str) -> Numbers | None:
+    """Return a score of a row; instead of mean squared errors of forces, their roots for each board and the mean."""
+    if row is None or metric not in row:
+        return None
+    stat = row[metric]
+    if metric != "mse_f_N2":
+        return stat
+    values = np.sqrt(stat["values"])
+    return {"mean": values.mean(), "values": values}
 
 
 def _touches(numbers: Numbers) -> str:
