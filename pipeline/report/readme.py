@@ -61,8 +61,8 @@ RECORDED_METRICS = {
 }  # fmt: skip
 RECORDED_MEANING = (
     "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. The model is calibrated to "
-    "{presses_n} presses at unknown places, and to labels: presses with known places and forces, spread over the skin. {halves}"
-    "\n\n{touch}"
+    "{presses_n} presses at unknown places, and to labels: presses with known places and forces, spread over the skin. "
+    "{halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # what README.md shows of this model and of one trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
