@@ -1,4 +1,4 @@
-"""Find boards among the serial ports: listen to each port, and detect wire format, number of chips, rate and scale."""
+"""Find boards among the serial ports, and detect each board's wire format, number of chips, rate and scale."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,7 +26,7 @@ Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
 class DetectedBoard(NamedTuple):
-    """A port and the board on it; without a board, `problem` says why."""
+    """A port and the board on it; if no board was detected, `problem` says why."""
 
     port: str
     problem: str | None
@@ -61,7 +61,7 @@ class DetectedBoard(NamedTuple):
         return "steps not known yet: do the readings change?"
 
     def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
-        """Describe the measured rate, what would explain it, and the computed limits, in several lines."""
+        """Describe the measured rate, its likely explanation, and the computed limits, in several lines."""
         if self.problem is not None or self.rate is None:
             return str(self)
         rate = self.rate
@@ -133,8 +133,8 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
     decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
-    # Text frames have the temperature of a chip first or last. Temperatures vary less than fields, so choose the format
-    # in which they vary least.
+    # In text frames, the temperature of a chip is first in one format and last in the other. Temperatures vary less
+    # than fields, so choose the format in which the decoded temperatures vary least.
     frames, account, wire, chips_n = min(
         decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64))
     )

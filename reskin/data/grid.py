@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int32
 # "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; the paper's "16cm" is a typo for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
-BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns that have no excluded points
+BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns in which no point is excluded
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
 SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
 

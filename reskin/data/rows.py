@@ -1,4 +1,4 @@
-"""Rows of a dataset: selected readings of several captures, stacked."""
+"""The rows of a dataset, which are selected readings of several captures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if a recording has s
 
 
 class Selection(Strict):
-    """Criteria for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
+    """Criterion for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
 
     force_min_N: float
 
@@ -52,7 +52,7 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Create rows whose readings and targets are 0, one row per indentation, for doctests of folds.
+        """Create rows for doctests of folds: one row per indentation, whose reading and targets are 0.
 
         Without `pass_i`, all rows are in pass 0.
         """
