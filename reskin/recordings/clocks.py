@@ -179,7 +179,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
 
 
 class _Pattern:
-    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with equal total weights."""
+    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with a sum of zero."""
 
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
@@ -195,7 +195,7 @@ class _Pattern:
         self._unsigned = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the weights of `steps_n` steps of probe time: contact > 0, no-load < 0, between dwells 0."""
+        """Return the weights of `steps_n` steps of probe time; they are 0 between dwells."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
     def unsigned(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:

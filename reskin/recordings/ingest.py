@@ -55,7 +55,7 @@ OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # this key is in the account onl
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames, the stream time of each (NaN: unknown for this frame and all later ones), and which frames to keep."""
+    """Frames, their stream times, and which frames to keep. After an unknown time (NaN), all times are unknown."""
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]

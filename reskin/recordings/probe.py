@@ -1,7 +1,8 @@
 """The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in chronological order. An indentation is one no-load dwell (robot lifted), followed by its contact dwells:
-one dwell, or several if the robot drags the indenter.
+Rows are in chronological order. A dwell is a time in which the robot does not move. An indentation consists of one
+no-load dwell, with the robot lifted, and the contact dwells after it. There are several contact dwells if the robot
+drags the indenter, or else one.
 """
 
 from dataclasses import dataclass
