@@ -475,9 +475,9 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
         `frame.attrs["counts"]` contains the numbers of frames and rows that were read, and the numbers of those that
         were dropped, one number for each reason.
 
-        If the recording has labels, there is one row per reading in contact, as in an ingested capture: the columns of
-        data/README.md (`board`, `x_mm`, `Fz_N`, ...), with one column per channel for the field (`bx0_uT`, `by0_uT`,
-        ...), the no-load reading (`noload_bx0_uT`, ...) and their difference (`dbx0_uT`, ...).
+        If the recording has labels, there is one row per reading in contact, as in an ingested capture. The columns are
+        those of data/README.md (`board`, `x_mm`, `Fz_N`, ...). Each channel has three columns: the field (`bx0_uT`),
+        the no-load reading (`noload_bx0_uT`) and their difference (`dbx0_uT`).
 
         Without labels, or if `frames` is True, there is one row per frame: time `t_s`, field `bx0_uT`, ..., and
         temperature `temperature0_degC`, .... For a capture's folder, there are also the columns `capture`, `board`,

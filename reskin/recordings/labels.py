@@ -59,7 +59,7 @@ class Dwell(NamedTuple):
 
 
 class ProbeLogWriter:
-    """Write the probe log of a recording as labels arrive, each contact together with the no-load dwell before it.
+    """Write the probe log of a recording as labels arrive; write a contact together with the no-load dwell before it.
 
     Therefore, `probe.parse` accepts the log even if the recorder is killed. Contacts that `probe.parse` would refuse
     are counted and not written.

@@ -39,7 +39,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
 
 
 def _read_capture(folder: Path) -> sd_card.Log:
-    """Read the frames of a capture; drop frames after the last recorded arrival time, because they have no time."""
+    """Read the frames of a capture; drop frames after the last recorded arrival, because their times are unknown."""
     header = read_header(folder)
     if header.layout == "sd-card":
         return sd_card.read_log(folder / LOG_FILE)
