@@ -9,9 +9,9 @@
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
-`simulate_recording`                   a recording of a simulated board, like that of `record`
+`simulate_recording`                   record a simulated board, as `record` records a real one
 `ContactRegressor`                     the paper's network, with scikit-learn's fit and predict
-`UniversalRegressor`                   the same for the universal model: `fit` calibrates it to a skin
+`UniversalRegressor`                   the universal model with the same methods; `fit` calibrates it to a skin
 `SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
 =====================================  ==========================================================
 

@@ -2,7 +2,7 @@
 
 The functions take names and plain values and return NumPy arrays. The names of arguments and results end in their
 units: mm, N, s, uT. The channels of a field are Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports
-its dependencies when it is called, so that `import reskin` is quick.
+its dependencies only when it is called, so that `import reskin` is quick.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 AnyModel = Union[Path, str, "Model", "Universal", Sequence[Union[Path, str, "Model", "Universal"]]]
-Changes = Mapping[str, Any]  # setting name -> value, for settings that differ from the nominal ones
+Changes = Mapping[str, Any]  # name of a setting -> value, for settings that differ from the nominal settings
 NOMINAL_BOARD = "rigid"
 
 
@@ -57,7 +57,7 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     Raises
     ------
     ParamsError
-        If the folder holds no Parquet file.
+        If the folder contains no Parquet file.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def simulate_pokes(
 ) -> Pokes:
     """Simulate the chip readings and the normal force for indentations of a skin without wear.
 
-    Ageing and friction are not simulated.
+    Ageing of the skin and friction are not simulated.
 
     Parameters
     ----------
@@ -661,7 +661,7 @@ def record(
     Examples
     --------
     >>> def presses():
-    ...     for x_mm, y_mm in places:  # in random order, because each touch affects the next one
+    ...     for x_mm, y_mm in places:  # in random order, because each touch affects the next touch
     ...         robot.lift_and_go_to(x_mm, y_mm)
     ...         yield reskin.lifted()
     ...         robot.press()

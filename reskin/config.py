@@ -26,7 +26,7 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a file as YAML 1.2, like DVC (in YAML 1.1, `1e-3` would be text)."""
+    """Read a file as YAML 1.2, as DVC does; in YAML 1.1, `1e-3` would be text."""
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

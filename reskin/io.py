@@ -41,7 +41,7 @@ MACHINE_ERRNOS = {
     errno.EMFILE,
     errno.ENFILE,
     errno.ESTALE,
-}  # errors for which the file itself may be intact
+}  # errors after which the file itself may be intact
 
 
 @contextmanager

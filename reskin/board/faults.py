@@ -48,7 +48,7 @@ OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
-CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock is a jump
+CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock counts as a jump
 # assumed: repeated frames are a fault if more than 40 % of the frames in a window of 40 frames (0.1 s at 400 Hz) equal
 # the previous frame
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
@@ -59,7 +59,8 @@ SILENCE_STEPS = 50.0
 GARBAGE_FRAMES_N = 10  # if there are more stray bytes than this many frames have, the baud rate is probably wrong
 LONG_LINE = 1.5  # a line of text that is longer than the median length by this factor contains stray bytes
 
-SCALE_FRAMES_N = 400  # enough to find the LSB of every working chip in real recordings; 200 may be too few
+# in real recordings, this is enough to find the LSB of every working chip; 200 frames may be too few
+SCALE_FRAMES_N = 400
 GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
 
 
@@ -99,7 +100,7 @@ def find_lsb(
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
     """Mark the chips whose LSB is not the expected one (along x and y, and along z).
 
-    Without an expected LSB, mark the chips whose LSB differs from the median of all chips, or equals the LSB of a chip
+    Without an expected LSB, mark the chips whose LSB differs from the median LSB of all chips or equals that of a chip
     after a reset. A chip whose LSB cannot be detected is not marked.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
@@ -228,7 +229,7 @@ def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the missing frames before each frame, according to the board's clock; all 0 without a clock."""
+    """Count the missing frames before each frame by the board's clock; without a clock, all counts are 0."""
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -322,7 +323,7 @@ class ScaleWindow(NamedTuple):
 
 
 class Faults(NamedTuple):
-    """The faults in one portion of frames: masks and counts, per frame or per frame and chip."""
+    """The faults in one portion of frames, as masks and counts per frame, or per frame and chip."""
 
     readings: ReadingFaults
     stuck: Bool[np.ndarray, "f k"]
@@ -362,7 +363,7 @@ class FaultDetector:
         self._frame_bytes_n = frame_bytes_n
         self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
-        self._windowed_n = 0  # frames in complete windows
+        self._windowed_n = 0  # number of frames in complete windows so far
         self._lsb_uT = np.full((chips_n, 2), np.nan)  # LSB of each chip; NaN until known
         self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
         self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame

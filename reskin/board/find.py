@@ -21,7 +21,7 @@ LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the L
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
 BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
-LSB_TOLERANCE = 0.05  # relative; the LSBs of two gains differ by 20 % or more
+LSB_TOLERANCE = 0.05  # relative tolerance; the LSBs of two gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
@@ -34,7 +34,7 @@ class DetectedBoard(NamedTuple):
     chips_n: int = 0
     rate_hz: float = np.nan
     lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and along z: medians over chips
-    rate: RateMeasurement | None = None  # None without a board
+    rate: RateMeasurement | None = None  # None if there is no board
     frame_bytes_n: float = np.nan  # mean length of a frame
 
     @property

@@ -51,7 +51,7 @@ def check_name(port: str) -> None:
     if port.startswith(SOCKET):
         if not re.fullmatch(r".+:\d{1,5}([/?].*)?", port.removeprefix(SOCKET)):
             reason = f"its port number is missing. Write {SOCKET}HOST:PORT."
-    elif "://" in port:  # pyserial has more schemes, some of which load code
+    elif "://" in port:  # pyserial accepts more schemes, some of which load code
         reason = f"the only supported URL is {SOCKET}HOST:PORT."
     elif os.path.isdir(port):  # unlike `Path.is_dir`, never raises for names such as COM3
         reason = f"it is a folder. {found_ports()}"

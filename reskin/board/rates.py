@@ -1,6 +1,7 @@
 """Measure a board's frame rate and its repeated readings, and explain what limits the rate.
 
-`RateMeter` measures. `find_limits` computes the rates that conversion time, I2C bus, baud rate and USB allow.
+`RateMeter` measures the rate. `find_limits` computes the maximum rates that conversion time, I2C bus, baud rate and USB
+allow.
 `explain` compares the measured rate with these limits in one sentence. Agreement with a limit does not prove that this
 limit is the cause, so the sentence says "would explain".
 """
@@ -20,8 +21,8 @@ from reskin.physics.chip import CONVERSION_S, DIG_FILT_MAX, OSR_MAX, conversion_
 # is at most 0.024, because successive values of a chip with a coarse LSB are sometimes equal by chance.
 REPEATED_MAX = 0.05
 ALL_REPEATED = 0.99  # above this share, the board sends the same reading again and again
-FRAMES_MIN_N = 20  # with fewer frames, no rate is given
-CLOCK_FRAMES_N = 400  # number of frames from which the usual step of the board's clock is determined
+FRAMES_MIN_N = 20  # with fewer frames, the rate is unknown
+CLOCK_FRAMES_N = 400  # the usual step of the board's clock is determined from this many frames
 # A board sends the time of its clock as a float32 in s. After some hours, the resolution of a float32 is too coarse for
 # the time between two frames.
 CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of this resolution to the time between two frames
@@ -119,7 +120,7 @@ class RepeatCounter:
 
 
 class RateMeter:
-    """Measure the rate of frames that arrive in portions of any length; the memory used does not grow.
+    """Measure the rate of frames that arrive in portions of any length, with constant memory.
 
     `start_s` is the time of arrival of the first bytes. Frames that arrived at this time may have been waiting in the
     port, so they are not counted for the rate. A silence of a second or more is not counted either.
@@ -132,7 +133,7 @@ class RateMeter:
         self._elapsed_s = 0.0
         # times of the board's clock for frames that are not counted yet
         self._clock_s: list[Float64[np.ndarray, " f"]] = []
-        self._clocked_n = 0  # number of these times
+        self._clocked_n = 0  # number of times in `_clock_s`
         self._sent_n = 0.0
         self._sent_s = 0.0
 
@@ -169,7 +170,7 @@ class RateMeter:
         clock_s = np.concatenate(self._clock_s) if self._clock_s else np.zeros(0)
         self._clock_s, self._clocked_n = [clock_s[-1:]], 0
         step_s = np.diff(clock_s)
-        # A frame with the same time as the previous frame was sent once but arrived twice.
+        # If a frame has the same time as the previous frame, this frame was sent once but arrived twice.
         step_s = step_s[~clock_jumps(step_s) & (step_s > 0)]
         if not len(step_s) or np.spacing(np.float32(clock_s[-1])) > CLOCK_STEP_RESOLUTION_MAX * np.median(step_s):
             return

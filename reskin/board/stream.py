@@ -64,7 +64,7 @@ class FrameStream:
         return self._advance(data, final=False)
 
     def close(self) -> Frames:
-        """End the stream; return the frames that waited for more bytes, and count the remaining bytes as lost."""
+        """End the stream; return the frames that were not yet certain, and count the remaining bytes as lost."""
         self._closed = True
         return self._advance(b"", final=True)
 
@@ -213,14 +213,14 @@ def _search(
     when the window is searched again with more bytes.
     """
     length_n, window_n = record.itemsize, len(window)
-    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
+    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # whether a frame may have ended before each byte
     ended[0] = at_boundary
     ended[2 : window_n + 1] = _terminators(window)[: max(window_n - 1, 0)]
     fits = ended[:-length_n] & ended[length_n:]
     first = int(fits.argmax())
     if not fits[first]:
         return (window_n if final else max(window_n - length_n - 1, 0)), False
-    if not final and window_n < first + 3 * length_n:  # other candidates may follow
+    if not final and window_n < first + 3 * length_n:  # other candidate positions may follow
         return max(first - 2, 0), False
     starts = first + np.flatnonzero(fits[first : first + length_n])
     here_n, next_n = (

@@ -1,7 +1,7 @@
 """Encode and decode whole frames: binary bursts and lines of text.
 
-These are the formats of the ReSkin and AnySkin firmwares, which have no header, checksum or counter. Module `stream`
-finds frames in a byte stream, and `faults` checks their values.
+The formats are those of the ReSkin and AnySkin firmware; their frames have no header, checksum or counter. Module
+`stream` finds frames in a byte stream, and `faults` checks their values.
 """
 
 from collections.abc import Iterator, Sequence
@@ -67,7 +67,7 @@ def line_bytes_max_n(chips_n: int) -> int:
 
 
 def encode(frames: Frames, wire: Wire) -> bytes:
-    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` includes the device's time."""
+    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` has the board's time."""
     frames_n, chips_n = frames.temperature_degC.shape
     b_uT = frames.b_uT.reshape(frames_n, chips_n, 3)
     if wire in TEXT_WIRES:

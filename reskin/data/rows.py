@@ -16,7 +16,7 @@ from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
 UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not change these
-SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if a recording has shear forces (paper section 4)
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # targets for recordings with shear forces (paper section 4)
 
 
 class Selection(Strict):
@@ -32,8 +32,8 @@ class Rows:
     `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
     and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
     number of the pass, counted over all captures of a skin. `indentation` is the number of the indentation, counted
-    over all captures of the scene; all readings of an indentation have the same number. `dropped` counts the readings
-    that are left out because they are not in contact, by reason.
+    over all captures of the scene; all readings of an indentation have the same number. `dropped` contains the numbers
+    of readings that were left out because they are not in contact, by reason.
     """
 
     capture: np.ndarray

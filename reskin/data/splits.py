@@ -280,7 +280,8 @@ def draw_sides(
     Rows with the same `group` are never separated, and at least one group is in the test rows. `state` is the random
     seed. In error messages, `what` describes the groups, and `where` the experiment.
     """
-    from sklearn.model_selection import GroupShuffleSplit  # imported late: takes a second, and few stages need it
+    # imported late, because it takes a second and few stages need it
+    from sklearn.model_selection import GroupShuffleSplit
 
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
@@ -302,7 +303,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
 
 
 def _check_disjoint(rows: Rows, fold: Fold) -> None:
-    """Raise if a board or a skin of the training rows is also in the test rows or in the pool."""
+    """Raise if a board or a skin of the training rows also occurs in the test rows or in the pool."""
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))

@@ -51,8 +51,8 @@ class Part:
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
     """Return the training window (the first `train_n` units) and the test windows (`test_n` units each).
 
-    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, ... `units_n` is the length of each capture in
-    units; all windows are within the shortest capture.
+    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, and so on. `units_n` contains the length of each
+    capture in units. All windows are within the shortest capture.
 
     >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)

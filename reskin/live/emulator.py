@@ -82,7 +82,7 @@ class Script:
     frames: Frames
     pieces: list[bytes]
     t_s: Float64[np.ndarray, " f"]  # due time of each piece, from the start of the script
-    # Index of a piece -> time for which the board is unplugged before this piece is sent.
+    # Maps the index of a piece to the time for which the board is unplugged before this piece is sent.
     unplugged_s: dict[int, float] = field(default_factory=dict)
     # True x_mm, y_mm and F_N of each frame; NaN without contact. None if the true contacts are unknown.
     true_contacts: Float64[np.ndarray, "f 3"] | None = None
@@ -131,7 +131,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
 
 
 def read_capture(folder: Path) -> Script:
-    """Create a script from a recorded byte stream, or from an SD card log; the log's readings are encoded as frames."""
+    """Create a script from a recorded byte stream, or from an SD card log, whose readings are encoded as frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
@@ -193,7 +193,7 @@ def simulate(
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
     script = replace(script, true_contacts=true_contacts_of(capture))
-    if robot:  # frames are sent one by one, so that each row of the robot's log has the time of its frame
+    if robot:  # frames are due one by one, so that each row of the robot's log has the time of its frame
         even_s = np.arange(len(script)) / ROBOT_RATE_HZ
         script = replace(script, t_s=even_s, presses_per_pass_n=len(points_mm()))
     return script
@@ -562,7 +562,7 @@ class RobotLog:
         if piece_i < self._sent_i:  # the script has restarted
             self._sent_i = -1
         now_s = time.time()
-        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent at once, but were due one after another
+        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent together, but were due one after another
             self._last_s = max(self._last_s, now_s - float(self._due_s[piece_i] - self._due_s[i]))
             self._stream.write(f"{self._last_s:.6f},{self._cells[i]}\n")
         self._sent_i = piece_i

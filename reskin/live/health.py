@@ -59,7 +59,7 @@ class Health:
         self._batch: list[Frames] = []
         self._repeats = RepeatCounter(chips_n)
         self._frames_repeat = False  # whether whole frames were repeated since the last check of single readings
-        self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
+        self._stuck = False  # whether frames are dropped now, because a chip was stuck at the end of the last batch
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 

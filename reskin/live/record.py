@@ -35,7 +35,7 @@ class RecordingResult(NamedTuple):
 
     folder: Path
     summary: str
-    error: Exception | None  # exception from the source of labels, which ended the recording
+    error: Exception | None  # exception of the label source that ended the recording, if any
 
 
 def label_source(

@@ -33,7 +33,7 @@ BINS_N = round(WINDOW_S / BIN_S)
 LATENCIES_N = 4000  # number of latest latencies in the statistics; 10 s at 400 Hz
 UNCONFIRMED_MAX_N = 64  # maximum number of sent messages that wait for a confirmation
 UNKNOWN_CONTACT = (math.nan,) * 3
-HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading
+HEAD = struct.Struct("<IHHd")  # fields: message number, number of chips, number of bins, time of the last reading
 # The numbers are: x_mm, y_mm, F_N, standard deviations of x and y, contact, rate, number of lost bytes, four latencies
 # in ms, number of dropped frames, and the true x, y and F of an emulated board (NaN for real boards and without
 # contact).
@@ -47,7 +47,7 @@ READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
 
 
 class Traces:
-    """Minimum and maximum of the force and of the field changes in 20 ms bins, for the last ten seconds."""
+    """Minima and maxima of the force and of the field changes in bins of 20 ms, for the last ten seconds."""
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
@@ -242,7 +242,7 @@ class Session:
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
         self._guided_press: LabelledPress | None = None  # the current guided press, whose label is recorded
-        self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
+        self._adapted = self._labelled = ""  # texts about the last calibration and the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
         # Requested changes of the model. The polling thread makes these changes, because it also estimates with the

@@ -45,7 +45,7 @@ from reskin.universal.layout import BoardLayout
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
-NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
+NOLOAD_S = 1.0  # the no-load reading is the mean over this time without contact
 NOLOAD_FRAMES_MAX_N = 10_000
 # The wire format is detected when data for `HEAD_S` seconds, or `HEAD_BYTES_MAX_N` bytes, have arrived.
 HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18
@@ -87,11 +87,12 @@ class NetworkEstimator:
         self._inputs = [
             (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
         ]
-        for network in networks:  # so that torch is imported and the network is built before the first contact
+        # predict once, so that torch is imported and the network is built before the first contact
+        for network in networks:
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Do nothing, because networks use only field changes."""
+        """Do nothing, because networks use only field changes and not the no-load reading."""
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
@@ -421,8 +422,8 @@ class LiveSkin:
             self.estimator = NetworkEstimator(models)
         self._model_problem = ""
         self._head: list[Chunk] = []
-        self._partial_first_bytes_n = 0  # bytes of frames that were cut by opening the port
-        self.dropped_frames_n = 0  # frames without an estimate because of a fault
+        self._partial_first_bytes_n = 0  # number of bytes of frames that were cut by opening the port
+        self.dropped_frames_n = 0  # number of frames that have no estimate because of a fault
         self.zeroings_n = 0
         self.zeroings_s: deque[float] = deque(maxlen=ZEROINGS_KEPT_N)  # times of the latest no-load readings
         self._restart_noload()
@@ -644,7 +645,8 @@ class LiveSkin:
             return
         self._quiet, self._quiet_from_s = [], np.inf
         with suppress(CaptureError):  # raised by `quiet_start` if the field changed; then the next second is tried
-            # Evenly spaced times replace the arrival times, which are equal for all frames of a chunk.
+            # Use evenly spaced times instead of arrival times, because all frames of a chunk have the same arrival
+            # time.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)

@@ -1,4 +1,4 @@
-"""Prepare the training data of a stack of networks: scaled rows, initial weights, and the batches of each step."""
+"""Prepare the data of networks that are trained together: scaled rows, initial weights, and batches."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -153,7 +153,7 @@ _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """Draws batches for all networks of a stack.
+    """Draws batches for all networks of a stack, which are trained together.
 
     The rows of all networks are concatenated and stored on the device that trains the networks.
     """

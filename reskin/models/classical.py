@@ -26,7 +26,7 @@ class _Method(Strict):
 
 
 class Ridge(_Method):
-    """Linear ridge regression. `alpha` is the weight of the penalty relative to the sum of scaled squared errors."""
+    """Linear ridge regression. `alpha` is the weight of the penalty; the sum of scaled squared errors has weight 1."""
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -250,7 +250,7 @@ class _BlockwiseCubicRidge:
         from sklearn.preprocessing import PolynomialFeatures
 
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1; its coefficient is not penalised
+        self.lift = PolynomialFeatures(3)  # the first product is the constant 1, whose coefficient is not penalised
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_

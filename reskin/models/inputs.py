@@ -16,7 +16,7 @@ from jaxtyping import Float32
 DB_FLOOR_uT = 1.0
 # Lower limit of scales, which avoids a division by zero for channels that are constant in training.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # about the input scale of the network that the authors released
+RELEASED_INPUT_SDS = np.float32(5.0)  # about the scale of the inputs in the network that the authors released
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 

@@ -26,7 +26,7 @@ BLOCK_ROWS_N = 65_536  # rows per forward pass, to limit memory
 
 @dataclass(frozen=True)
 class Layer:
-    """A linear layer, and whether a ReLU follows it."""
+    """A linear layer, with or without a ReLU after it."""
 
     in_n: int
     out_n: int

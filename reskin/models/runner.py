@@ -29,8 +29,10 @@ MAX_ATTEMPTS_N = 3
 STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
 NO_ROWS = np.zeros(0, np.int64)  # placeholder in a `RemoteJob`, whose row numbers are in the shared file
 
-RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; names of `train` and `test` in the shared file
-FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array of row numbers -> name in the shared file, the array
+# a job without row numbers, and the names of `train` and `test` in the shared file
+RemoteJob = tuple[TrainingJob, str, str]
+# id of an array of row numbers -> its name in the shared file, and the array
+FoldRows = Mapping[int, tuple[str, np.ndarray]]
 
 
 def run_jobs(
@@ -66,7 +68,7 @@ def _run_once(
 ) -> list[TrainingResult]:
     job_keys = JobKeys(data)
     keys = [job_keys.key(job) for job in jobs]
-    unique = dict(zip(keys, jobs, strict=True))  # equal jobs are trained once
+    unique = dict(zip(keys, jobs, strict=True))  # equal jobs are trained only once
     planned = [(stack, _result_files(stack, cache)) for stack in make_stacks(unique, STACK_N[device()])]
     missing = [(stack, files) for stack, files in planned if not all([_is_intact(file, log) for file in files])]
     fresh = {key for stack, _ in missing for key in stack}

@@ -1,4 +1,4 @@
-"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks with equal settings."""
+"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks (see `reskin.models.network`)."""
 
 import math
 import time

@@ -138,7 +138,7 @@ class ClockMap:
 def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
     """Fit the clock map to sync marks, one row (stream time, probe time) each.
 
-    A single mark determines the offset, with a rate of 1; several marks also determine the rate.
+    A single mark determines only the offset, and the rate is 1. Several marks also determine the rate.
     """
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
@@ -189,7 +189,7 @@ class _Pattern:
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
         # Fraction of the time without contact.
         self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
-        scaled = len(firsts) * weight * dwell_s  # so that one indentation has weight 1
+        scaled = len(firsts) * weight * dwell_s  # scaled so that one indentation has weight 1
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
         self._signed = _running(np.where(log.contact, scaled, -scaled))
         self._unsigned = _running(scaled)

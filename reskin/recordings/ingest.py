@@ -255,7 +255,7 @@ class OpenedCapture(NamedTuple):
 
 
 def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
-    """Check a capture's header and files, and begin to read it; `policy` decides what to do about faults."""
+    """Check a capture's header and files, and begin to read the capture; `policy` decides what happens to faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():

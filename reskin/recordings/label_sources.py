@@ -369,7 +369,7 @@ class Prompts:
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:
-    """Yield typed lines, stripped, until they end or `stop` is set; a thread waits for the input."""
+    """Yield typed lines without surrounding spaces until they end or `stop` is set; a thread waits for the input."""
     typed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def read() -> None:

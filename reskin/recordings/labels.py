@@ -109,7 +109,7 @@ class ProbeLogWriter:
             self.write(dwell)
 
     def _append(self, touch: Dwell) -> None:
-        is_new = self._noload is not None  # otherwise, the dwell continues a touch
+        is_new = self._noload is not None  # if not, the dwell continues the latest touch
         self._touch = touch.label if is_new else self._touch
         indentation = self._indentation + is_new
         pass_i = touch.label.pass_i

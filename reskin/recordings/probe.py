@@ -31,7 +31,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class ProbeLog:
-    """The dwells of one capture, one array element per dwell; NaN where a label is unknown.
+    """The dwells of one capture, one array element per dwell; unknown labels are NaN.
 
     `contact` is True for phase `contact`, and False for phase `noload`, when the robot is lifted. Forces have the signs
     of `reskin.schema`.

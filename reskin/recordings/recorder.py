@@ -74,7 +74,7 @@ def record_capture(
     failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         recording = replace(recording, ended="not written")
-    if recording.ended != "not written":  # if the disk is full, the .part folder can be added as it is
+    if recording.ended != "not written":  # if the disk is full, keep the .part folder, which can be added as it is
         end_capture(folder, headers[-1], recording.rate)
     return CaptureResult(recording, summary, failed)
 

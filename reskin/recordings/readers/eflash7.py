@@ -75,7 +75,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return all rows from the first touch on as readings, in contact or not; earlier rows give the no-load field."""
+    """Return all rows from the first touch on as readings; the rows before give the no-load field."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:

@@ -46,8 +46,8 @@ PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
 # which is 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# If z varies by less than this fraction of its largest value, the robot kept a constant height. The fraction is 1e-4
-# for a robot at constant height, and some hundredths for presses whose z is in m instead of mm.
+# If z varies by less than this fraction of its largest value, the robot kept a constant height. For a robot at constant
+# height, z varies by a fraction of 1e-4; for presses whose z is in m instead of mm, by some hundredths.
 HELD_FRACTION = 1e-3
 
 Account = dict[str, int]

@@ -19,7 +19,7 @@ from reskin.recordings.units import check_fields
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500
+HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
 # assumed: no board logs at a lower rate, and no chip measures at a higher rate
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
 SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long to be quoted in an error message
