@@ -479,9 +479,9 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
         those of data/README.md (`board`, `x_mm`, `Fz_N`, ...). Each channel has three columns: the field (`bx0_uT`),
         the no-load reading (`noload_bx0_uT`) and their difference (`dbx0_uT`).
 
-        Without labels, or if `frames` is True, there is one row per frame: time `t_s`, field `bx0_uT`, ..., and
-        temperature `temperature0_degC`, .... For a capture's folder, there are also the columns `capture`, `board`,
-        `skin` and `source`.
+        Without labels, or if `frames` is True, there is one row per frame: the time (`t_s`), the field (`bx0_uT`,
+        `by0_uT` and so on) and the temperature of each chip (`temperature0_degC` and so on). For a capture's folder,
+        there are also the columns `capture`, `board`, `skin` and `source`.
 
         Faulty readings are dropped according to section `faults` of `params.yaml`.
 
@@ -516,7 +516,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     Parameters
     ----------
     port : str or list of str
-        A serial port or `socket://host:port`. For several boards, a list of them.
+        A serial port or `socket://host:port`, or a list of these for several boards.
     model : optional
         One or more trained networks, or one universal model. Networks are files or `Model` objects. A universal model
         is a `Universal` object, which is not modified, or the file of a model, of a calibration, or both files.
@@ -536,8 +536,8 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is listed twice. The `with` statement raises it if a port cannot be opened
-        or sends no frames, or if the board's number of chips does not match the model.
+        If a model cannot be read or a port is listed twice. The `with` statement raises this error if a port cannot be
+        opened or sends no frames, or if the board's number of chips does not match the model.
 
     Examples
     --------

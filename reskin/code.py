@@ -74,7 +74,7 @@ def file_of(name: str) -> Path:
 def _syntax(node: ast.AST) -> list[Any]:
     """Convert a syntax tree to nested lists, without docstrings.
 
-    Empty fields are dropped, because which empty fields a node has depends on the version of Python.
+    Empty fields are dropped, because the empty fields of a node depend on the version of Python.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})

@@ -81,8 +81,9 @@ RETRY = "Run it again: finished work is kept."
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`; the message begins with
-    `where`.
+    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`.
+
+    The message of the new error begins with `where`.
 
     Other exceptions pass through unchanged.
 

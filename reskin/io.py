@@ -164,7 +164,7 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     metadata = {**metadata, DIGEST: _digest(dense, metadata)}
     content = safetensors.numpy.save(dense, metadata)
-    # because safetensors' save_file would hide disk errors
+    # The file is not written by safetensors' save_file, because this function would hide disk errors.
     with replacing(path) as temporary, temporary.open("wb") as stream:
         stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
@@ -233,7 +233,7 @@ def read_column_names(path: Path) -> list[str]:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block, then `counts`, which iterating over `blocks` may update."""
+    """Write the readings of one capture block by block, then `counts`. Iterating over `blocks` may update `counts`."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:

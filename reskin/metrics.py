@@ -55,7 +55,10 @@ def coverage_pct(
 def interval_score(
     true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
 ) -> float:
-    """Return the mean interval score of 90 % intervals: the width, plus 20 times the distance of a true value outside.
+    """Return the mean interval score of 90 % intervals.
+
+    The score of an interval is its width, plus 20 times the distance of the true value from the interval if it is
+    outside.
 
     The expected score is smallest if the limits are the true 5 % and 95 % quantiles (Gneiting & Raftery, JASA 2007).
     """

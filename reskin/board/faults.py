@@ -133,7 +133,7 @@ class StuckChips:
     def __init__(self, chips_n: int) -> None:
         self._last_uT = np.full((1, chips_n, 3), np.nan)
         self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip last changed
-        # in how many of the frames since each chip last changed another chip changed
+        # number of frames since each chip last changed in which another chip changed
         self._moved_n = np.zeros(chips_n, np.int64)
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
@@ -211,8 +211,7 @@ def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
     """Mark frames that repeat the previous frame, if more than `REPEATED_SHARE` of the frames around them do so too.
 
-    `REPEATED_SHARE` is a fraction. A few repeated frames are normal if the firmware reads the chips faster than they
-    measure.
+    A few repeated frames are normal if the firmware reads the chips faster than they measure.
     """
     same = np.asarray((step_uT == 0).all(axis=1))
     if len(same) < REPEATED_LOOK_N:

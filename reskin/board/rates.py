@@ -38,8 +38,7 @@ UART_BITS_PER_BYTE_N = 10  # start bit, 8 data bits, stop bit
 USB_BYTES_PER_S = 19 * 64 * 1000  # full speed: at most 19 bulk packets of 64 bytes in 1 ms (USB 2.0, table 5-9)
 
 ERROR = 0.03  # assumed: relative error of a measured rate
-# assumed: a limit explains rates between this fraction of the limit and the limit, because the board's program takes
-# time too
+# assumed: a limit also explains rates down to this fraction of the limit, because the board's program takes time too
 NEAR = 0.8
 
 Method = Literal["arrivals", "clock"]
@@ -54,8 +53,7 @@ class RateMeasurement:
     frames_n : number of frames
     arrived_hz : frames per second that arrived; NaN if unknown
     sent_hz : frames per second that the board sent
-    method : how `sent_hz` was measured: by the board's clock or, if the wire format has no usable clock, by the
-    arrivals
+    method : how `sent_hz` was measured: by the board's clock, or by arrivals if there is no usable clock
     repeated_frames : share of frames whose fields equal those of the previous frame
     repeated_readings : share of a chip's readings that equal the chip's previous reading. This is the median over
         chips, so that a single stuck chip has no effect.

@@ -206,8 +206,7 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
 def _search(
     window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[int, bool]:
-    """Search the next frame; return the number of bytes to skip, and whether a frame begins there (else, wait for
-    bytes).
+    """Return the number of bytes to skip, and whether a frame begins there; if not, more bytes are needed.
 
     The two bytes before the first possible start of a frame are not skipped, because they may be the CR LF of a frame
     when the window is searched again with more bytes.

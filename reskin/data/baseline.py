@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three values were tuned on all passes of the recording of scene `eflesh`, so they cannot be tested on it. Number
-# of latest states with which `follow_free` compares a reading; usually, five are contacts and five are not.
+# These three values were tuned on all passes of the recording of scene `eflesh`, so they cannot be tested on it.
+# Number of latest states with which `follow_free` compares a reading; usually, five are contacts and five are not.
 STATES_N = 10
 # a state is free of contact if it is similar to at least this many of the latest states, including itself
 SIMILAR_MIN_N = 4

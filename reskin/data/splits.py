@@ -184,7 +184,7 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled; n labels are those of the first n."""
+    """Draw the order in which the indentations of a fold's pool are labelled; with n labels, use the first n."""
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
@@ -290,9 +290,7 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return the number of test groups among `all_n` groups; raise `ParamsError` if none would be left to train or test
-    on.
-    """
+    """Return the number of test groups among `all_n` groups; raise `ParamsError` if it is 0 or `all_n`."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene."

@@ -175,9 +175,9 @@ def simulate(
 ) -> Script:
     """Create a script by simulating a skin as section `simulate` of a scene describes.
 
-    If the section has protocol `log`, this protocol is simulated, or else the scan over a grid of places. `board` is
-    the name of the board (default: the first board of the scene). With `robot`, the touches of protocol `log` are
-    replaced by presses of a robot.
+    Protocol `log` is simulated if the section has it; otherwise, the scan over a grid of places. `board` is the name of
+    the board (default: the first board of the scene). With `robot`, the touches of protocol `log` are replaced by
+    presses of a robot.
     """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
@@ -351,7 +351,7 @@ class EmulatedPort:
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal. An optional symbolic link keeps its name when the board is unplugged and plugged in."""
+    """A pseudo-terminal. A symbolic link, if any, has the same name after the board is plugged in again."""
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):

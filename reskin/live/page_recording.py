@@ -21,7 +21,7 @@ from reskin.recordings.stream_recorder import CaptureWriter
 
 # Assumed times for the no-load dwell of a labelled press. The dwell begins RECOVERY_S or more after the previous
 # contact, because the skin needs time to recover. It ends APPROACH_S before the press, because the tip may approach
-# slowly. It lasts from REST_MIN_S to REST_MAX_S.
+# slowly. It lasts between REST_MIN_S and REST_MAX_S.
 REST_MAX_S, REST_MIN_S, RECOVERY_S, APPROACH_S = 1.0, 0.2, 0.3, 0.05
 PLATEAU = 0.8  # assumed: the press is held while |dB| is at least this fraction of its maximum
 PRESS_READINGS_MAX_N = 20_000  # maximum number of readings that are kept of one press, to limit memory; 50 s at 400 Hz

@@ -44,7 +44,7 @@ def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: 
     Each batch has equal numbers of readings from the known skins and from the new skin. The discriminator's gradient is
     reversed before it reaches the features, and is multiplied by a factor that rises to `weight` during training.
     """
-    # one thread, so that the order of summation does not depend on the number of other processes
+    # Use one thread, so that the order of summation does not depend on the number of other processes.
     torch.set_num_threads(1)
     layers = paper_layers(domains.known.shape[1], domains.target.shape[1])
     net = Stack(layers, [draw_weights(layers, rng)])

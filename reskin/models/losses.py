@@ -1,4 +1,4 @@
-"""Training losses: the squared error, and the triplet loss of section 5 of the paper; and the sampling of triplets.
+"""Training losses: the squared error and the triplet loss (paper section 5), with the sampling of triplets.
 
 A triplet consists of three points of the same group (a skin, or a line of pokes): an anchor, a positive and a negative.
 The positive is strictly nearer to the anchor than the negative.

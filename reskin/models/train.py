@@ -87,7 +87,7 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Train a stack: minimise the squared error plus the loss terms that `loss_weights` weights.
+    """Train a stack: minimise the squared error plus the other loss terms, weighted by `loss_weights`.
 
     The paper specifies neither the optimiser nor the schedule. This implementation uses AdamW with PyTorch's one-cycle
     schedule of learning rate and momentum.

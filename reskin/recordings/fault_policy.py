@@ -273,8 +273,7 @@ def check_rows(
 
     Parameters
     ----------
-    row : number of each row in its file, needed if some rows of the file were left out. If None, rows are counted from
-        1.
+    row : number of each row in its file, if some rows of the file were left out; None: rows are counted from 1.
 
     Raises
     ------

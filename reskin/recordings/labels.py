@@ -120,7 +120,7 @@ class ProbeLogWriter:
 
 
 def same_place(a: Label, b: Label) -> bool:
-    """Return whether two labels have the same place; a coordinate counts as equal if both labels do not know it."""
+    """Return whether two labels have the same place; a coordinate that is unknown in both labels counts as equal."""
     return all(
         abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
         for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))

@@ -24,8 +24,8 @@ FORCE_MAX_N = 100.0
 FORCE_MIN_N = 0.05  # every recording has a touch with a larger force; in kg, 0.4 N would be 0.04
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-# If some places are far from the others, these places are wrong if they are at most this fraction of all places;
-# otherwise, the unit is wrong.
+# If some places are far from the others, but at most this fraction of all places, these places are wrong. If they are
+# more, the unit is wrong.
 FAR_SHARE_MAX = 0.1
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 

@@ -84,7 +84,7 @@ class Episode:
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
 ) -> dict[str, float]:
-    """Write recordings as a LeRobot dataset; return its size, rate, largest timestamp error and losses.
+    """Write recordings as a LeRobot dataset; return size, rate, largest timestamp error and number of omitted frames.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
 
 
 def _rate_hz(recording: Recording) -> float | None:
-    """Return the rate: 1 / the median time between readings of the same part; None if no part has two readings."""
+    """Return 1 / the median time between readings of the same part; None if no part has readings at two times."""
     assert recording.t_s is not None
     step_s = np.diff(recording.t_s)[np.diff(recording.part) == 0]
     return float(1 / np.median(step_s[step_s > 0])) if (step_s > 0).any() else None
@@ -352,7 +352,7 @@ def _table(columns: Columns) -> pa.Table:
 
 
 def _file_numbers(bytes_n: Sequence[int]) -> list[int]:
-    """Return the data file's number of each episode; a file contains several episodes of up to `FILE_MB` in total."""
+    """Return for each episode the number of its data file; a file has several episodes, up to `FILE_MB` in total."""
     numbers, size_n, number = [], 0, 0
     for episode_bytes_n in bytes_n:
         if size_n and size_n + episode_bytes_n > FILE_MB * 2**20:
