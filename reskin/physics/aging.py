@@ -117,8 +117,8 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
 def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony) -> Float[np.ndarray, " t"]:
     """Return the force of a viscoelastic skin at each time, given the force of an elastic skin at these times.
 
-    The elastic force starts from 0 and is linear between the times. The force at time t is the integral of relaxation(t
-    - s) d elastic(s) over all earlier times s (Lee & Radok 1960). This solution is valid only while the contact area
+    The elastic force starts from 0 and is linear between the times. The force at time t is the integral over earlier
+    times s of relaxation(t - s) d elastic(s) (Lee & Radok 1960). This solution is valid only while the contact area
     does not shrink.
     """
     state = np.zeros_like(prony.tau_s)

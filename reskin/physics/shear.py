@@ -269,9 +269,9 @@ def evaluate_map(
 def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
     """Return the response of a layer that is fixed at the base to a wave of tangential traction on top.
 
-    With A = kh, z' = kz and t = A - z', v = sinh z' / cosh A and w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A +
-    A^2). The function w is the solution W of `layer` with the boundary condition W''' = 3 W' at the top. Numerators and
-    denominators are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
+    With A = kh, z' = kz and t = A - z', the functions are v = sinh z' / cosh A and w = [A z' cosh t - t cosh A sinh z']
+    / (cosh^2 A + A^2). The function w is the solution W of `layer` with the boundary condition W''' = 3 W' at the top.
+    Numerators and denominators are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)

@@ -1,4 +1,4 @@
-"""The law of a skin: eleven fitted parameters that determine the field change for any place and force.
+"""The law of a skin: a simulation with eleven fitted parameters that gives the field change for any place and force.
 
 This module also fits the law to the presses of one board. Units: uT, mm, N.
 """
@@ -24,7 +24,7 @@ HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y| and largest |x| + |y| of th
 
 @dataclass(frozen=True)
 class Area:
-    """The places that are pressed: a rectangle around the board's centre, or the octagon that is left without corners.
+    """The places that are pressed: a rectangle around the board's centre, without its corners if `octagon` is set.
 
     The octagon has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
     """
@@ -55,12 +55,12 @@ def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[
 # Quadrature rule for the skin's field, the same as in scene `quick`: the cheapest rule whose error is below 2 % of the
 # field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
-COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; the law itself has larger errors
+COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; its error is smaller than that of the law
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board; all but the first seven are the same for all boards of a rig."""
+    """Parameters of one skin on its board. The first seven differ between boards; the others are the same for a rig."""
 
     seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
@@ -75,7 +75,7 @@ class Law:
     give_y_um: float
     # The following parameters are not fitted.
     lets_go_N: float = 8.0  # force at which the slide `away_um_mm` vanishes; chosen on both boards of scene lab
-    grip_N_mm: float = 8.75  # lateral stiffness, 7 N/mm, over friction coefficient, 0.8 (nominal.yaml: skin.hold)
+    grip_N_mm: float = 8.75  # lateral stiffness (7 N/mm) / friction coefficient (0.8), from nominal.yaml: skin.hold
     tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
@@ -85,14 +85,14 @@ class Law:
 class Setup:
     """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area.
 
-    start_law: the law at which fits start, which is also the mean of their priors; by default `START`.
+    start_law: the law at which fits start. It is also the mean of the fits' priors. By default, it is `START`.
     """
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # all fields have the opposite sign, as after a rotation of a checkerboard skin by 90 degrees
+    skin_flipped: bool  # whether all fields have the opposite sign, as if a checkerboard skin is rotated by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
     coarse_rule: Quadrature = COARSE
@@ -177,7 +177,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes of the nominal skin: without fitted parameters or sliding, with forces from `layer`."""
+    """Return the field changes of the nominal skin, which does not slide, for forces according to `physics.layer`."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -258,7 +258,7 @@ class AlignedPresses:
 
 
 def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law | None = None) -> Law:
-    """Fit the named parameters by least squares; the others keep their values in `start` (default: `setup.start`)."""
+    """Fit the named parameters by least squares; other parameters are those of `start` (default: `setup.start`)."""
     start = start or setup.start
     magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)

@@ -109,6 +109,6 @@ def loss_of(network: Network, batch: Batch) -> torch.Tensor:
     mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
     # The likelihood trains only the standard deviations. If it also trained the means, presses with large errors would
-    # have little influence on them, because the network would predict large standard deviations there.
+    # have little influence on the means, because the network would predict large standard deviations for these presses.
     deviation = (mean - target).detach()
     return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * exp(-2 * log_sd)).mean()
