@@ -12,7 +12,8 @@ from scipy.constants import micro, mu_0
 from reskin.physics import magnet
 from reskin.physics.magnet import MU0_4PI, Dipoles
 
-# The earth's field at a middle latitude; it varies from 25 to 65 uT over the globe (IGRF). x is north, z is up.
+# The earth's field at a middle latitude; its magnitude is between 25 and 65 uT over the globe (IGRF). x is north, z is
+# up.
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])

@@ -34,7 +34,7 @@ def covariance(
 
 
 def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
-    """Return a symmetric matrix that shrinks external fields in a reading to the size of its noise.
+    """Return a symmetric matrix that shrinks external fields in a reading to the size of the noise.
 
     The matrix whitens the sum of external field and noise, and is multiplied by the standard deviation of the noise.
     The part of a reading that no external field can explain is unchanged.

@@ -43,9 +43,9 @@ WAVES_KH, WAVES_W = _gauss(40.0, 240)
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact and its pressure p, given by the Hankel transform p^(k) / 2G = sum_i weights_i cos(k x_i).
+    """A contact and its pressure, given by the Hankel transform p^(k) of the pressure.
 
-    G is the shear modulus.
+    p^(k) / 2G = sum_i weights_i cos(k x_i), where G is the shear modulus.
     """
 
     radius_m: float
@@ -56,7 +56,8 @@ class Contact:
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure on the layer as a sum of waves J0(k r): wave numbers k, and amplitudes p^(k) dk / 2G of the waves."""
+    """A pressure on the layer as a sum of waves J0(k r) with wave numbers k and amplitudes p^(k) dk / 2G (see
+    `Contact`)."""
 
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
@@ -66,7 +67,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement of material points (outward `r_m`, up `z_m`) and its gradient.
+    """Displacement of material points (outward `r_m`, up `z_m`), and the gradient of the displacement.
 
     `r_z` is the derivative of the outward component with respect to z, and so on. `hoop` is `r_m` divided by the
     radius.

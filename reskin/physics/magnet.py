@@ -43,7 +43,7 @@ def cuboid_field(
 
 
 def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
+    """Return the contribution of one corner of a cuboid to the cuboid's field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
     # The published formula contains log(y + r). asinh(y / hypot(x, z)) differs by a term that cancels in the sum over

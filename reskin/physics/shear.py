@@ -126,7 +126,7 @@ class WaveResponse:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """Displacement, and half of its curl, due to a force Q along x, on a grid with equal steps in r and in z.
+    """Displacement due to a force Q along x, and half of its curl, on a grid with equal steps in r and in z.
 
     All values are divided by Q / G, where G is the shear modulus. At the angle f from the x axis, the components along
     x, y and z are A + B cos 2f, B sin 2f and C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for
@@ -159,7 +159,7 @@ def slip_traction(contact: layer.Contact) -> Traction:
 
 
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
-    """Return the axisymmetric traction of a sticking tip, which displaces the whole contact by the same amount.
+    """Return the axisymmetric traction that displaces the whole contact by the same amount, as a sticking tip does.
 
     The term B of `ShearMap`, which makes the displacement non-uniform, is neglected. The Hankel transform of the
     traction is the integral of chi(x) cos(kx) dx over the contact, as in `layer.contact_of_radius`. The function chi is

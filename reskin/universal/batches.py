@@ -119,7 +119,7 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw 130 presses of a recorded board (some repeatedly if it has fewer), and one reading of each."""
+    """Draw 130 presses of a recorded board (some repeatedly if the board has fewer), and one reading of each press."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
@@ -145,7 +145,7 @@ def add_error(
     """Add a random error of the law that is smooth in place and log F.
 
     Half of a channel's error is proportional to |dB| at its chip, half to |dB| over all chips. size: bounds between
-    which the relative rms error of each skin is drawn.
+    which the relative rms error of each skin is drawn uniformly.
     """
     skins_n, _, channels_n = db_uT.shape
     rms = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)

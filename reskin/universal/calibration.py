@@ -92,9 +92,9 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
 
 # Limit for the detection of field changes that are passed instead of readings, and of readings that are passed instead
 # of field changes. Readings of presses should be near the no-load reading, and field changes near 0. Values are refused
-# if they are nearer to the wrong one of these two points: if the distance to it is below this fraction of the distance
-# to the right one. On the boards of scene lab, the median ratio of these distances is 0.15 to 0.22 for values of the
-# wrong kind, and 4 or more for values of the right kind.
+# if the distance to the wrong one of these two points, divided by the distance to the right one, is below this limit.
+# On the boards of scene lab, the median ratio is 0.15 to 0.22 for values of the wrong kind, and 4 or more for values of
+# the right kind.
 NEAR_MAX = 0.5
 
 

@@ -177,7 +177,7 @@ def write_onnx(of: SkinFunction, file: Path) -> None:
 
 
 def build_onnx(of: SkinFunction) -> "ModelProto":
-    """Build the ONNX model of a skin's estimate; its input `db_uT` are field changes along the chips' axes [f, ch]."""
+    """Build the ONNX model of a skin's estimate; the input `db_uT` has field changes along the chips' axes [f, ch]."""
     try:
         from onnx import TensorProto, checker, helper
     except ImportError:

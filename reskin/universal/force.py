@@ -91,9 +91,9 @@ def prior_line(estimator: str = FEW_ESTIMATOR) -> ForceLine:
 def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[np.ndarray, " m"]) -> ForceLine:
     """Fit the line to presses with known forces, and select the estimator.
 
-    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With more, it is `DEFAULT`, unless the labels are
-    more likely under another estimator by a factor above exp(MARGIN). For this comparison, each label is predicted from
-    the other labels.
+    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With `FEW_N` labels or more, it is `DEFAULT`,
+    unless the labels are more likely under another estimator by a factor above exp(MARGIN). For this comparison, each
+    label is predicted from the other labels.
 
     Parameters
     ----------

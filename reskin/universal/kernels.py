@@ -274,7 +274,7 @@ def products(
 
     The fourth array contains the mean log forces of the map alone, weighted by the power `force_power` of its
     probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
-    likelihoods. power: power of the product; it affects standard deviations only.
+    likelihoods. power: power of the product, which affects only standard deviations.
     """
     moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power, force_power), moments)

@@ -85,7 +85,7 @@ class Law:
 class Setup:
     """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area.
 
-    start_law: the law at which fits start. It is also the mean of the fits' priors. By default, it is `START`.
+    start_law: the law at which fits start, and the mean of the fits' priors; by default `START`.
     """
 
     design: SkinDesign
@@ -113,7 +113,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Dipoles of the magnetised, undeformed skin; its centre is at the origin."""
+        """Dipoles of the magnetised, undeformed skin; the skin's centre is at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -235,7 +235,8 @@ PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-# Parameters that may differ between boards. When only these are fitted, the others come from a fit to another board.
+# Parameters that may differ between boards. If only these are fitted, the other parameters come from a fit to another
+# board.
 SEVEN = (*OF_BOARD, "rotation_deg")
 PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of |dB|^2
 # Weight of the residuals that compare the growth of |dB| with force. Each group of presses has one such residual: the

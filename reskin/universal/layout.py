@@ -46,7 +46,7 @@ class ChipPlace(Strict):
 
 
 class SkinStack(Strict):
-    """The nominal skin. The model is also trained on skins that differ from it."""
+    """The nominal skin. The model is also trained on skins that differ from the nominal skin."""
 
     size_mm: tuple[Length, Length]
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
@@ -65,7 +65,7 @@ class PressArea(Strict):
 
 
 class BoardLayout(Strict):
-    """Everything that the universal model must know about a board and its skin before it is trained."""
+    """Everything about a board and its skin that the universal model must know before training."""
 
     name: Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     chips: Annotated[tuple[ChipPlace, ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
@@ -75,7 +75,7 @@ class BoardLayout(Strict):
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     area: PressArea
     force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]  # least, largest
-    # Standard deviations of parameters of the law that replace those in `map.NOMINAL_SPREADS`.
+    # Standard deviations of the law's parameters, which replace the values in `map.NOMINAL_SPREADS`.
     spreads: dict[str, Annotated[float, Field(gt=0, le=100)]]
 
     @model_validator(mode="after")

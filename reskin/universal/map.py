@@ -32,8 +32,9 @@ from reskin.universal.law import (
 PITCH_MM, STEPS_MAX_N = 0.8, 28  # lattice of places: pitch, and largest number of places along each axis
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
 LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is the standard deviation of their logarithm
-# Standard deviations of a skin's parameters about the mean of known boards of the same rig, or about nominal parameters
-# if no board is known. Assumed, and larger than the differences between the two recorded boards.
+# Standard deviations of a skin's parameters. RIG_SPREADS: about the mean of known boards of the same rig.
+# NOMINAL_SPREADS: about nominal parameters, if no board is known. The values are assumed. They are larger than the
+# differences between the two recorded boards.
 RIG_SPREADS = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
     "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
@@ -141,7 +142,7 @@ class Residual:
     log_N: Float[np.ndarray, " m"]
     solved: Float[np.ndarray, "m ch"]  # inverse covariance of the known errors times these errors
     channel_cov: Float[np.ndarray, "ch ch"]  # covariance between channels, with a trace of 1
-    noise: float  # variance of the errors that differs between presses at the same place, relative to the total
+    noise: float  # part of the errors' variance that differs between presses at the same place, relative to the total
 
     def at(self, place_mm: Float[np.ndarray, "n 2"], log_N: Float[np.ndarray, " n"]) -> Relative:
         """Return the law's expected relative errors for presses at these places with these log forces."""
@@ -514,7 +515,8 @@ def condition_on_labels(
     root = np.linalg.cholesky(k)
     deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
     slope = _slopes_by_day(skin, slope_uT / magnitude_uT[:, None, None], days_ago)
-    # The law's errors are correlated between presses (k) and between channels (error_cov): whiten over both.
+    # The law's errors are correlated between presses (k) and between channels (error_cov). Whiten over presses and
+    # channels.
     white = solve_triangular(
         root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
     )
@@ -552,7 +554,7 @@ def _slide_indices(skin: SkinMap) -> list[int]:
 def _slopes_by_day(
     skin: SkinMap, slope: Float[np.ndarray, "m ch t"], days_ago: Int64[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m ch p"]:
-    """Return slopes with respect to all parameters of a map; each press depends on the slide of its own day."""
+    """Return slopes with respect to all parameters of a map; each press depends on the slide of only its own day."""
     t, slide_i = slope.shape[2], _slide_indices(skin)
     if len(skin.mean) == t:
         return slope

@@ -83,9 +83,10 @@ FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networks' estimates
 FADES_PER_LABEL = 0.15  # the first correction of `network_offsets_mm` is divided by 1 + this value * labels
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
-MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+MISFIT_MAX = 4.0  # assumed chi^2 per channel above which a warning is given; about 1 for skins like in training
 # If the no-load field differs from that of the saved calibration by more than this fraction, a warning says that this
-# may be another skin. In scene lab, recordings of one board differ by at most 5 %, those of the two boards by 65 %.
+# may be another skin. In scene lab, recordings of one board differ by at most 5 %, and recordings of different boards
+# by 65 %.
 OTHER_SKIN_MIN = 0.25
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 # With external fields, the errors of map and networks are more strongly correlated. The likelihood power is therefore
@@ -94,7 +95,7 @@ BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
 EXTERNAL_MAX_uT = 1000.0  # largest external field; for a much larger field, single precision is not sufficient
 
-FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
+FILE = Path(__file__).with_name("universal.safetensors")  # the model's card is universal.json
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
 OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # the spreads of these parameters give the prior of a shift of all places
 # The skin is assumed to slide as on the last day if the log odds for this, from presses of the new day, are at least
@@ -124,7 +125,7 @@ class Evaluation:
     __repr__ = one_line
 
     def by_map(self, power: float) -> Estimate:
-        """Estimate with the map alone, as means over its hypotheses."""
+        """Estimate with the map alone, as means over the map's hypotheses."""
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
@@ -388,7 +389,7 @@ def is_same_slide(log_odds: Float[np.ndarray, " n"]) -> bool:
 
 
 class Slide(NamedTuple):
-    """Whether the skin slides under presses as on the last day of the calibration, and the log odds that it does."""
+    """Whether the skin slides under presses as on the last day of the calibration, and the log odds for this."""
 
     same: bool
     log_odds: float
@@ -429,9 +430,9 @@ def network_offsets_mm(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return two corrections to add to the places that the networks estimate.
 
-    The first correction is `centre_mm`, which follows from unlabelled presses; its size decreases with the number of
-    labels. The second correction is the mean error that then remains for labelled presses (estimated at `estimated_mm`,
-    truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
+    The first correction is `centre_mm`, which follows from unlabelled presses, divided by a number that grows with the
+    number of labels. The second correction is the mean error that then remains for labelled presses, shrunk by a
+    Gaussian prior with mean zero. These presses are estimated at `estimated_mm` and are truly at `place_mm`.
     """
     centre_mm = centre_mm / (1 + FADES_PER_LABEL * len(place_mm))
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -452,7 +453,7 @@ class Universal:
     networks : weights of the networks
     powers : likelihood powers by numbers of presses and labels
     layout : the board and the skin that the model was made for
-    card : how the model was trained, and what it must not be used for
+    card : how the model was trained, and what the model must not be used for
     external_uT : expected size of external fields (see `load_universal`)
     """
 

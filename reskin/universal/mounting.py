@@ -1,4 +1,4 @@
-"""Find the orientation of a skin from its no-load field, and that of its labels from presses at known places.
+"""Find the orientation of a skin from the no-load field, and that of the labels' axes from presses at known places.
 
 The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after one or three
 quarter turns, every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from reskin.universal.map import Estimate, OFFSET_uT, Tables
 
-LOG_ODDS_MIN = 2.0  # if the log odds of the found orientation are smaller, it is reported as uncertain (odds of 7 to 1)
+LOG_ODDS_MIN = 2.0  # an orientation with smaller log odds is reported as uncertain (odds of 7 to 1)
 NOLOAD_MISFIT_MAX = (
     12.0  # a no-load field with a larger chi^2 per channel is reported as unusual; few skins exceed this
 )
@@ -77,8 +77,8 @@ class Mounting:
 def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
     """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
 
-    A skin is taken as turned only if the log odds for it are at least `LOG_ODDS_MIN`. The no-load field has a normal
-    distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
+    A skin is taken as turned only if the log odds for this orientation are at least `LOG_ODDS_MIN`. The no-load field
+    has a normal distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
     """
     covariance = _noload_covariance(tables)
     chi2 = {}

@@ -29,6 +29,7 @@ TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: probability
 LOG_AMPLITUDE_PER_MM = 0.95
 # Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
+# Standard deviations over chips: relative gain, cross-talk, rotation about each axis, and offset.
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
 # Least values of drawn parameters: chips must not be inside the skin, and the skin must not slide away from its centre.
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}

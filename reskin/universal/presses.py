@@ -23,7 +23,8 @@ SPREAD_MIN = 0.2  # places with a smaller range of log F (F: force) are not used
 
 @dataclass(frozen=True)
 class RecordedPresses:
-    """Presses of one skin on its board; values are means over the readings of a press, and fields are in chip axes.
+    """Presses of one skin on its board; values are means over the readings of a press, and fields are along the chips'
+    axes.
 
     group_i: index of the press's group. A group is a capture or, if depths are known, one depth of a capture. If a
         capture has more than `DEPTHS_MAX_N` depths, its groups are the thirds of its presses by depth.

@@ -22,7 +22,9 @@ from reskin.universal.network import (
 )
 from reskin.universal.population import Population, draw_population
 
+# AdamW with a one-cycle schedule: largest rate, weight decay, share of steps with a rising rate, limit of the gradient.
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
+# Loss: threshold and weight of the Huber loss, and weight of the likelihood that trains the standard deviations.
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
 
 
