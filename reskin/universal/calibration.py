@@ -235,8 +235,8 @@ class CalibrationData:
     def joined_to(self, last: "CalibrationData") -> "CalibrationData":
         """Return these data and those of the last day as one day, for a skin that slid in the same way on both days.
 
-        The presses of the last day come first. Its `area_uT` is kept only if there are no presses at unknown places in
-        these data: within a day, `Universal.see` also drops `area_uT` if other presses follow.
+        The presses of the last day come first. The `area_uT` of the last day is kept only if no presses at unknown
+        places followed on this day. Within a day, `Universal.see` also drops `area_uT` if other presses follow.
         """
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
         even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
