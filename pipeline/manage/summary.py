@@ -1,4 +1,4 @@
-"""Summarise the scenes of the plan: their main scores, whether these equal the committed ones, where to look next."""
+"""Summarise the planned scenes: main scores, whether these equal the committed scores, and where to look next."""
 
 from collections.abc import Mapping
 from pathlib import Path
