@@ -63,7 +63,7 @@ class Compare(SectionWithRows):
     layout: BoardLayout | None = None
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # whether all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
+    skin_flipped: bool  # whether all magnetic poles are swapped, as by a quarter turn of a checkerboard skin
     labels_middle_mm: tuple[float, float]  # label (x, y) of the place at the board's middle
     labels_mirrored: bool  # whether y of the labels points opposite to y of the board
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
@@ -167,7 +167,7 @@ def _outline(section: Compare) -> dict[str, Any]:
 
 
 def _without_law(aligned: AlignedPresses, recorded: RecordedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Return the numbers of a board that need no fitted law, and therefore no forces; `recorded`: all its presses."""
+    """Return a board's numbers that need no fitted law, and thus no forces; `recorded` contains all its presses."""
     noise_uT = recorded.noise_uT
     noise = {"noise_uT": dict(zip("xyz", noise_uT.tolist(), strict=True))} if np.isfinite(noise_uT).all() else {}
     counts = {"pokes_n": len(recorded), "left_out_n": recorded.excluded_n}

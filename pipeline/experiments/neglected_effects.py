@@ -159,7 +159,7 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate how the base holds the skin: compare with an infinite linearly elastic layer that slides freely."""
+    """Evaluate the hold of the base, by comparison with an infinite linearly elastic layer that slides freely."""
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])

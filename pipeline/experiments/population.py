@@ -353,7 +353,7 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 
 
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
-    """Return the least-squares slope, over skins, of the other presses' error in log F against the weight's error."""
+    """Return the factor of the weight's error in log F that best fits the test presses' mean error, over skins."""
     return float(weight_off @ others_off / (weight_off @ weight_off))
 
 

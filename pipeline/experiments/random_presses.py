@@ -137,7 +137,7 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
     """Draw unlabelled presses, labels and the press of known weight at random.
 
     The tested presses are all other presses in the part of the skin without labels, except those in the middle. Raises
-    SchemaError if no press is in the middle of the skin, or if a part of the skin has no presses.
+    SchemaError if no press is in the middle of the skin, or if no press is left for labels or for tests.
     """
     rng = rng_for(seed, "random presses", split, presses_n, draw_i)
     n, middle = len(board.presses), np.flatnonzero(board.middle)
@@ -180,7 +180,7 @@ def score_draw(
 
 
 def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
-    """Return the labels to calibrate with, and their names: each number of labels and, after 0, the known weight."""
+    """Return sets of labels for calibration, with names: each number of labels and, after 0, the known weight."""
     if max(labels_n, default=0) > len(draw.labels):
         what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
         raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
@@ -199,7 +199,7 @@ def raise_forces(labels: LabelledPresses) -> LabelledPresses:
 
 @dataclass(frozen=True)
 class CalibratedBoard:
-    """A variant calibrated to the no-load field and the unlabelled presses of a board, and their median misfit."""
+    """A variant calibrated to a board's no-load field and unlabelled presses, and the presses' median misfit."""
 
     calibration: PressCalibration
     misfit: float

@@ -1,4 +1,4 @@
-"""Shear: place and all three force components of dragged lines (paper section 4).
+"""Shear: estimates of place and of all three force components along dragged lines (paper section 4).
 
 The readings of every skin are split in two ways: random readings are held out, or whole lines are held out.
 """

@@ -101,7 +101,7 @@ def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | Non
 
 
 def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
-    """Describe, for an error message, the depths visited at a place; if there are none, all depths and some places."""
+    """Describe the depths visited at a place or, if there are none, all depths and some places, for an error."""
 
     def join(values_mm: np.ndarray) -> str:
         return ", ".join(f"{value:g}" for value in values_mm[:LISTED_N])

@@ -196,8 +196,8 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
 def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
     """Draw the folds of one world, whose names begin with the name of the world.
 
-    `rows` are the rows of this world. In the concatenated rows of all worlds, to which the row numbers in folds refer,
-    they follow the `before_n` rows of the previous worlds.
+    `rows` are the rows of this world. The row numbers in folds refer to the concatenated rows of all worlds, in which
+    `before_n` rows of earlier worlds precede `rows`.
     """
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]

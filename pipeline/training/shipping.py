@@ -167,7 +167,7 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
 
 
 def read_layout_of(file: Path) -> BoardLayout:
-    """Read a layout: a file or name that `read_layout` accepts, or a scene with key `layout` in section `compare`."""
+    """Read a layout from a file or name that `read_layout` accepts, or from section `compare` of a scene's file."""
     content = read_yaml(file) if file.suffix in (".yaml", ".yml") else {}
     if not (isinstance(content, dict) and "source" in content):
         return read_layout(file)

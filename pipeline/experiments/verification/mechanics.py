@@ -390,7 +390,7 @@ Places = Float[np.ndarray, "p 2"]
 def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
-    """Check dB of indentations on a scene's first skin, and symmetries of dB on a skin that equals its design."""
+    """Check dB of indentations on a scene's first skin, and symmetries of dB on a skin without spreads."""
     first_board, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:

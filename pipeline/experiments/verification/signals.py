@@ -158,7 +158,7 @@ def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[n
     return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)
 
 
-PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count by GAIN_SEL, for RES 0
+PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count (x, y, z) by GAIN_SEL; RES 0
 PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # gains for GAIN_SEL 0 to 7
 # Ranges of the noise's standard deviation in three recorded data sets, for the x and y axes, and for the z axis.
 RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))
