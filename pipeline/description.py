@@ -15,7 +15,7 @@ from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
-NEAR = 0.2  # largest relative difference between a reading's force and the force in `FORCES_N` it counts for
+NEAR = 0.2  # largest relative difference between a reading's force and the force in `FORCES_N` for which it counts
 ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between two compared no-load readings
 STEP_READINGS_N = 2000  # number of readings that determine the chips' resolution

@@ -145,15 +145,15 @@ def use(root: Path, names: Sequence[str]) -> None:
 def _keep_outputs(root: Path) -> None:
     """Keep DVC from deleting the outputs of scenes that are no longer in the plan.
 
-    DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete the listed
-    outputs that no stage of the current plan writes, so the list is emptied.
+    DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete listed
+    outputs that no stage of the current plan writes. This function therefore empties the list.
     """
     if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
         return
     from dvc.exceptions import DvcException  # imported late: the import takes a second
     from dvc.repo import Repo
 
-    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start, it cannot delete outputs either
+    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start here, it cannot delete outputs
         repo.state.links.clear()
 
 

@@ -108,7 +108,7 @@ def clear_cost(folder: Path, stage: str) -> None:
 def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
     """Add training runs to the record of the current run of a stage.
 
-    trained: by the key of a training run, the seconds that the training took, and whether its result is from an earlier
+    trained: maps the key of a training run to its duration in seconds, and to whether its result is from an earlier
     run. waited_s: how long the stage waited for these training runs.
     """
     recorded = _read_trainings(folder, stage)

@@ -130,7 +130,7 @@ class Scene(Strict, extra="allow"):
 
     @property
     def _settings_by_place(self) -> dict[str, tuple[Set[str], Set[str]]]:
-        """The settings that the scene has, and those that its experiments need, by place in the scene's file."""
+        """The settings that the scene has, and those that its experiments need, by their place in the file."""
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
         # Adaptation draws its pokes from the first `pool_passes_n` passes.
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()

@@ -1,7 +1,7 @@
 """The table of scores of all training runs, and the statistics over boards that reports compute from it.
 
 A row of the table has the scores of one network on one skin, or on all skins that it was tested on. The unit of
-inference is the board, because the skins of one board are not independent: they share the board, and they are tested
+inference is the board, because the skins of one board are not independent. They share the board, and they are tested
 with the same networks, which were trained without this board.
 """
 

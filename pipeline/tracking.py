@@ -614,7 +614,7 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
 
 
 def _datasets(card: Mapping[str, Any]) -> list[Any]:
-    """Describe the skins that a network was trained and tested on as datasets."""
+    """Describe, as MLflow datasets, the skins on which a network was trained and tested."""
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
     inputs = []

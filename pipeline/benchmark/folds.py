@@ -133,7 +133,7 @@ class Task:
     fold, board, labels_n
         Name of the fold, tested board and number of its labelled presses.
     train, train_readings : Presses
-        All presses of the training boards, with places and forces, and all single readings of these presses. Both are
+        All presses of the training boards, with places and forces; and all single readings of these presses. Both are
         empty if there is no training board.
     noload_uT : array [ch]
         Mean field of the tested board without contact.

@@ -199,8 +199,8 @@ def fine_tuning(job: TrainingJob, trained: TrainingResult, labels: Int64[np.ndar
 def training_rows(group: Tasks) -> tuple[TrainingData, dict[Any, Int64[np.ndarray, " r"]]]:
     """Stack the readings of the training boards, and the labels and tests of tasks that share these boards.
 
-    Returns the rows, and row numbers by role. The roles are `train` and, for each fold, (fold, "labels") and (fold,
-    "tests"). Targets of tests are NaN.
+    Returns the rows, and row numbers by role. The roles are `train` and, for each fold, (fold, "labels") and
+    (fold, "tests"). Targets of tests are NaN.
     """
     parts, start = [group[0].train_readings], len(group[0].train_readings)
     rows: dict[Any, np.ndarray] = {"train": np.arange(start)}

@@ -40,7 +40,7 @@ from reskin.simulation.settings import SimulationSettings
 REFERENCE_ASIDE_MM = 30.0
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
-Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction: AS_IT_IS, ASIDE, OWN
+Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction (AS_IT_IS, ASIDE, OWN)
 
 
 class Iron(Strict):

@@ -329,8 +329,8 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 # --- Frames: are labels, chips and skin oriented as the scene states? ---
 
 # An orientation that differs from the scene's is reported only if it raises the sum of cosines by this much. The sum is
-# over chips, and each cosine is between the recorded and the simulated field of a chip. The value is assumed, because
-# wrong axes lower the cosine of a chip by 0.5 or more, and a skin displaced by 0.5 mm changes every cosine by less than
+# over chips, and each cosine is between the recorded and the simulated field of a chip. The value is assumed. Wrong
+# axes lower the cosine of a chip by 0.5 or more, while a skin displaced by 0.5 mm changes every cosine by less than
 # 0.1.
 PENALTY = 0.1
 AXES = "xyz"

@@ -285,8 +285,8 @@ def count_contacts(
     """Count contacts per 100 readings at the threshold of `reskin live`, and at thresholds for a stated detection rate.
 
     Each touch is a recorded press, times a factor, plus a random change of a random pad. Each factor has its own
-    threshold. It is the strength that `detected_fraction` of the touches exceed if changes of the rows for thresholds
-    are added. Detected touches are then counted with changes of the tested rows.
+    threshold, which is set with changes from the rows for thresholds, such that `detected_fraction` of the touches
+    exceed it. Detected touches are then counted with changes from the tested rows.
     """
     model = load_universal(external_uT=external_uT)
     matrices = [[model.suppressor(pad.noise_uT) for pad in pair] for pair in pairs]

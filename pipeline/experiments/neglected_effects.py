@@ -41,7 +41,7 @@ PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))
 BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of magnetic powder, whose own field is computed
 FRICTION = Friction(coefficient=0.8)  # between skin and tip; assumed, within a range of 0.5 to 1.2
 FEW = 5  # number of indentations for effects that take long to compute
-COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects whose computation tracks every node separately
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects that are computed by tracking every node separately
 
 
 @dataclass(frozen=True)

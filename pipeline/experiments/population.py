@@ -1,8 +1,8 @@
 """The universal model, built from simulated skins alone and tested on held-out skins of a simulated scene.
 
-The model is calibrated to each skin with its no-load field, unlabelled presses and labelled presses. Estimated forces
-are also corrected with one known weight, which is put on the skin. Networks trained on different numbers of simulated
-skins show how the error depends on this number.
+The model is calibrated to each skin with the skin's no-load field, unlabelled presses and labelled presses. Estimated
+forces are also corrected with one known weight, which is put on the skin. Networks trained on different numbers of
+simulated skins show how the error depends on this number.
 """
 
 import hashlib

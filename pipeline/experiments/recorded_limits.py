@@ -535,9 +535,9 @@ def needed_changes_uT(
 ) -> Float[np.ndarray, "m r"]:
     """For each press and each noise, return the size of the field change that a reading needs to exceed the threshold.
 
-    A reading is u s + n, where u is the unit vector of a press's field change, s the size and n the recorded noise. |u
-    s + n| is above the threshold for all s above the larger root of a quadratic equation. If there is no positive root,
-    the returned size is 0.
+    A reading is u s + n, where u is the unit vector of a press's field change, s the size and n the recorded noise.
+    |u s + n| is above the threshold for all s above the larger root of a quadratic equation. If there is no positive
+    root, the returned size is 0.
     """
     along_uT = direction @ noise_uT.T
     beyond = along_uT**2 + threshold_uT**2 - (noise_uT**2).sum(axis=1)

@@ -245,7 +245,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return rms error / rms dB, for each depth (the largest ratio of any skin) and over all depths and skins."""
+    """Return rms error / rms dB for each depth, as the largest ratio of any skin, and for all depths and skins."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)

@@ -103,7 +103,7 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
     """Return the fraction of correctly ordered pairs of readings, for weight differences of 1 step, 2 steps, ...
 
     A pair is correctly ordered if the reading under the larger weight has the larger response; equal responses count
-    half. Both readings of a pair are of the same filling, and so have the same no-load reading.
+    half. Both readings of a pair are of the same filling of the glass, and therefore have the same no-load reading.
     """
     levels_n = response_uT.shape[1]
     shares = []

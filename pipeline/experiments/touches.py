@@ -103,7 +103,7 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
 
 @dataclass(frozen=True)
 class Touched:
-    """The rows of one recording with enough force, in order of time. `places`: numbers of the one or two places."""
+    """The rows of one recording with enough force, in order of time; `places` are its one or two place numbers."""
 
     name: str
     places: tuple[int, ...]

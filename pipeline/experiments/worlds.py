@@ -1,7 +1,7 @@
 """Find which properties of simulated skins determine the scores of table 2 (not in the paper).
 
-The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from
-those of the scene in one factor, for example a spread between skins, or an error of the simulation.
+The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from the
+scene's in one factor, such as a spread between skins or an error of the simulation.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, and register it.
 
-The scene is added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
+The scene is also added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
 changes are undone.
 """
 

@@ -49,8 +49,8 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
 def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
     """Move a damaged object away, and repair the cache; return a sentence that says what was done.
 
-    The object is restored from an output that contains an intact copy. If no output does, damaged copies are deleted
-    from the outputs, so that the stages of these outputs run again.
+    The object is restored from an output that contains an intact copy. If there is no such output, the damaged copies
+    are deleted from outputs, so that the stages of these outputs run again.
     """
     damaged_md5, aside = _md5(file), root / DAMAGED / name
     outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]

@@ -31,7 +31,8 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
-# Disk space must be free for this many copies of each file: as fetched, in data/raw, in DVC's cache, one in reserve.
+# The free disk space must suffice for this many copies of each file: as fetched, in data/raw, in DVC's cache, and one
+# in reserve.
 COPIES_N = 4
 USE_FROM = "--from takes a git mirror or a folder that contains the files."
 PART = "pad"  # option that selects one of several captures in the same files (layout leaphand)
@@ -268,7 +269,7 @@ class Origin:
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
-    """Open a folder, or a git repository at a commit (None: the newest); git creates the folder `scratch`."""
+    """Open a folder, or a git repository at a commit (None means the newest); git creates the folder `scratch`."""
     folder = Path(where)
     if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither an existing path nor a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")

@@ -56,7 +56,7 @@ def merge(root: Path) -> str:
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
-    """Apply the changes from base to theirs to our registry; raise if one of their captures conflicts with ours."""
+    """Apply the changes from base to theirs to our registry; raise an error if their captures conflict with ours."""
     merged, before, after = ours, _entries(base), _entries(theirs)
     for (scene, name), entry in before.items():
         if after.get((scene, name)) != entry == _entries(ours).get((scene, name)):

@@ -241,8 +241,8 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6b.
 
-    Three kinds of differences are computed: most training skins minus fewest; adapted networks minus other networks;
-    and the gain from adaptation with the fewest training skins minus the gain with the most.
+    Three kinds of differences are computed: most training skins minus fewest training skins, adapted networks minus
+    other networks, and the gain from adaptation with the fewest training skins minus the gain with the most.
     """
     groups = {
         (method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])
@@ -352,7 +352,7 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count training runs by experiment: all, those that collapsed, and collapsed runs that were kept."""
+    """Count training runs by experiment: all runs, collapsed runs, and collapsed runs that were kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)

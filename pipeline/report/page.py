@@ -33,7 +33,7 @@ SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that na
 SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
 SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
-# Tables that are unfolded when the page loads; all others are folded.
+# Tables that are unfolded when the page loads; all other tables are folded.
 OPEN = {"table1", "table2", "labels", "claims", "final_model"}
 WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist lists all
@@ -43,7 +43,7 @@ SOURCES = {
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# No line break is allowed between a number and its deviation, or between an interval and its unit.
+# Places where no line break is allowed: between a number and its deviation, and between an interval and its unit.
 UNBROKEN = re.compile(
     r"(?<=\d) ± (?=\d)|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?"
 )
@@ -104,7 +104,7 @@ class Drawing:
 
     @property
     def scrolls(self) -> bool:
-        """Whether the figure scrolls on a phone, because it is legible only if it is wider than the screen."""
+        """Whether the figure scrolls on a phone, because its letters are illegible at the width of the screen."""
         return self.least_px > NARROW_PX
 
 

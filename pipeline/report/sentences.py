@@ -9,7 +9,7 @@ from pipeline.report.formatting import SHORT
 from pipeline.report.paper import TABLE_2
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
-# No line break is allowed between a number and its unit.
+# Places where no line break is allowed: between a number and its unit.
 UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
 MAPS = (
     "Look for places with large errors, for example at the edge of the skin or between the chips. All maps have the "

@@ -400,7 +400,7 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
-    """Count the training runs of each experiment, those that collapsed, and the collapsed networks that were kept."""
+    """Count, for each experiment, all training runs, collapsed training runs, and collapsed networks that were kept."""
     columns = {
         "training runs": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip

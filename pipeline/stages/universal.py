@@ -36,7 +36,7 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
     trained_entries: list[few.TrainedEntry] = []
-    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # use earlier networks
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each needs networks of earlier steps
         pairs = step(study, trained_entries)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
         trained_entries = [

@@ -169,7 +169,7 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant digits; rounding errors change only later digits; a change of the physics changes these
+DIGITS = 4  # significant digits, which changes of the physics change, but rounding errors do not
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """Make universal models for boards: `reskin model make`, and the shipped one: `python -m pipeline.training.shipping`.
 
 The second command takes a few minutes, and writes reskin/universal/universal.safetensors and its card. The networks
-have the training settings and the seed of scene lab, which tests the shipped model under the name `universal, simulated
-alone`. Likelihood powers are calibrated on simulated skins.
+have the training settings and the seed of scene lab, which tests the shipped model under the name
+`universal, simulated alone`. Likelihood powers are calibrated on simulated skins.
 """
 
 import time

@@ -64,7 +64,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class KnownBoards:
-    """All recorded boards of a scene, including the one that is later held out.
+    """All recorded boards of a scene, including each board that is later held out.
 
     presses: the presses on each board, in the board's frame.
     """

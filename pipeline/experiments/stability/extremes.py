@@ -87,8 +87,8 @@ def ring_force_N(
 
     Under each ring, either the surface touches the sphere or the pressure is zero. The deflection by a ring is the
     Hankel integral of the ring's pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number *
-    thickness, the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and (sinh 2A - 2A) / (cosh 2A + 2 A^2
-    + 1) on a bonded base.
+    thickness, the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
+    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
     """
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2

@@ -31,7 +31,7 @@ from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
 HALF_SPACE_M = 100.0  # a layer this thick acts as a half-space under a tip of a few millimetres
-A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.780)
+A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fitted 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
@@ -380,8 +380,8 @@ COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
 REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
-# Errors of this size are not visible in readings, because they are only a third of a chip's noise, and increase its rms
-# by 5 %.
+# Errors of this size are not visible in readings, because they are a third of a chip's noise, and increase the rms of
+# the noise by only 5 %.
 UNSEEN_uT = 1.0
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # at these places, no node is on the tip's axis
 Places = Float[np.ndarray, "p 2"]

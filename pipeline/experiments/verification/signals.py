@@ -126,7 +126,7 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # The dipoles are not centred at the origin, because a wrong sign of the separation could then go unnoticed.
+    # If the dipoles were centred at the origin, a wrong sign of the separation could go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
