@@ -310,7 +310,7 @@ def check_cache() -> None:
 def readme(
     check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a page is out of date.")] = False,
 ) -> None:
-    """Write the generated parts and the figure of README.md, and those of docs, from the results in reports/."""
+    """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
     changed, scenes_shown = fill_pages(ROOT, write=not check)

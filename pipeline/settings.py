@@ -180,7 +180,7 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and every variant of it.
+    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and each of its variants.
 
     shared: the row of `params.yaml` that the section names. This row, together with `steps_n`, is the headline recipe.
     """

@@ -379,8 +379,8 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
     """Summarise `method` minus `single` on the test skins of `single`, whose networks are trained on one skin each.
 
-    The result has the form of that of `paired`. Its interval and `p` use `two_way_error`, because both the boards and
-    the training skins of `single` are samples.
+    The result has the same form as the result of `paired`. Its interval and `p` use `two_way_error`, because both the
+    boards and the training skins of `single` are samples.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])

@@ -79,7 +79,7 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class Times:
-    """When the training runs and the stages of a scene ran, as far as this checkout knows.
+    """Times at which the training runs and the stages of a scene ran, as far as this checkout knows them.
 
     trainings: spans by stage and name of the training run. stages: spans by stage. by_key_s: seconds of training runs
     by their key.

@@ -289,8 +289,8 @@ STRONG_NOISES = 10.0
 # Largest distance between a copy and its original, in units of a reading's noise. Two readings of the same contact
 # differ by 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
 COPY_DISTANCE_NOISES = 2.0
-# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. In a copied capture, all indentations have the
-# same ratio; between different skins, the ratio varies with the depth of the indentation.
+# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. All indentations of a copied capture have the
+# same ratio. Between different skins, the ratio varies with the depth of the indentation.
 FACTOR_TOLERANCE = 0.1
 # A capture counts as a copy if at least this fraction of its indentations look copied. Measured fractions: 0 % between
 # four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least 55 % in a

@@ -1,8 +1,8 @@
 """Compare recorded changes of field with simulated ones, poke by poke, on boards with known forces (not in the paper).
 
-Each board is simulated in three ways: with the nominal skin, with a physical model (law) fitted to the board, and with
-the law of another board after refitting only the parameters that may differ between boards. The experiment also
-examines:
+Each board is simulated in three ways: with the nominal skin, with a physical model (law) that is fitted to the board,
+and with the law of another board. In the third way, only the parameters that may differ between boards are refitted.
+The experiment also examines:
 - the friction under the tip,
 - the memory, which is the fraction of a poke's change of field that remains in the next no-load reading,
 - whether labels, chips and skin are oriented as the scene's settings state.
@@ -510,8 +510,9 @@ def _best_chips(
 ) -> Frames:
     """Find the best positions and orientations of the chips for given orientations of labels and skin.
 
-    `common` is the orientation that most chips share. If it differs from the scene's, this counts as one difference
-    whose penalty is 1.5 times as large, because a flipped skin can look like such a common turn.
+    `common` is the orientation that most chips share. If `common` differs from the scene's orientation, this counts as
+    one difference. Its penalty is 1.5 times as large as others, because a flipped skin can look like such a common
+    turn.
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])

@@ -294,8 +294,8 @@ def residual(
 ) -> Float[np.ndarray, " f"]:
     """Return the difference between dB and the dB of a single contact as predicted, relative to |dB| plus noise.
 
-    The dB of that single contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; dB in uT) that are nearest
-    to the prediction in place and, if forces are known, in force.
+    The dB of that single contact is interpolated from `known` contacts (x_mm, y_mm, F_N; dB in uT). These are the
+    contacts that are nearest to the prediction in place and, if forces are known, in force.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 

@@ -34,8 +34,8 @@ from reskin.universal.model import Universal, load_universal
 # Rate of the controller, duration of a run, and the time in a run after which forces are scored.
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0
 SWING = 3.0  # an object's stiffness varies between a third of its nominal value and three times this value
-# Assumed indentation of the skin by a round tip with a force of 1 N; for other forces, it follows Hertz's law. The
-# indentation affects how fast a force is reached, but not which force is reached.
+# Assumed indentation of the skin by a round tip with a force of 1 N; for other forces, the indentation follows Hertz's
+# law. It affects how fast a force is reached, but not which force is reached.
 DEPTH_OF_1_N_MM = 0.8
 READINGS_N = 5  # readings averaged for the press of known force, as the paper does for indentations (section 3)
 WITHIN = 0.1  # tolerance of the held force, relative to the aim; assumed, because the paper states none

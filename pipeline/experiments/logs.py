@@ -1,4 +1,4 @@
-"""Logs: force and place over time from a log on an SD card, as recorded in a dog shoe or a glove (paper section 6).
+"""Logs: force and place over time from a log on an SD card, such as a log of a dog shoe or a glove (paper section 6).
 
 Networks that were trained without the log's board estimate the contacts in the log. A simulated log is also scored,
 both as it is and as if its board rotated in the earth's field.
@@ -99,8 +99,9 @@ def score_pitches(
 ) -> list[dict[str, Any]]:
     """Score the networks on a log whose board pitches in the earth's field after the quiet start.
 
-    Returns one row per amplitude in `PITCHES_DEG`: the scores as logged, and under `reference_chip` the scores after
-    subtracting the reading of a reference chip. `instrument.noise_uT` is the noise of one reading of that chip.
+    Returns one row per amplitude in `PITCHES_DEG`. A row contains the scores as logged and, under `reference_chip`, the
+    scores after the reading of a reference chip was subtracted. `instrument.noise_uT` is the noise of one reading of
+    that chip.
     """
     period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
     rows = []

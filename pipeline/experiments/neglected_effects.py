@@ -274,7 +274,7 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     """Evaluate, to first order, the effect of the powder's own field on the magnetisation of the powder.
 
-    The field of the powder is that of uniformly magnetised boxes (magpylib).
+    The powder's field is computed as the field of uniformly magnetised boxes (magpylib).
     """
     rest = midpoints(subject.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, subject.skin.thickness_m, simulation.skin.polarity)

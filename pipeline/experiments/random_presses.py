@@ -1,8 +1,9 @@
 """The universal model on recorded boards, calibrated to presses at random places and tested at other places.
 
 Unlabelled presses of a held-out board are drawn at random over all places and forces; the model does not know their
-places. Labels are drawn at random from one part of the places; all tested presses are in the other part. In the case of
-one known weight, the only label is a press in the middle of the skin, as if by a weight that a user puts there.
+places. Labels are drawn at random from one part of the places; all tested presses are in the other part. To test
+calibration with one known weight, the only label is a press in the middle of the skin, as if a user had put the weight
+there.
 """
 
 from collections.abc import Mapping, Sequence

@@ -486,8 +486,8 @@ def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Record
 class Changes(NamedTuple):
     """Field changes relative to one kind of baseline.
 
-    Thresholds are set on the no-load readings of presses with odd numbers (`setting`), and verified on those of presses
-    with even numbers (`verifying`). `contact` and `force_N` belong to the readings in contact.
+    Thresholds are set on the no-load readings before presses with odd numbers (`setting`), and verified on the no-load
+    readings before presses with even numbers (`verifying`). `contact` and `force_N` belong to the readings in contact.
     """
 
     setting: Float[np.ndarray, "a ch"]
@@ -623,7 +623,8 @@ class ContactPresses:
     def proportional_N(self, change_uT: Float[np.ndarray, "m r"], law: PowerLaw) -> Float[np.ndarray, "m r"]:
         """Return forces under the assumption that |dB| is proportional to the force below the weakest press at a place.
 
-        A field change above that of the weakest press is in the recorded range, where the power law is used instead.
+        For larger field changes than that of the weakest press, which are in the recorded range, the power law is used
+        instead.
         """
         order = np.lexsort((self.force_N, self.place_i))
         weakest = order[np.unique(self.place_i[order], return_index=True)[1]][self.place_i]

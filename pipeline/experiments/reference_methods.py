@@ -180,8 +180,8 @@ ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
     """Score a regressor that was fitted to known boards on a new board, in several variants.
 
-    The variants are: the regressor as it is; inputs aligned with the new board by its unlabelled pokes; direct
-    standardisation by labelled pokes; and labelled pokes as additional training rows.
+    The variants are the regressor as it is, alignment of the inputs with the new board by unlabelled pokes, direct
+    standardisation of the inputs by labelled pokes, and labelled pokes as additional training rows.
     """
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
     known, new, test = (view(rows.db_uT[side]) for side in (fold.train, fold.pool, fold.test))

@@ -464,9 +464,9 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
     """Prepare only the sum over nodes, with the compiled kernel and precomputed displacements.
 
-    The run time is comparable with those of the magpylib methods, with one difference. For every indentation, the
-    kernel computes the field of each node both at rest and displaced, which avoids the subtraction of two large sums.
-    With magpylib, the field at rest is computed only once.
+    The run time can be compared with the run times of the magpylib methods, except for one difference. For every
+    indentation, the kernel computes the field of each node both at rest and displaced, which avoids the subtraction of
+    two large sums. With magpylib, the field at rest is computed only once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)

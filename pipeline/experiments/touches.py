@@ -245,8 +245,8 @@ def score_unlike_one(
 ) -> Scores:
     """Score how unlike a single touch each tested row is.
 
-    The detectors are those of experiment `contacts` that use no network, and one more: the smallest residual of a fit
-    by one place.
+    The detectors are the detectors of experiment `contacts` that use no network, and the smallest residual of a fit by
+    one place.
     """
     residuals = [relative_residual(known, (place,), tested_uT) for place in known]
     return {

@@ -60,7 +60,7 @@ class Residual(Strict):
     sizes: Sizes  # rms sizes relative to |dB|, one world per size
     length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation length along x and y
     length_log_N: Annotated[float, Field(gt=0, le=10)]  # correlation length along the logarithm of the force
-    # Fraction of the error's variance that is specific to each skin; the rest of the error is the same on all skins.
+    # Fraction of the error's variance that is drawn for each skin; the rest of the error is the same on all skins.
     own_share: Annotated[float, Field(ge=0, le=1)]
 
 

@@ -222,8 +222,8 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6a.
 
-    Three differences are computed, where the plateau is the number of pokes at which the paper's plateau begins: fewest
-    pokes minus no pokes, plateau minus no pokes, and most pokes minus plateau.
+    Three differences are computed: fewest pokes minus no pokes, plateau minus no pokes, and most pokes minus plateau.
+    Here, plateau means the number of pokes at which the paper's plateau begins.
     """
     groups = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in groups or len(groups) < 2:

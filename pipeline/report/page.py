@@ -202,7 +202,8 @@ def efforts_table(name: str, answered: Answers) -> Table | None:
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
 
-    numbers: numbers.json joined with provenance.json. costs: text of the other files in the folder, by file name.
+    numbers: numbers.json joined with provenance.json. costs: texts of the other files in the folder of the page, by
+    file name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)

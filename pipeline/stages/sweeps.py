@@ -87,8 +87,8 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
     # Folds with most training skins come first, so that the folds with all training skins form the same stacks as in
     # stage train_multi.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # One seed per draw of skins is enough: the random numbers of a network depend on the fold's name, which contains
-    # the draw.
+    # One seed per draw of skins is enough, because the random numbers of a network depend on the fold's name, which
+    # contains the draw.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()

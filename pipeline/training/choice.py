@@ -6,8 +6,8 @@ the same budgets, and its errors are averaged over the budgets, so that no candi
 with a collapsed training run are not chosen. Settings of adaptation are chosen together with the triplet weight of the
 network that is adapted, because without adaptation the triplet term only increases the error.
 
-The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with that of
-the current code.
+The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
+fingerprint that the current code computes.
 """
 
 import hashlib

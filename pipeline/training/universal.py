@@ -1,4 +1,9 @@
-"""The universal model on held-out boards: choose the powers of its likelihoods, calibrate it, and score it."""
+"""The universal model on held-out boards: choose the powers of its likelihoods, calibrate it, and score it.
+
+The model combines a map (a Gaussian model of the reading for each place and force) with networks. Places and forces are
+weighted by a power of their likelihood. In this module, the power affects only the standard deviations of estimates,
+and thus their intervals.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -242,7 +247,10 @@ LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns fi
 
 
 def law_error(scale: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, `scale` times as large as in training."""
+    """Return a function that adds errors of the law, which are `scale` times as large as in training.
+
+    The law is the physical model of a skin.
+    """
     least, most = ERROR_OF_NOMINAL
 
     def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:

@@ -1,7 +1,8 @@
 """Cases of skins and indentations at the limits of what is allowed, compared with references.
 
-The references are indentations in steps four times as fine and without tables of displacements, rings of pressure on a
-layer with the textbook compliance, magpylib's closed form of a magnetised box, and the exact scaling of lengths.
+There are four references: indentations in steps four times as fine and without tables of displacements, rings of
+pressure on a layer with the textbook compliance, magpylib's closed form of a magnetised box, and the exact scaling of
+lengths.
 """
 
 from dataclasses import asdict, replace

@@ -380,8 +380,7 @@ COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
 REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
-# Errors of this size are not visible in readings, because they are a third of a chip's noise, and increase the rms of
-# the noise by only 5 %.
+# Errors of this size are not visible in readings. They are a third of a chip's noise, and increase the rms by only 5 %.
 UNSEEN_uT = 1.0
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # at these places, no node is on the tip's axis
 Places = Float[np.ndarray, "p 2"]
