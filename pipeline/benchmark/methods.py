@@ -50,7 +50,7 @@ LAB = read_settings("lab", ROOT)  # has the frame of the lab's boards, and setti
 SEED = 2021
 DATASETS = ("lab", "eflesh", "simulated")
 SEEDS_N = 3  # number of networks for each set of training boards
-ROWS_MAX_N = 2000  # largest number of rows, drawn at random, of a kernel ridge regression on other boards
+ROWS_MAX_N = 2000  # largest number of presses, drawn at random, for kernel ridge regression on other boards
 # By dataset, the scene and section with the settings of the network. For `simulated`, these are settings of scene lab.
 NETWORK_SETTINGS = {
     "lab": ("lab", "few_labels"),

@@ -93,7 +93,7 @@ def write_registry(root: Path, registry: Registry) -> None:
 
 
 def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
-    """Raise `CaptureError` for a copy of capture `original`, unless a copy with another board or skin is allowed."""
+    """Raise `CaptureError` for a copy of `original`, unless the copy has another board or skin and is allowed."""
     relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return
