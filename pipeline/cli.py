@@ -118,7 +118,7 @@ def add(
         Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
     ] = False,
 ) -> None:
-    """Add recordings to a scene: all of them, or none if one is refused. The next `dvc repro` uses them."""
+    """Add recordings to a scene; if one is refused, none is added. The next `dvc repro` uses them."""
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.scenes import read_plan
@@ -211,7 +211,7 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
-    """Resolve conflicts in data/captures.yaml, plan, dvc.lock and reports, after merging a branch with recordings."""
+    """Resolve the conflicts of merging a branch with recordings, in data/captures.yaml, plan, dvc.lock and reports."""
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))
@@ -219,7 +219,7 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write missing training runs and reports to MLflow, for example after its store was deleted or unreachable."""
+    """Write training runs and reports that MLflow lacks, for example because its store was deleted or unreachable."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import published_results, write_scene
 
@@ -310,7 +310,7 @@ def check_cache() -> None:
 def readme(
     check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a page is out of date.")] = False,
 ) -> None:
-    """Write the generated parts and the figure of README.md, and those of docs, from the results in reports/."""
+    """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
     changed, scenes_shown = fill_pages(ROOT, write=not check)
@@ -358,7 +358,7 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check the planned scenes and params.yaml, and that pipeline/plan.yaml is up to date."""
+    """Check the planned scenes and params.yaml, and whether pipeline/plan.yaml is up to date."""
     from pipeline import plan
 
     names = list(checked_plan().scenes)

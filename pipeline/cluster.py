@@ -1,9 +1,9 @@
 """A `concurrent.futures` executor that runs calls on the workers of a Dask scheduler.
 
-Workers must have the checkout at the same path (on the same machine or on a shared file system), because calls read and
-write files in the checkout. Results are bit-identical to those of a local run, because a worker with different code,
-libraries or environment variables, or with more than one thread, is rejected. Workers are checked when the executor is
-created; a worker that joins later is checked at its first call.
+Calls read and write files in the checkout. Workers must therefore have the checkout at the same path, on the same
+machine or on a shared file system. Workers with different code, libraries or environment variables, or with more than
+one thread, are rejected, so that results are bit-identical to those of a local run. Workers are checked when the
+executor is created; a worker that joins later is checked at its first call.
 """
 
 import os
@@ -26,7 +26,8 @@ from reskin.numerics import signature
 CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
-# Suffixes of the files that must be equal on all machines. Settings need not be, because they are sent with each call.
+# Suffixes of the files that must be equal on all machines. Files of settings may differ, because settings are sent with
+# each call.
 CODE = (".py", ".json", ".safetensors")
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 
@@ -58,7 +59,7 @@ class Cluster(Executor):
         except BaseException:
             self._client.close()
             raise
-        # pure=True would not repeat equal calls, but every call must run, because calls write files.
+        # With pure=True, Dask would not repeat equal calls. Every call must run, because calls write files.
         self._executor = self._client.get_executor(pure=False)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -118,7 +119,7 @@ def _connect(address: str) -> Any:
 
 
 def _check_workers(client: Any, address: str) -> None:
-    """Raise if there is no worker, or if the results of a worker could differ from those of this process."""
+    """Raise an error if there is no worker, or if results of a worker could differ from results of this process."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
         raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HELP}")
@@ -141,7 +142,7 @@ def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker:
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
     """Copy the result or error of a Dask future to `future`.
 
-    If the worker died, the error is `BrokenExecutor`, as it would be on this machine.
+    If the worker died, the error is `BrokenExecutor`, as for a worker process on this machine.
     """
     from distributed import KilledWorker
 

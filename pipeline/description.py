@@ -15,17 +15,17 @@ from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
-NEAR = 0.2  # a reading belongs to a force in `FORCES_N` if its own force differs by at most this fraction
+NEAR = 0.2  # largest relative difference between a reading's force and the force in `FORCES_N` for which it counts
 LARGEST = "force_max_N"
 ENOUGH_N = 20  # minimum number of readings for a statistic
-LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
-STEP_READINGS_N = 2000  # number of readings from which the chips' resolution is determined
+LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between two compared no-load readings
+STEP_READINGS_N = 2000  # number of readings that determine the chips' resolution
 PRESSED_N = 0.5  # below this force, the field change of a weak chip is mostly noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
     """Summarise the readings of one capture: values by quantity; quantities with too few readings are omitted."""
-    # A reading with a force but no place is not a contact; a reading with neither is an unlabelled contact.
+    # A reading with a force but without a place is not a contact. A reading without either is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
@@ -40,7 +40,7 @@ def describe(readings: Readings) -> dict[str, float]:
 
 
 def without_rest(described: Mapping[str, float]) -> dict[str, float]:
-    """Remove the fields at rest and their changes, which are unknown if the recorder subtracted a baseline."""
+    """Remove the fields at rest and their changes, because they are unknown if the recorder subtracted a baseline."""
     prefixes = ("field_at_rest", "rest_changes")
     return {name: number for name, number in described.items() if not name.startswith(prefixes)}
 
@@ -57,7 +57,7 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
     if LARGEST in skins:
         skins[LARGEST] = by_skin[LARGEST].max()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
-    if {weak, strong} <= set(skins):  # per skin, because a capture may contain only one of the two forces
+    if {weak, strong} <= set(skins):  # computed per skin, because a capture may contain only one of the two forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
     summary = summarise(skins)
     return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
@@ -73,10 +73,11 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 
 
 def _wander(readings: Readings) -> dict[str, float]:
-    """Return the rms difference between the fields at rest of two contacts, for each number of contacts between them.
+    """Return the rms difference between the fields at rest before two contacts, for each lag in `LAGS_N`.
 
-    The number of contacts is the lag. A difference caused by a random walk grows as the square root of the lag. A
-    difference caused by after-effects of contacts has its full size at lag 1, and repeats when the scan repeats.
+    The lag is the number of contacts from one field at rest to the other. A random walk of the field causes a
+    difference that grows as the square root of the lag. After-effects of contacts cause a difference that has its full
+    size at lag 1, and that repeats when the scan repeats.
     """
     _, first_i = np.unique(rank(readings.indentation), return_index=True)
     rest_uT = readings.noload_uT[first_i].astype(np.float64)
@@ -111,7 +112,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 def _rate(readings: Readings) -> dict[str, float]:
     """Return the median rate of readings within a stop, in Hz, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
-    known_s = between_s[between_s > 0]  # also excludes NaN, which means that there is no clock
+    known_s = between_s[between_s > 0]  # also excludes NaN, the time in a capture without a clock
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 

@@ -35,7 +35,7 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
 
 
 def prepare_workers(imports: str) -> None:
-    """Start the fork server, so that it imports module `imports` while this process reads its data."""
+    """Start the fork server early, so that it imports module `imports` while this process reads data."""
     if not _scheduler_address() and _workers_n(DEFAULT):
         _context(imports)
         forkserver.ensure_running()
@@ -87,7 +87,7 @@ class InProcessExecutor(Executor):
 
 
 def _end_with_parent() -> None:
-    """Make this worker exit when its parent process ends; otherwise it would go on after its stage is killed."""
+    """Make this worker exit when its parent process ends; otherwise the worker would outlive a killed stage."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -21,16 +21,16 @@ HEADER = """\
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
 MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
-NOT_INGESTED = {"walk"}  # kinds of protocols without a probe log; their experiments read raw captures
+NOT_INGESTED = {"walk"}  # kinds of protocols without a probe log, whose experiments read raw captures
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
     """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
 
-    Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
-    for each protocol of a scene, and `ingest` over recorded captures. An experiment that has its own protocol in
-    simulated scenes, but may also run in recorded scenes (`drift`), iterates over pairs of a scene and its folder of
-    captures.
+    Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures; each
+    protocol of a scene has one folder. `ingest` iterates over recorded captures. An experiment such as `drift` has its
+    own protocol in simulated scenes, and may also run in recorded scenes. The stage of such an experiment iterates over
+    pairs of a scene and the folder that contains the scene's captures.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
@@ -104,10 +104,10 @@ def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/
 
 @contextmanager
 def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
-    """Create scene `name` as a copy of scene `like`, and delete it if the `with` block fails.
+    """Create scene `name` as a copy of scene `like`; delete the copy if the `with` block fails.
 
-    If `like` is None, nothing is created. Comments are copied, except those above the first setting, which describe the
-    other scene.
+    If `like` is None, nothing is created. Comments are copied, except those above the first setting, because they
+    describe scene `like`.
     """
     if like is None:
         yield
@@ -131,7 +131,7 @@ def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Write the plan for exactly these scenes; raise if `dvc repro` is running, because its stages read the plan."""
+    """Write the plan for exactly these scenes; raise an error if `dvc repro` runs, because its stages read the plan."""
     require_idle(root)
     yaml = YAML()
     yaml.width = 120
@@ -145,20 +145,20 @@ def use(root: Path, names: Sequence[str]) -> None:
 def _keep_outputs(root: Path) -> None:
     """Keep DVC from deleting the outputs of scenes that are no longer in the plan.
 
-    DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete the listed
-    outputs that no stage of the current plan writes, so the list is emptied.
+    DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete listed
+    outputs that no stage of the current plan writes. This function therefore empties the list.
     """
     if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
         return
     from dvc.exceptions import DvcException  # imported late: the import takes a second
     from dvc.repo import Repo
 
-    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start, it cannot delete outputs either
+    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start here, it cannot delete outputs
         repo.state.links.clear()
 
 
 def check(root: Path) -> Plan:
-    """Read the plan; raise `ParamsError` if it is out of date, or if a scene or params.yaml is invalid."""
+    """Read the plan; raise `ParamsError` if the plan is out of date, or if a scene or params.yaml is invalid."""
     plan = read_plan(root / PLAN)
     if plan.model_dump(mode="json") != plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"

@@ -1,4 +1,4 @@
-"""Report the position of the running stage in `dvc repro`, such as `stage 5 of 39`."""
+"""Find the position of the running stage in `dvc repro`, such as `stage 5 of 39`."""
 
 import hashlib
 import os
@@ -44,5 +44,5 @@ def _ask_dvc() -> list[str]:
 
     with Repo() as repo:
         stages = plan_repro(get_active_graph(repo.index.graph))
-        # Added recordings are stages without a command.
+        # DVC also counts added recordings as stages; these have no command.
         return [stage.addressing for stage in stages if stage.cmd]

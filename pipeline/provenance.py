@@ -1,4 +1,4 @@
-"""Provenance of results: checkout, commit of the code, machine, and costs in seconds."""
+"""Provenance of results: checkout, commit of the code, machine, and costs in seconds of run time."""
 
 import os
 import platform
@@ -16,7 +16,7 @@ from reskin.numerics import departures
 
 EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of DVC's temporary copies of a checkout, for `dvc exp`
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
-NO_CODE = ("plan.yaml", "scenes")  # in package `pipeline`, but settings rather than code
+NO_CODE = ("plan.yaml", "scenes")  # settings rather than code, although they are in package `pipeline`
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
@@ -26,7 +26,7 @@ INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd"
 
 
 def home() -> Path:
-    """Return the checkout that contains the caches: the working directory, or the original if `dvc exp` copied one."""
+    """Return the checkout with the caches: the working directory or, in a copy by `dvc exp`, the original checkout."""
     here = Path.cwd()
     originals = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
     return originals[-1] if originals else Path()
@@ -40,8 +40,8 @@ def is_experiment() -> bool:
 def code_version() -> str:
     """Return the last commit that changed the two packages; `unknown` outside git.
 
-    `+dirty` is appended if the packages have uncommitted changes. HEAD is not used, because a later commit of results
-    must not make equal results look different.
+    `+dirty` is appended if the packages have uncommitted changes. HEAD is not used, because equal results would look
+    different after a later commit of results.
     """
     code_paths = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
     commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *code_paths)
@@ -108,8 +108,8 @@ def clear_cost(folder: Path, stage: str) -> None:
 def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
     """Add training runs to the record of the current run of a stage.
 
-    trained: for each training run's key, the seconds that it took, and whether its result comes from an earlier run.
-    waited_s: how long the stage waited for these training runs.
+    trained: maps the key of a training run to its duration in seconds, and to whether its result is from an earlier
+    run. waited_s: how long the stage waited for these training runs.
     """
     recorded = _read_trainings(folder, stage)
     reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(recorded["computed_s"])
@@ -124,7 +124,7 @@ def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float
 
 
 def record_cost(folder: Path, stage: str, seconds: float) -> None:
-    """Write the cost of a stage to `folder`, which is not a stage output, because costs differ between equal runs.
+    """Write the cost of a stage to `folder`, which is not an output of the stage, because equal runs differ in cost.
 
     A stage that DVC skips or restores keeps the cost of its last run.
     """
@@ -137,8 +137,9 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
-            # Time without training runs. If these run in parallel, the stage waits less than the sum of their times. If
-            # it waits longer than this sum, for example for the workers' imports, the excess counts as other time.
+            # Time of the stage without training runs. If training runs are parallel, the stage waits less than the sum
+            # of their times. If it waits longer than the sum, for example for the imports of workers, the excess counts
+            # as other time.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),

@@ -1,7 +1,8 @@
-"""Models in MLflow's format: writing their description, and loading them without pickle files.
+"""Write models in MLflow's format, and load them without pickle files.
 
-Every model takes field changes since the no-load reading in uT, one row per reading with columns Bx0, By0, Bz0, Bx1,
-..., and returns x_mm, y_mm and force_N. The universal model can also be calibrated, by MLflow's `params`:
+The input of every model is a table of field changes since the no-load reading, in uT. It has one row per reading, and
+columns Bx0, By0, Bz0, Bx1, ... The output has columns x_mm, y_mm and force_N. The universal model can also be
+calibrated by MLflow's `params`:
 
 noload_uT      no-load reading of the skin (one value per channel)
 presses_uT     field changes of presses at unknown places, one press after the other
@@ -64,7 +65,8 @@ class NetworkModel:
 class UniversalModel:
     """The universal model with the method `predict` that MLflow calls; `params` calibrate it to a skin.
 
-    The last calibration is kept, so that a program that sends single readings with equal `params` waits for it once.
+    The last calibration is kept, so that a program that sends single readings with equal `params` waits for calibration
+    only once.
     """
 
     def __init__(self, file: Path) -> None:
@@ -108,8 +110,8 @@ def typical_noload_uT(model: Universal) -> Float[np.ndarray, " ch"]:
 def _load_pyfunc(path: str) -> NetworkModel | UniversalModel:
     """Load the model whose weights are in the file `path`; MLflow calls this function with the path in MLmodel.
 
-    A first prediction is made here, because it compiles code and imports PyTorch: a server would answer its first
-    request late otherwise.
+    This function also makes a first prediction, which compiles code and imports PyTorch. Otherwise a server would
+    answer its first request late.
     """
     file = Path(path)
     model: NetworkModel | UniversalModel
@@ -130,8 +132,8 @@ def write_model_files(
 ) -> dict[str, Any]:
     """Write a model in MLflow's format to a folder; return the content of its file MLmodel.
 
-    The folder contains the weights and their card, MLmodel with loader, signature and the place of the example, and
-    the example itself as input of `predict` and as body of a request to `mlflow models serve`.
+    The folder contains the weights and their card. MLmodel names the loader, the signature and the file of the example.
+    The example is written twice: as input of `predict`, and as body of a request to `mlflow models serve`.
 
     Parameters
     ----------
@@ -140,9 +142,9 @@ def write_model_files(
     weights
         The model's weights (.safetensors); its card is beside it.
     example_uT
-        Field changes of some readings; there may be none, but their number of channels is that of the model.
+        Field changes of some readings, with the model's number of channels; there may be no readings.
     run_id, created
-        The model's run; time at which it was made, in ISO format.
+        Id of the run that the model belongs to; time at which the model was made, in ISO format.
     """
     names = channel_names(example_uT.shape[1])
     for file in (weights, weights.with_suffix(".json")):
@@ -174,7 +176,7 @@ def write_model_files(
             "serving_input_path": SERVING_EXAMPLE,
             "type": "dataframe",
         }
-    io.write_text(folder / "MLmodel", json.dumps(about, indent=2))  # MLflow reads it as YAML, which JSON is as well
+    io.write_text(folder / "MLmodel", json.dumps(about, indent=2))  # MLflow reads YAML; JSON is also YAML
     return about
 
 
@@ -187,7 +189,7 @@ def _param(name: str) -> dict[str, Any]:
 
 
 def read_example(files: Iterable[Path]) -> Float[np.ndarray, "f ch"] | None:
-    """Return field changes of a few readings in contact from the first table of readings that exists; None if none."""
+    """Return field changes of a few contact readings from the first existing file; None if no file exists."""
     for file in files:
         if file.exists():
             with pq.ParquetFile(file) as table:

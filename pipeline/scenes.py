@@ -22,7 +22,7 @@ MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 WHOLE = "the scene"  # place of sections in messages about a scene's settings
-KEPT = {"pool_passes_n"}  # settings that have an effect even if the experiment that needs them is removed
+KEPT = {"pool_passes_n"}  # settings with an effect even without the experiment that needs them
 
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
 ANALYSES = tuple(experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "analysis")
@@ -114,7 +114,7 @@ class Scene(Strict, extra="allow"):
         return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
 
     def named_file(self, experiment: str) -> str:
-        """Return the file that the section of an experiment names, as a path in the checkout."""
+        """Return the file that an experiment's section names, as a path in the checkout."""
         entry = EXPERIMENTS[experiment]
         return str((self.model_extra or {})[entry.stage].get(entry.file, ""))
 
@@ -122,15 +122,15 @@ class Scene(Strict, extra="allow"):
     def unused(self) -> list[str]:
         """The settings that no experiment of the scene reads, by their place in the scene's file, such as `drift`.
 
-        They change nothing, so an experiment can be removed from a scene without removing its settings.
-        `split.pool_passes_n` is never listed: it also keeps passes out of the test rows of other experiments.
+        Unused settings change nothing, so an experiment can be removed from a scene without removing its settings.
+        `split.pool_passes_n` is never listed, because it also keeps passes out of the test rows of other experiments.
         """
         unread = {place: sorted(have - want - KEPT) for place, (have, want) in self._settings_by_place.items()}
         return [name if place == WHOLE else f"{place}.{name}" for place, names in unread.items() for name in names]
 
     @property
     def _settings_by_place(self) -> dict[str, tuple[Set[str], Set[str]]]:
-        """The settings that the scene has, and those that its experiments need, by place in the scene's file."""
+        """The settings that the scene has, and those that its experiments need, by their place in the file."""
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
         # Adaptation draws its pokes from the first `pool_passes_n` passes.
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
@@ -230,7 +230,7 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and that the scene has the sections that they need; do not parse the sections."""
+    """Check a scene's experiments, and whether the scene has the sections that they need; do not parse the sections."""
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))

@@ -1,6 +1,6 @@
-"""Settings of a scene, from its own file, `params.yaml`, and the library's nominal skin; each file is read once.
+"""Settings of a scene, from the scene's file, `params.yaml` and the library's nominal skin; each file is read once.
 
-The sections that a stage parses are its `params` in `dvc.yaml` (tests/test_settings.py compares the two).
+The `params` of a stage in `dvc.yaml` are the sections that the stage parses (tests/test_settings.py compares both).
 """
 
 import inspect
@@ -30,7 +30,7 @@ class Seeded(Strict):
 
 
 class SectionWithRows(Strict):
-    """Base class of sections that refer to rows of `params.yaml` by name, such as a recipe."""
+    """Base class of sections that refer to rows of `params.yaml`, such as recipes, by name."""
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
@@ -39,10 +39,10 @@ class SectionWithRows(Strict):
 
 
 class Training(SectionWithRows):
-    """Training recipes by name; `paper` is the headline recipe. Each is trained on every fold with `seeds_n` seeds.
+    """Training recipes by name; each recipe is trained on every fold with `seeds_n` seeds.
 
-    The scene's file sets `recipe` (the name of a shared recipe), `steps_n`, and for each variant the values that
-    differ.
+    `paper` is the headline recipe. The scene's file sets `recipe` (the name of a shared recipe), `steps_n` and, for
+    each variant of the recipe, the values that differ.
     """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
@@ -89,11 +89,10 @@ class Adaptations(SectionWithRows):
 class Settings:
     """The settings of a scene; each section is parsed into a typed model when it is first read.
 
-    where: the path of the scene's file, for error messages. of_scene: the content of that file.
-    shared: the content of `params.yaml` and of the library's nominal skin.
-    captures: names of the scene's recorded captures; empty for a simulated scene.
-    held_out: experiments of the scene for which folds are drawn. models: stages of the scene that write models.
-    parsed: sections that were parsed already, by settings model and name.
+    where: the path of the scene's file, for error messages. of_scene: the content of that file. shared: the content of
+    `params.yaml` and of the library's nominal skin. captures: names of the scene's recorded captures; empty for a
+    simulated scene. held_out: experiments of the scene for which folds are drawn. models: stages of the scene that
+    write models. parsed: sections that have been parsed, by settings model and name.
     """
 
     scene: str
@@ -106,7 +105,7 @@ class Settings:
     parsed: dict[tuple[type[Strict], str], Strict] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getitem__(self, section: str) -> Any:
-        """Return a section of the scene's file as it is written; raise `ParamsError` if it is missing."""
+        """Return a section of the scene's file without parsing it; raise `ParamsError` if the section is missing."""
         if section not in self.of_scene:
             raise ParamsError(f"{self.where}: section {section} is missing. Add it there.")
         return self.of_scene[section]
@@ -127,9 +126,9 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Remove a key from a section, and return the row of `params.yaml`, section `shared`, that its value names.
+        """Remove a key from a section; return the row in section `shared` of `params.yaml` that the key's value names.
 
-        Raises `ParamsError`, which names `where` and the key, if the key or the row is missing.
+        If the key or the row is missing, raises `ParamsError`, whose message names `where` and the key.
         """
         name, rows = take(section, key, where), self.shared[shared]
         if not isinstance(name, str) or name not in rows:
@@ -147,7 +146,7 @@ class Settings:
     def captures_in(self, indentations: Path) -> list[str]:
         """Return the names of the captures in a folder of readings.
 
-        For a recorded scene, the names come from the registry, so that a file left by a removed capture is not read.
+        For a recorded scene, the names come from the registry, so that a file that a removed capture left is not read.
         """
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
 
@@ -181,9 +180,9 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and every variant of it.
+    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and each of its variants.
 
-    shared: the row of `params.yaml` that the section names; with `steps_n`, it is the headline recipe.
+    shared: the row of `params.yaml` that the section names. This row, together with `steps_n`, is the headline recipe.
     """
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}

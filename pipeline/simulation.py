@@ -6,13 +6,13 @@ from reskin.errors import ParamsError
 from reskin.simulation.protocols import Load
 from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulation
 
-# The protocols that experiments read, and the kind that each must have.
+# The protocols that experiments read, and the kind that each of these protocols must have.
 KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
     "grip": "load", "press": "press", "log": "walk",
 }  # fmt: skip
-# Protocols on the main boards: their captures are compared with those of the main protocol, or test networks that were
-# trained on the main boards.
+# Protocols on the main boards. Their captures are compared with the captures of the main protocol, or are used to test
+# networks that were trained on the main boards.
 ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "press", "log")
 ON_OTHER_BOARDS = ("flexible",)  # protocols on boards other than the main ones
 OF_ONE_SKIN = ("wear", "glass", "press", "log")  # protocols whose experiments read one capture
@@ -45,7 +45,7 @@ def check_protocols(simulation: SimulationSettings, where: str) -> None:
 
 
 def load_protocol(settings: Settings, protocol: str) -> Load:
-    """Return the settings of a protocol that loads the skin step by step."""
+    """Return the settings of a protocol that increases the load on the skin in steps."""
     load = simulation_settings(settings).protocols[protocol]
     assert isinstance(load, Load), "checked by check_protocols"
     return load

@@ -15,7 +15,7 @@ from reskin.errors import ReskinError, explaining
 
 
 def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage; the command line gives its paths as options, and its scene as `--scene`."""
+    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`."""
     stage = function.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=function.__doc__)
     parser.add_argument("--scene", required=True)
@@ -44,7 +44,7 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
-    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it has one."""
+    """Return the name under which the cost is recorded: the stage and, if there is one, its capture or protocol."""
     if stage == "ingest":
         return f"{stage}-{options['indentations'].stem}"
     if stage in ("simulate", "ingest_simulated"):

@@ -1,7 +1,8 @@
 """The table of scores of all training runs, and the statistics over boards that reports compute from it.
 
 A row of the table has the scores of one network on one skin, or on all skins that it was tested on. The unit of
-inference is the board, because the skins of a board share that board and the networks that were trained without it.
+inference is the board, because the skins of one board are not independent. They share the board, and they are tested
+with the same networks, which were trained without this board.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -20,7 +21,7 @@ COUNTS = (
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
 UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that give an uncertainty
-ALL_SKINS = ""  # value in column `skin` of a row for all skins that a network was tested on
+ALL_SKINS = ""  # value in column `skin` of a joint row for all skins that a network was tested on
 # Values of column `places`; registered: positions are corrected by one offset per board, estimated from its labels.
 AS_LABELLED, REGISTERED = "as_labelled", "registered"
 METHODS = {
@@ -31,7 +32,7 @@ CONFIDENCE = 0.95  # confidence level of intervals; convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
-BOARDS_MIN = 4  # fewest boards for an interval; with fewer, the values of the boards are given
+BOARDS_MIN = 4  # fewest boards for an interval; for fewer boards, their values are given
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
@@ -45,8 +46,8 @@ VERDICTS = (
 
 Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-# Keys `mean` and `n`; also `sd` if n > 1. If the values belong to boards, also `ci95` ([low, high]), or `values` (one
-# value per board) if there are few boards.
+# A statistic with keys `mean` and `n`, and with `sd` if n > 1. If the values belong to boards, it also has `ci95`
+# ([low, high]), or `values` (one value per board) if there are few boards.
 Stat = Mapping[str, Any]
 
 
@@ -59,7 +60,7 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     Parameters
     ----------
     cards
-        Model cards. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row for
+        Model cards. If networks are adapted to one skin each, the networks of a fold and seed also have a joint row for
         all skins.
     points
         Points of sweeps, by experiment; each point has the scores of one training run.
@@ -102,7 +103,7 @@ def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the rows of a training run: for all skins as labelled, for all skins registered, then for each skin."""
+    """Make the rows of a training run: joint rows with positions as labelled and registered, then a row per skin."""
     boards = {*scores["board_of"].values()}
     joint = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
     rows = [joint | {"places": AS_LABELLED} | scores["all"], joint | {"places": REGISTERED} | scores["registered"]]
@@ -137,7 +138,7 @@ def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:
 
 
 def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
-    """Select the joint rows for all skins that a network was tested on: one row per training run."""
+    """Select the joint rows for all skins that a network was tested on, one row per training run."""
     return select(rows, skin=ALL_SKINS, places=places)
 
 
@@ -153,7 +154,7 @@ def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count training runs: all, those that collapsed, and collapsed runs that were kept because every repeat collapsed.
+    """Count all training runs, collapsed runs, and collapsed runs that were kept because every repeat collapsed too.
 
     A training run has collapsed if the output of its network is nearly constant.
 
@@ -235,8 +236,9 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
     """Summarise values: `mean` and `n`, and for two or more values the standard deviation `sd` (n - 1).
 
-    boards: whether each value belongs to one board. If so, two or more values also have an interval `ci95`, or, if they
-    are fewer than `BOARDS_MIN`, the `values` themselves in the order of the boards.
+    boards: whether each value belongs to one board. If so, the summary of two or more values also has an interval
+    `ci95`. For fewer than `BOARDS_MIN` values, it has the `values` themselves, in the order of the boards, instead of
+    the interval.
     """
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
@@ -251,7 +253,7 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
     """Summarise each column over its values that are not NaN.
 
-    differences: whether the columns are differences of metrics, which do not have the bounds of the metrics.
+    differences: whether the columns are differences of metrics; the bounds of a metric do not hold for its differences.
     """
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
@@ -264,8 +266,8 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
     """Summarise every metric over units, which are the groups of rows with equal values in the columns `unit`.
 
-    The value of a unit is the mean of its rows. `sd_seeds`, the mean standard deviation within a unit, is added unless
-    the units are several boards.
+    The value of a unit is the mean of its rows. Unless the units are several boards, the summary also has `sd_seeds`,
+    the mean standard deviation within a unit.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
@@ -316,9 +318,9 @@ def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
     """Compute the standard error, and its degrees of freedom, of the mean of a table with random rows and columns.
 
     Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
-    row means divided by the number of rows, plus the variance of the column means divided by the number of columns. It
-    is slightly too large, because the residual variance of cells is counted twice. The degrees of freedom are
-    Satterthwaite's. Returns None for fewer than two rows or fewer than `BOARDS_MIN` columns.
+    row means divided by the number of rows, plus the variance of the column means divided by the number of columns. The
+    squared error is slightly too large, because the residual variance of cells is counted twice. The degrees of freedom
+    are Satterthwaite's. Returns None for fewer than two rows or fewer than `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -345,7 +347,7 @@ def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def paired(method: pd.DataFrame, other: pd.DataFrame) -> dict[str, Any]:
-    """Summarise over boards the difference between two methods on the same skins; `by_board` has the boards' values."""
+    """Summarise differences between two methods on the same skins over boards; `by_board` has each board's value."""
     return summarise_differences(differences(method, other))
 
 
@@ -363,8 +365,8 @@ def differences(method: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
 def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     """Summarise differences over boards; `by_board` has each board's value.
 
-    With `BOARDS_MIN` boards or more, `p` is the p-value under the null hypothesis of no difference. It follows from the
-    standard error `se` and the degrees of freedom `df`.
+    With `BOARDS_MIN` boards or more, `p` is the p-value under the null hypothesis of no difference. The p-value follows
+    from the standard error `se` and the degrees of freedom `df`.
     """
     summary = summarise(by_board, boards=True, differences=True)
     means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
@@ -377,8 +379,8 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
     """Summarise `method` minus `single` on the test skins of `single`, whose networks are trained on one skin each.
 
-    The result is like that of `paired`, but the interval and `p` use `two_way_error`, because both the boards and the
-    training skins of `single` are samples.
+    The result has the same form as the result of `paired`. Its interval and `p` use `two_way_error`, because both the
+    boards and the training skins of `single` are samples.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])

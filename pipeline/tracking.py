@@ -38,17 +38,17 @@ SQLITE = "sqlite:///"
 STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 PARENT = "mlflow.parentRunId"
-CHAMPION = "champion"  # alias of the version of a registered model to use
-UNIVERSAL = "reskin-universal"  # registered name of the universal model
+CHAMPION = "champion"  # alias of the version of a registered model that users should load
+UNIVERSAL = "reskin-universal"  # name under which the universal model is registered
 UNIVERSAL_EXPERIMENT = "universal model"
-LAYOUT = 4  # version of the content of MLflow runs; runs of older versions are written again
+LAYOUT = 4  # version of the format of MLflow runs; runs of older versions are written again
 DIGITS_N = 6  # significant digits of metrics, as in numbers.json; MLflow's page shows all digits
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
 TIMEOUT_S = 2.0  # time in which an HTTP server must answer
-LOCK_TIMEOUT_S = 5.0  # how long to wait for a locked SQLite store; UIs and other writers lock it for much shorter
+LOCK_TIMEOUT_S = 5.0  # longest wait for a locked SQLite store; UIs and other writers lock it only briefly
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
-# Keys of numbers.json that are not metrics of a run: run times, provenance, counts of data, and values that other
-# MLflow runs contain.
+# Keys of numbers.json that are not metrics of the report's run: run times, provenance, counts of data, and values that
+# other MLflow runs contain.
 NOT_METRICS = {"provenance", "runtime", "described", "variants", "capture", "trainings"}
 
 # A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and the mean of
@@ -65,7 +65,7 @@ class Span(NamedTuple):
 
     @classmethod
     def now(cls) -> "Span":
-        """Return a span of no duration, for a result whose time is unknown."""
+        """Return a span that starts now and has no duration, for a result whose time is unknown."""
         return cls(time.time(), 0.0)
 
     @property
@@ -79,7 +79,7 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class Times:
-    """When the training runs and the stages of a scene ran, as far as this checkout knows.
+    """Times at which the training runs and the stages of a scene ran, as far as this checkout knows them.
 
     trainings: spans by stage and name of the training run. stages: spans by stage. by_key_s: seconds of training runs
     by their key.
@@ -91,7 +91,7 @@ class Times:
 
 
 def read_times(scene: str) -> Times:
-    """Read the times that stages recorded in the working directory; results of other machines have none."""
+    """Read the times that stages recorded in the working directory; results of other machines have no times."""
     trainings: dict[tuple[str, str], Span] = {}
     stages: dict[str, Span] = {}
     by_key_s: dict[str, float] = {}
@@ -131,7 +131,7 @@ class TrackingUnavailable(ReskinError):
 
 
 def server_uri() -> str | None:
-    """Return the tracking server that the environment variable names; None if the embedded store is used."""
+    """Return the tracking server that the environment variable names; None means the embedded store."""
     return os.environ.get(VARIABLE) or None
 
 
@@ -178,10 +178,10 @@ def _probe_sqlite(file: str) -> None:
 
 
 def publish(results: Results, *, scene: str, root: Path, register: bool = True) -> dict[str, int]:
-    """Write every training run and the report of a scene to MLflow, each once.
+    """Write every training run and the report of a scene to MLflow, unless they are already there.
 
-    A sweep or an experiment is one MLflow run with metrics by step, because hundreds of child runs would hide the
-    other runs. Tag `current` marks the runs of the current results. Results that are in MLflow already are only tagged.
+    A sweep or an experiment is a single MLflow run with metrics by step, because hundreds of child runs would hide the
+    other runs. Tag `current` marks the runs of the current results. Results that are already in MLflow are only tagged.
 
     Parameters
     ----------
@@ -195,8 +195,8 @@ def publish(results: Results, *, scene: str, root: Path, register: bool = True) 
     Returns
     -------
     dict
-        Numbers of training runs that were written (`new_n`) and that MLflow had already (`kept_n`), and of MLflow runs
-        that are no longer current (`superseded_n`).
+        Number of training runs that were written (`new_n`), number that MLflow already had (`kept_n`), and number of
+        MLflow runs that are no longer current (`superseded_n`).
 
     Raises
     ------
@@ -242,9 +242,9 @@ def scores_link(scene: str, root: Path) -> str:
 
 
 class Publisher:
-    """Writes the MLflow runs of one scene, each once, and remembers the keys of runs that contain current results.
+    """Writes each MLflow run of a scene once, and remembers the keys of the runs that contain current results.
 
-    The tag `run_key`, a digest of a run's content, identifies the run.
+    Tag `run_key`, which is a digest of a run's content, identifies the run.
     """
 
     def __init__(self, client: Any, scene: str, root: Path, results: Results, *, runs_n: int) -> None:
@@ -258,7 +258,7 @@ class Publisher:
 
     @cached_property
     def marked(self) -> dict[str, Any]:
-        """The runs that were current before, by key; read at once, because single queries take 10 ms each."""
+        """The runs that were current before, by key; one query reads all runs, because each query takes 10 ms."""
         runs, token = [], None
         while True:
             page = self.client.search_runs(
@@ -384,7 +384,7 @@ class Publisher:
             return False
         scores = card["scores"]
         rows = [(name, value, 0) for name, value in scores["all"].items() if name in METRICS]
-        # One offset per board, subtracted from the places, does not change the scores of the force.
+        # Subtracting one offset per board from the places does not change the scores of the force.
         rows += [(f"registered_{name}", scores["registered"][name], 0) for name in METRICS[:2]]
         rows += [(TRAIN_S, span.duration_s, 0)] if self._is_timed(stage, file) else []
         self.write_model(run_id, file.with_suffix(".safetensors"), card, rows, span)
@@ -393,7 +393,7 @@ class Publisher:
     def write_model(
         self, run_id: str, weights: Path, card: Mapping[str, Any], rows: Iterable[tuple[str, float, int]], span: Span
     ) -> None:
-        """Write a trained network with its settings, loss curve and datasets, and metrics `rows`, to a run; end it."""
+        """Write a network, its settings, loss curve and datasets, and metrics `rows` to a run, and end the run."""
         curve = zip(_curve_steps(card), card["curve"], strict=True)
         rows = [*rows, *(("loss", value, step) for step, value in curve)]
         about = self.write_artifacts(run_id, weights, self.example_uT(card["input"]["channels_n"]), span)
@@ -419,7 +419,7 @@ class Publisher:
         return read_example(self.results.readings)
 
     def example_uT(self, channels_n: int) -> "np.ndarray":
-        """Return an example of a model's input; it has no rows if the scene's readings are not there."""
+        """Return an example of a model's input; it has no rows if the scene's readings are missing."""
         import numpy as np
 
         example_uT = self._read_example
@@ -430,7 +430,8 @@ class Publisher:
     def write_final(self, weights: Path, *, register: bool) -> None:
         """Write the final model of a scene, which is trained on all boards; register it as `reskin-SCENE`.
 
-        Its scores are means over boards of the networks of the same recipe that were trained without the tested board.
+        The scores in the run are means over boards. They are scores of networks of the same recipe that were trained
+        without the tested board.
         """
         card = io.read_json(weights.with_suffix(".json"))
         train_s = self.results.times.by_key_s.get(card["key"])
@@ -456,8 +457,8 @@ class Publisher:
     def write_universal(self, weights: Path, tested: Path) -> None:
         """Write and register the universal model, with its scores on the recorded boards of scene lab.
 
-        The step of its metrics is the number of labelled presses that it was calibrated to, besides unlabelled ones.
-        MLflow's tables show the last step; metrics that end in `_0_labels` are the scores without labels.
+        The step of a metric is the number of labelled presses to which the model was calibrated. MLflow's tables show the
+        last step. Metrics that end in `_0_labels` are the scores without labels.
         """
         from pipeline.pyfunc import simulated_example
         from pipeline.report.figures import TESTED
@@ -520,8 +521,8 @@ class Publisher:
     def write_report(self, reports: Path) -> None:
         """Write the report's numbers and files to a run; its key depends on numbers, figures and tables, not on costs.
 
-        Tag `inputs` identifies the results that a report shows. If earlier results were restored without their report
-        (`dvc checkout` does not restore reports), the run of their report becomes the current one again.
+        Tag `inputs` identifies the results that a report shows. `dvc checkout` restores earlier results without their
+        report. The run of their report then becomes current again.
         """
         inputs = _digest(sorted(self.current))
         earlier = self.find("report", inputs=inputs)
@@ -572,7 +573,7 @@ def _settings_of(card: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _curve_steps(card: Mapping[str, Any]) -> list[int]:
-    """Return the training steps at which the points of the loss curve end; cards of earlier versions lack them."""
+    """Return the training step at which each point of the loss curve ends; cards of earlier versions lack it."""
     points_n = len(card["curve"])
     return list(card.get("curve_steps", range(1, points_n + 1)))
 
@@ -595,7 +596,7 @@ def _client(uri: str) -> Iterator[Any]:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     import logging
 
-    # Errors are raised as one sentence. Tracebacks that MLflow would log as well would hide that sentence.
+    # Errors are raised as one sentence. MLflow would also log tracebacks, which would hide that sentence.
     levels = {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
@@ -627,7 +628,7 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
 
 
 def _datasets(card: Mapping[str, Any]) -> list[Any]:
-    """Describe the skins that a network was trained and tested on as datasets."""
+    """Describe, as MLflow datasets, the skins on which a network was trained and tested."""
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
     inputs = []
@@ -649,8 +650,8 @@ def _datasets(card: Mapping[str, Any]) -> list[Any]:
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
     """Flatten numbers.json to rows (name, value, step).
 
-    A list of rows whose first key is a count becomes a curve over this count. Other lists, texts, costs and the content
-    of training runs are left out, and so are counts.
+    If the first key of the rows in a list is a count, the list becomes a curve over this count. Other lists, texts,
+    costs, counts and the content of training runs are left out.
     """
     published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
     rows = ((re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0))

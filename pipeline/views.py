@@ -1,14 +1,15 @@
-"""Views of MLflow's table of runs: columns, filter and links to them.
+"""Views of MLflow's table of runs, each with columns and a filter, and links to these views.
 
-MLflow 3.17 offers no other way to choose the columns that everybody sees first. A view is a tag of an experiment; the
-button *Views* on the experiment's page lists it, and a link can open it. Without a view, the table shows no metric.
+Without a view, the table shows no metrics, and MLflow 3.17 offers no other way to choose the columns that everybody
+sees first. A view is a tag of an experiment. It can be opened with the button *Views* on the experiment's page, or by a
+link.
 """
 
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")  # metrics of every training run, and of its stage
+SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")  # metrics of every training run, and of its stage's run
 TRAIN_S = "train_s"
 TAG, NOTE = "mlflow.sharedViewState.", "mlflow.note.content"
 UI = "http://127.0.0.1:5000"  # where `mlflow ui` listens by default
@@ -17,7 +18,7 @@ WIDTHS = {"name": 170, "metric": 100, "other": 130}  # px; all scores fit on a p
 
 @dataclass(frozen=True)
 class View:
-    """A view: its key in links, its title, the current runs that it lists, and its columns beside the scores."""
+    """A view: key in links, title, filter for the current runs that it lists, and columns beside the scores."""
 
     key: str
     title: str

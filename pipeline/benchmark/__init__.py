@@ -1,4 +1,4 @@
-"""A benchmark that other people can enter: frozen folds, a file format for predictions, scores, a table of entries.
+"""A benchmark that anybody can enter, with frozen folds, a file format for predictions, scores and tables of entries.
 
 docs/benchmark.md describes the task, how to enter a method, and the rules.
 

@@ -1,9 +1,12 @@
-"""Draw the folds of benchmark v1. They are frozen, so this module, which documents how they were made, must not change.
+"""Draw the folds of benchmark v1.
+
+The folds are frozen, and this module documents how they were drawn. The module must therefore not change.
 
     python -m pipeline.benchmark.draw RECORDINGS OUT
 
 RECORDINGS is a folder with the recordings of scenes lab and eflesh, as `reskin fetch` writes them (data/fetched). OUT
-is a new folder for the files. If the simulator or NumPy has changed since, the simulated presses may differ.
+is a new folder for the files. If the simulator or NumPy has changed since v1, the simulated presses may differ from
+those of v1.
 """
 
 import json
@@ -36,11 +39,11 @@ from reskin.seeds import rng_for
 from reskin.universal.calibration import LabelledPresses
 
 VERSION = "v1"
-SEED = 2021  # the seed of scene lab: the draws of lab are those of its experiment random_presses
+SEED = 2021  # the seed of scene lab; the draws of lab equal those of experiment random_presses
 LABELS_N = (0, 10, 40)
 UNLABELLED_N = 65
 LAB_DRAWS_N = 10
-EFLESH_TEST_FRACTION = 0.2  # the last of the five passes, as in scene eflesh
+EFLESH_TEST_FRACTION = 0.2  # tests are the last of five passes, as in scene eflesh
 POPULATION_SEED = 2026
 TRAIN_SKINS_N, TEST_SKINS_N, PRESSES_N = 40, 12, 195
 DEPTHS_MM = (0.4, 1.2)
@@ -110,7 +113,7 @@ def simulate() -> Presses:
 
 
 def simulate_skin(name: str) -> Presses:
-    """Simulate the presses of one skin on its own board; both have this name."""
+    """Simulate the presses of one skin on its own board; skin and board are both called `name`."""
     rng = rng_for(POPULATION_SEED, "benchmark", VERSION, name)
     place_mm = rng.uniform(-HALF_MM, HALF_MM, (4 * PRESSES_N, 2))
     place_mm = place_mm[np.abs(place_mm).sum(axis=1) <= CORNER * HALF_MM][:PRESSES_N] + CENTRE_MM
@@ -125,7 +128,7 @@ def simulate_skin(name: str) -> Presses:
 
 
 def draw_simulated(folder: Path) -> dict[str, Any]:
-    """Draw presses of the simulated test skins; all skins for training are labelled."""
+    """Draw presses of the simulated test skins; all presses of the training skins are labelled."""
     file = "simulated.parquet"
     content: dict[str, Any] = {"path": file, "layout": "presses", "board": None, "options": {}}
     recording = parse(Recording, content | {"files": {file: io.sha256(folder / file)}}, file)
@@ -141,7 +144,7 @@ def draw_simulated(folder: Path) -> dict[str, Any]:
 
 
 def _recorded(source: str, folder: Path) -> tuple[list[Recording], dict[str, Presses]]:
-    """Return a source of `reskin fetch` as recordings of a fold file, and its presses."""
+    """Return the recordings of a source of `reskin fetch`, in the form of a fold file, and their presses."""
     fetched = read_sources(ROOT)[source]
     recordings = []
     for one in fetched.recordings:

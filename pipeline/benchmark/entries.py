@@ -13,9 +13,9 @@ from reskin.config import parse
 from reskin.errors import ParamsError, SchemaError
 
 NOT_STATED = "not stated"
-NETWORK = "network of the paper"  # an entry that corresponds to method `network` of experiment labels
+NETWORK = "network of the paper"  # name of the entry that corresponds to method `network` of experiment labels
 UNLABELLED_N = 65  # unlabelled presses of dataset lab
-CHECKERBOARD = "other colour of a checkerboard"  # dataset lab uses this split of experiment random_presses
+CHECKERBOARD = "other colour of a checkerboard"  # split of experiment random_presses that dataset lab uses
 NONE_YET = "No entries yet."
 
 
@@ -34,7 +34,7 @@ def score_and_write(
 ) -> tuple[Entry, Path]:
     """Score a file of predictions; write the scores beside it or, if `enter`, to benchmark/entries; return the path.
 
-    about: fields of `About`, which an entry needs; None if not given.
+    about: fields of `About`, all of which an entry needs; None for a field that is not given.
     """
     missing = [name.replace("_", "-") for name, text in about.items() if not text]
     if enter and missing:
@@ -45,14 +45,14 @@ def score_and_write(
 
 
 def write_entry(entry: Entry, file: Path | None = None) -> Path:
-    """Write an entry to a file, by default under its name to benchmark/entries; return the path."""
+    """Write an entry to `file`, or by default to benchmark/entries under its own name; return the path."""
     file = file or entry_file(entry.dataset, entry.about.method)
     io.write_json(file, entry.model_dump(mode="json"))
     return file
 
 
 def read_entries(folder: Path) -> list[Entry]:
-    """Read all entries; raise `ReskinError` for one that is incomplete, misnamed, or for an unknown dataset."""
+    """Read all entries; raise `ReskinError` if an entry is incomplete, misnamed, or for an unknown dataset."""
     entries = []
     for file in sorted((folder / ENTRIES).glob("*.json")):
         entry = parse(Entry, io.read_json(file), str(file))
@@ -67,7 +67,7 @@ def read_entries(folder: Path) -> list[Entry]:
 
 
 def blocks(entries: Sequence[Entry], lab: Mapping[str, Any]) -> dict[str, str]:
-    """Make the generated blocks of docs/benchmark.md: recorded and simulated datasets apart.
+    """Make the generated blocks of docs/benchmark.md, with recorded and simulated datasets in separate blocks.
 
     lab: numbers.json of scene lab, or an empty dict.
     """

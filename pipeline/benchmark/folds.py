@@ -1,8 +1,8 @@
 """Folds of the benchmark: the frozen files that list presses by role, and the arrays of each task.
 
-A fold file (`benchmark/v1/*.json`) contains numbers of presses and the SHA-256 of the files that they are in. Presses
-of a board are numbered from 0, in the order of the board's recordings and then of the presses in each recording. A
-published fold file never changes: a correction needs a new version.
+A fold file (`benchmark/v1/*.json`) contains the numbers of presses, and the SHA-256 of the files that contain the
+presses. Presses of a board are numbered from 0, in the order of the board's recordings and then of the presses in each
+recording. A published fold file never changes: a correction needs a new version.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,8 @@ class Recording(Strict):
     """A recording in a fold file, with the SHA-256 of each of its files.
 
     layout: a layout of `reskin add`, or `presses` for a Parquet file of simulated presses beside the fold file. board:
-    None for `presses`, whose file names the boards. options: those of `reskin add` for the layout.
+    None for layout `presses`, because the Parquet file contains the boards' names. options: options of `reskin add` for
+    the layout.
     """
 
     path: str
@@ -55,8 +56,9 @@ class Recording(Strict):
 class Draw(Strict):
     """Presses of one tested board by role.
 
-    train: boards whose presses are all labelled. unlabelled: presses of the tested board at unknown places. labels: its
-    labelled presses; a task with n labels has the first n. tests: presses whose places and forces are predicted.
+    train: boards whose presses are all labelled. unlabelled: presses of the tested board at unknown places. labels:
+    labelled presses of the tested board; a task with n labels has the first n of them. tests: presses whose places and
+    forces are predicted.
     """
 
     board: Name
@@ -70,7 +72,7 @@ class Draw(Strict):
 class FoldFile(Strict):
     """Content of a fold file.
 
-    forces: whether forces are known and predicted. labels_n: numbers of labels; each draw has one task for each.
+    forces: whether forces are known and predicted. labels_n: numbers of labels; each draw has one task per number.
     presses_n: number of presses of each board.
     """
 
@@ -100,8 +102,8 @@ class FoldFile(Strict):
 class Presses:
     """Presses, each as the mean over its readings, or single readings of presses.
 
-    press: number of the press on its board. recording: index of its recording; one recording of dataset lab contains
-    the presses to one depth. place_mm: x and y as recorded. force_N: normal force; NaN if unknown.
+    press: number of the press on its board. recording: index of the recording that contains the press; a recording of
+    dataset lab contains the presses to one depth. place_mm: x and y as recorded. force_N: normal force; NaN if unknown.
     db_uT: field during the press minus `noload_uT`, the field before this press.
     """
 
@@ -131,7 +133,7 @@ class Task:
     fold, board, labels_n
         Name of the fold, tested board and number of its labelled presses.
     train, train_readings : Presses
-        All presses of the training boards, with places and forces, and all single readings of these presses. Both are
+        All presses of the training boards, with places and forces; and all single readings of these presses. Both are
         empty if there is no training board.
     noload_uT : array [ch]
         Mean field of the tested board without contact.
@@ -166,7 +168,7 @@ class Task:
         place_mm : array [t 2]
             Predicted x and y of the rows of `tests_uT`, in mm, in the coordinates of the labels.
         force_N : array [t], optional
-            Predicted normal forces; omit them if the dataset has none.
+            Predicted normal forces; omit them if the dataset has no forces.
         interval_90 : array [t 2 2] or [t 3 2], optional
             Limits (low, high) of 90 % intervals for x, y and, if given, the force.
         """
@@ -221,7 +223,7 @@ class Dataset:
         )
 
     def _train(self, boards: tuple[str, ...]) -> tuple[Presses, Presses]:
-        """Join the presses, and the readings, of training boards; draws with the same boards share the arrays."""
+        """Join the presses of training boards, and their readings; draws with the same boards share these arrays."""
         if boards not in self._joined:
             none = [next(iter(self.presses.values()))[:0]]
             presses, readings = ([of_board[board] for board in boards] for of_board in (self.presses, self.readings))
@@ -258,7 +260,7 @@ def tasks(dataset: str, data: Path | str | None = None, *, version: str = VERSIO
     Raises
     ------
     ReskinError
-        If the dataset is unknown, or its recordings are missing or not those of the fold file.
+        If the dataset is unknown, or if its recordings are missing or differ from those in the fold file.
     """
     return read_dataset(dataset, data, version=version).tasks()
 
@@ -289,7 +291,7 @@ def read_dataset(dataset: str, data: Path | str | None = None, *, version: str =
 
 
 def read_boards(folder: Path, recordings: Sequence[Recording]) -> tuple[dict[str, Presses], dict[str, Presses]]:
-    """Read the recordings of each board after a check of the files' SHA-256; return its presses and its readings."""
+    """Check the SHA-256 of all files and read them; return the presses and the readings of each board."""
     for name, digest in ((name, digest) for recording in recordings for name, digest in recording.files.items()):
         _check_file(folder / name, digest)
     by_board: dict[str, list[Presses]] = {}
@@ -322,7 +324,7 @@ def average_readings(readings: Presses) -> Presses:
 
 
 def join_presses(parts: Sequence[Presses]) -> Presses:
-    """Return the presses of all parts, in their order."""
+    """Concatenate the presses of all parts."""
     return Presses(*(np.concatenate([getattr(part, name) for part in parts]) for name in Presses.__dataclass_fields__))
 
 

@@ -2,10 +2,10 @@
 
     python -m pipeline.benchmark.methods PREDICTIONS [DATASET ...]
 
-Writes the files of predictions to folder PREDICTIONS, for all datasets by default. The recordings must be in
-data/fetched (`reskin fetch lab`, `reskin fetch eflesh`). Each method receives only the arrays of
+The command writes the files of predictions to folder PREDICTIONS, by default for all datasets. The recordings must be
+in data/fetched (`reskin fetch lab`, `reskin fetch eflesh`). Each method receives only the arrays of
 `pipeline.benchmark.tasks`, as other people's methods do. Some choices in the universal model, such as the form of its
-law, were made after results on both boards of dataset lab were known (docs/learning.md).
+physical model (law), were made after results on both boards of dataset lab were known (docs/learning.md).
 """
 
 import sys
@@ -46,12 +46,12 @@ from reskin.universal.map import Estimate, new_map, tabulate
 from reskin.universal.model import PriorModel
 from reskin.universal.presses import RecordedPresses
 
-LAB = read_settings("lab", ROOT)  # the frame of its boards, and settings of networks and universal models
+LAB = read_settings("lab", ROOT)  # has the frame of the lab's boards, and settings of networks and universal models
 SEED = 2021
 DATASETS = ("lab", "eflesh", "simulated")
-SEEDS_N = 3  # networks for each set of training boards
-ROWS_MAX_N = 2000  # of a kernel ridge regression on other boards, drawn at random
-# Scene and section with the settings of the network. For `simulated`, they are those of scene lab.
+SEEDS_N = 3  # number of networks for each set of training boards
+ROWS_MAX_N = 2000  # largest number of presses, drawn at random, for kernel ridge regression on other boards
+# By dataset, the scene and section with the settings of the network. For `simulated`, these are settings of scene lab.
 NETWORK_SETTINGS = {
     "lab": ("lab", "few_labels"),
     "simulated": ("lab", "few_labels"),
@@ -90,7 +90,7 @@ def nearest_label(all_tasks: Tasks) -> Iterator[pa.Table]:
 
 
 def fit_ridge(presses: Presses) -> Fitted:
-    """Fit a linear ridge regression; the penalty is chosen by leaving out each press of the fit once."""
+    """Fit a linear ridge regression, whose penalty is chosen by leave-one-out cross-validation over the presses."""
     from sklearn.linear_model import RidgeCV
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
@@ -134,7 +134,7 @@ def kernel_ridge_on_labels(all_tasks: Tasks) -> Iterator[pa.Table]:
 
 
 def kernel_ridge_on_other_boards(all_tasks: Tasks) -> Iterator[pa.Table]:
-    """Fit the presses of the training boards, at most `ROWS_MAX_N`; for tasks without labels."""
+    """For tasks without labels, fit kernel ridge regression to at most `ROWS_MAX_N` presses of the training boards."""
     for group in by_training_boards(all_tasks).values():
         train = group[0].train
         first = rng_for(SEED, "benchmark", "kernel ridge").permutation(len(train))[:ROWS_MAX_N]
@@ -155,8 +155,8 @@ def by_training_boards(all_tasks: Tasks) -> dict[tuple[str, ...], list[Task]]:
 def network(all_tasks: Tasks) -> Iterator[pa.Table]:
     """Train the paper's network on the readings of the training boards, and fine-tune it on the labels.
 
-    Without training boards, it is trained on the labels. `SEEDS_N` networks are trained for each set of training
-    boards; draws use them in turn, so that the mean over draws is also one over seeds.
+    If there are no training boards, the network is trained on the labels. `SEEDS_N` networks are trained for each set
+    of training boards. Successive draws use different networks, so that the mean over draws is also a mean over seeds.
     """
     scene, section = NETWORK_SETTINGS[all_tasks[0].fold.split(".")[1]]
     settings = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml")[section]
@@ -199,8 +199,8 @@ def fine_tuning(job: TrainingJob, trained: TrainingResult, labels: Int64[np.ndar
 def training_rows(group: Tasks) -> tuple[TrainingData, dict[Any, Int64[np.ndarray, " r"]]]:
     """Stack the readings of the training boards, and the labels and tests of tasks that share these boards.
 
-    Returns the rows and their numbers: `train`, and for each fold (fold, "labels") and (fold, "tests"). Targets of
-    tests are NaN.
+    Returns the rows, and row numbers by role. The roles are `train` and, for each fold, (fold, "labels") and
+    (fold, "tests"). Targets of tests are NaN.
     """
     parts, start = [group[0].train_readings], len(group[0].train_readings)
     rows: dict[Any, np.ndarray] = {"train": np.arange(start)}
@@ -242,7 +242,7 @@ def universal(all_tasks: Tasks) -> Iterator[pa.Table]:
 
 
 def universal_of_rig(all_tasks: Tasks) -> Iterator[pa.Table]:
-    """Calibrate universal models that were made with the training boards, as experiment random_presses does."""
+    """Make universal models with the training boards, and calibrate them as experiment random_presses does."""
     section = LAB.section(Compare, "compare")
     frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
     powers = reskin.load_universal().powers
@@ -301,7 +301,7 @@ def rows_of_estimate(task: Task, found: Estimate) -> pa.Table:
 
 
 class Method(NamedTuple):
-    """A method, the datasets that it is for, and what its entry says about its training data."""
+    """A method, its datasets, and the description of its training data in entries."""
 
     predict: Callable[[Tasks], Iterator[pa.Table]]
     datasets: tuple[str, ...]
@@ -322,7 +322,7 @@ METHODS = {
 
 
 def enter(predictions: Path, datasets: Sequence[str] = DATASETS) -> None:
-    """Predict with every method, and write the files of predictions and the entries."""
+    """Predict with every method; write the files of predictions and the entries."""
     for dataset in datasets:
         dataset_tasks = tasks(dataset)
         for name, method in METHODS.items():

@@ -1,7 +1,8 @@
 """Files of predictions for the benchmark: write them, read them, and check them completely.
 
 A file (CSV or Parquet) has one row for each tested press of each fold, in any order; docs/benchmark.md lists its
-columns. It may leave out all folds with some number of labels, but not a part of them.
+columns. A file may leave out a number of labels, that is, all folds with this number; it may not leave out only some of
+these folds.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +20,13 @@ from reskin.errors import ReskinError, SchemaError, did_you_mean
 from reskin.recordings.tables import parse_csv, render_csv
 from reskin.universal.force import NORMAL_90
 
-DECIMALS = 4  # of written predictions: 0.1 um and 0.1 mN
-FIRST_LINE_N = 2  # line of the first row of a CSV file
-SHOWN_N = 5  # missing presses that an error lists
+DECIMALS = 4  # written decimals of predictions: 0.1 um and 0.1 mN
+FIRST_LINE_N = 2  # number of the line with the first row of a CSV file
+SHOWN_N = 5  # number of missing presses that an error lists
 HELP = "See docs/benchmark.md."
-# Limits beyond which predictions are probably in another unit or have another origin. Poor methods are within them.
-OFF_MIDDLE = 0.4  # distance of the median place from the middle of the pressed area, relative to the area's width
+# Limits beyond which predictions probably have another unit or another origin. Predictions of poor methods are within
+# these limits.
+OFF_MIDDLE = 0.4  # largest distance of the median place from the pressed area's middle / the area's width
 PLACE_MIN = 0.15  # largest coordinate, relative to the largest one of the pressed area
 FORCE_MIN, FORCE_MAX = 0.01, 10.0  # largest and median force, relative to the largest true force
 
@@ -62,7 +64,7 @@ def read_predictions(file: Path) -> Predictions:
     Raises
     ------
     SchemaError
-        If the file cannot be read; columns, rows or values are missing, repeated, unknown or not finite.
+        If the file cannot be read, or if columns, rows or values are missing, repeated, unknown or not finite.
     """
     rows = _Rows(file, _read_table(file))
     folds = _folds_of(rows)
@@ -83,7 +85,7 @@ def read_predictions(file: Path) -> Predictions:
 
 
 def check_units(file: Path, predictions: Predictions, dataset: Dataset) -> None:
-    """Raise `SchemaError` if places or forces are probably in a wrong unit or have another origin."""
+    """Raise `SchemaError` if places or forces probably have a wrong unit or another origin."""
     boards, place_mm = list(dataset.presses.values()), predictions.place_mm
     pressed_mm = np.concatenate([presses.place_mm for presses in boards])
     least, most = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
@@ -106,7 +108,7 @@ def check_units(file: Path, predictions: Predictions, dataset: Dataset) -> None:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rows of a file of predictions as read, and errors that name a row's line."""
+    """The rows of a file of predictions, and functions that raise errors with the line of a row."""
 
     file: Path
     table: pa.Table
@@ -131,7 +133,7 @@ class _Rows:
         return SchemaError(f"{self.file}{'' if row_i is None else f', {self.line(row_i)}'}: {problem}")
 
     def check(self, bad: Bool[np.ndarray, " n"], problem: str | Callable[[int], str]) -> None:
-        """Raise for the first row that `bad` marks, if any; `problem` is a text or makes one for a row."""
+        """Raise an error for the first row that `bad` marks; `problem` is a text, or a function that describes it."""
         if bad.any():
             row_i = int(bad.argmax())
             more_n = int(bad.sum()) - 1
@@ -193,7 +195,7 @@ def _check_columns(file: Path, names: Sequence[str], known: Sequence[str], optio
 
 
 def _folds_of(rows: _Rows) -> FoldFile:
-    """Return the fold file that the folds of all rows are in."""
+    """Return the fold file that contains the folds of all rows."""
     version, dataset = [*str(rows.fold[0]).split("."), "", ""][:2]
     try:
         folds = read_folds(dataset, version)
@@ -208,7 +210,7 @@ def _folds_of(rows: _Rows) -> FoldFile:
 
 
 def _check_presses(rows: _Rows, folds: FoldFile) -> None:
-    """Check that every test press of each fold occurs once, and no other press."""
+    """Check that every test press of each fold occurs once, and that no other press occurs."""
     first: dict[tuple[str, int], int] = {}
     wrong, repeated = np.zeros(len(rows.table), bool), np.zeros(len(rows.table), bool)
     tests = {name: set(draw.tests) for name, (draw, _) in folds.folds.items()}
@@ -228,7 +230,7 @@ def _check_presses(rows: _Rows, folds: FoldFile) -> None:
 
 
 def _role(folds: FoldFile, fold: str, press: int) -> str:
-    """Say which other role a press has in a fold, if any."""
+    """Describe the role that a press, which is not tested, has in a fold; empty if it has none."""
     draw, labels_n = folds.folds[fold]
     if press in draw.labels[:labels_n]:
         return ", where it is labelled"
@@ -236,7 +238,7 @@ def _role(folds: FoldFile, fold: str, press: int) -> str:
 
 
 def _interval(rows: _Rows, quantity: str) -> Float[np.ndarray, "n 2"] | None:
-    """Return the limits of the 90 % intervals of a quantity, which may be given as standard deviations; None if not."""
+    """Return the limits of the 90 % intervals of a quantity, from given limits or standard deviations, or else None."""
     sd, limits, names = sd_column(quantity), limit_columns(quantity), rows.table.column_names
     given = [name for name in limits if name in names]
     if sd in names:

@@ -1,4 +1,4 @@
-"""Scores of a file of predictions, and the JSON file with them that is an entry of the benchmark."""
+"""Scores of a file of predictions, and the JSON file of scores that is an entry of the benchmark."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ Text = Annotated[str, Field(min_length=1, max_length=300)]
 
 
 class About(Strict):
-    """What an entry says about its method: name, authors, training data, and where its code is.
+    """Description of an entry's method: name, authors, training data, and address of the code.
 
     trained_on: for example `labels` (labelled presses of the tested board), `other boards` (the training boards), or
     the names of other data.
@@ -47,7 +47,7 @@ class About(Strict):
 
 
 class Prediction(Strict):
-    """The scored file: its SHA-256 and number of rows."""
+    """The scored file of predictions: its SHA-256 and number of rows."""
 
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     rows_n: Annotated[int, Field(ge=1)]
@@ -57,7 +57,7 @@ class TaskScores(Strict):
     """Scores with one number of labels.
 
     scores: for each metric, a statistic over boards (`pipeline.statistics.statistic`). by_board: for each board and
-    metric, the mean over draws, their number and, for several draws, their standard deviation.
+    metric, the mean over draws, the number of draws and, for several draws, the standard deviation over draws.
     """
 
     labels_n: Annotated[int, Field(ge=0)]
@@ -80,7 +80,7 @@ class Entry(Strict):
 def score_file(file: Path, about: About, data: Path | None = None) -> Entry:
     """Check and score a file of predictions.
 
-    data: folder of the dataset's recordings; by default, the one to which `reskin fetch` writes them.
+    data: folder of the dataset's recordings; by default, the folder to which `reskin fetch` writes recordings.
     """
     predictions = read_predictions(file)
     own = predictions.folds
@@ -88,7 +88,7 @@ def score_file(file: Path, about: About, data: Path | None = None) -> Entry:
 
 
 def score_predictions(file: Path, predictions: Predictions, dataset: Dataset, about: About) -> Entry:
-    """Score predictions that were read from a file, after a check of their units."""
+    """Check the units of predictions that were read from a file, and score the predictions."""
     check_units(file, predictions, dataset)
     own = dataset.folds
     return Entry(
@@ -121,7 +121,7 @@ def score_folds(predictions: Predictions, dataset: Dataset) -> pd.DataFrame:
 
 
 def _uncertainty(true: Float[np.ndarray, "n 3"], limits: Mapping[str, Float[np.ndarray, "n 2"]]) -> dict[str, float]:
-    """Score the intervals that are given; coverage and score of places are averaged over x and y."""
+    """Score the given intervals; coverage and interval score of places are averaged over x and y."""
     scores = {}
     if PLACE[0] in limits:
         ends = np.stack([limits[name] for name in PLACE], axis=1)
@@ -147,7 +147,7 @@ def summarise(table: pd.DataFrame) -> list[TaskScores]:
 
 
 def table_of(entries: Sequence[Entry]) -> pd.DataFrame:
-    """Tabulate entries of one dataset: by number of labels, then from the most to the least accurate."""
+    """Tabulate entries of one dataset, sorted by number of labels, then from the most to the least accurate."""
     pairs = [(entry, task) for entry in entries for task in entry.tasks]
     shown = [name for name in METRICS if any(name in task.scores for _, task in pairs)]
     pairs.sort(key=lambda pair: (pair[1].labels_n, -pair[1].scores["accuracy_pct"]["mean"], pair[0].about.method))

@@ -1,8 +1,8 @@
 """Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
-Measures how much these disturbances degrade the scores on held-out boards, and how much of the loss is recovered by
-two methods. The first method subtracts the reading of a separate reference chip. The second method subtracts the common
-part: the uniform field that best fits the readings of all chips of the board.
+The experiment measures how much these disturbances degrade the scores on held-out boards, and how much of the loss two
+methods recover. The first method subtracts the reading of a separate reference chip. The second method subtracts the
+common part, which is the uniform field that best fits the readings of all chips of the board.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,11 +35,12 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-# Distance of the reference chip from the board's middle, along x; assumed too large for the chip to sense a poke.
+# Distance of the reference chip from the board's middle, along x. At this distance, the chip is assumed not to sense
+# pokes.
 REFERENCE_ASIDE_MM = 30.0
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
-Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction: AS_IT_IS, ASIDE, OWN
+Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction (AS_IT_IS, ASIDE, OWN)
 
 
 class Iron(Strict):
@@ -60,8 +61,8 @@ class Ambient(Strict):
 def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Score the networks of every held-out board in ambient fields.
 
-    For the last board, networks are also trained on inputs from which the common part of all chips has been subtracted
-    (`remove_common_part`).
+    For the last board, networks are also trained on inputs without the common part of all chips, which
+    `remove_common_part` subtracts.
     """
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
@@ -104,13 +105,13 @@ class Instrument:
     """A board (`board`) and a separate reference chip (`aside`), both with their manufacturing errors.
 
     `turn` contains the rotations of the board's chips in the design, without manufacturing errors. The methods that
-    subtract a field use only these rotations, because the errors of a real board are unknown.
+    subtract a field use only the rotations in the design, because the errors of a real board are unknown.
     """
 
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    # Noise of the reference chip's change of field: standard deviation per axis.
+    # Standard deviation, per axis, of the noise of the reference chip's change of field.
     noise_uT: Float[np.ndarray, " 3"]
 
 
@@ -118,8 +119,8 @@ class Instrument:
 class Disturbance:
     """One ambient field; `added_uT` is the change that the field causes in each input row.
 
-    `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the field's
-    strength, or the distance of the ball of iron and the rms fields that it causes.
+    `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the strength
+    of a uniform field, or the distance of the ball of iron and the rms fields that the ball causes.
     """
 
     keys: Mapping[str, float]
@@ -155,7 +156,7 @@ def score_board(
 ) -> Iterator[dict[str, Any]]:
     """Yield the scores of every network of every method in every ambient field, on the held-out board of `fold`.
 
-    The networks are tested on one reading, drawn at random, of each poke of the board.
+    The networks are tested on one reading of each poke of the board, which is drawn at random.
     """
     rows, seed = data.rows, data.settings.seed
     test = one_row_per_poke(rows.indentation, fold.test, rng_for(seed, "ambient", fold.name, "pokes"))
@@ -192,7 +193,7 @@ def one_row_per_poke(
 
 
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over `boards`: one row per value of `axis`, with one entry per method tested on these boards.
+    """Summarise scores over `boards` in one row per value of `axis`, with one entry per method tested on these boards.
 
     Each element of `points` contains the scores of one network in one ambient field; `axis` is `field_uT` or
     `distance_mm`. In the result, `sd_seeds` is the standard deviation over the networks of one board, averaged over
@@ -240,7 +241,7 @@ def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> 
 
 
 def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Return the change of a board's readings, without noise, for the fields `b_T` added at the board's chips."""
+    """Return the change, without noise, of a board's readings if the fields `b_T` are added at the board's chips."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
@@ -250,8 +251,8 @@ def reference_uT(
 ) -> Float[np.ndarray, "f ch"]:
     """Return the estimated change of the board's readings, from a noisy reading of the reference chip.
 
-    `aside_T` is the ambient field at the reference chip. The reading of the reference chip is rotated into the axes
-    that each chip of the board has by design.
+    `aside_T` is the ambient field at the reference chip. The reading of the reference chip is rotated into the axes of
+    each chip of the board, according to the design.
     """
     read_uT = readings_uT(instrument.aside, aside_T[:, None]) + instrument.noise_uT * rng.standard_normal(
         (len(aside_T), 3)
@@ -260,7 +261,7 @@ def reference_uT(
 
 
 def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
-    """Return the projection matrix that subtracts, from a reading, the uniform field that fits it best (least squares).
+    """Return the projection matrix that subtracts from a reading its best-fitting uniform field (least squares).
 
     `turn` contains the rotations of the chips in the design.
     """
@@ -278,7 +279,7 @@ def uniform_fields(
 ) -> Iterator[Disturbance]:
     """Yield the disturbances by a zero field and by uniform fields of the given strengths, in increasing order.
 
-    Each row has a random direction of the field, which is the same for all strengths.
+    Each input row has a random direction of the field, which is the same for all strengths.
     """
     along = random_directions(rows_n, rng)
     for field_uT in sorted({0.0, *fields_uT}):
@@ -334,7 +335,7 @@ DASHES = ("-", "--", "-.")  # line styles of the methods, so that overlapping li
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores of every method in every field.
 
-    There are rows for the mean over all held-out boards, and rows for the last board alone: networks of all
+    There are rows for the mean over all held-out boards, and rows for the last board alone, because networks of all
     methods were trained for that board only.
     """
     last = numbers["last_board"]

@@ -1,8 +1,8 @@
 """Audit: check that no information about test rows leaked into training.
 
-Checks the folds, whether captures are copies of other captures, the scalers, the adaptation data and the settings. A
-leak fails the stage. Leaks that the paper's own protocol implies, and collapsed networks, are reported in the results
-and do not fail the stage.
+The audit checks the folds, the scalers, the adaptation data and the settings, and whether captures are copies of other
+captures. A leak fails the stage. Leaks that the paper's own protocol implies, and collapsed networks, are reported in
+the results and do not fail the stage.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from reskin.models.inputs import FIT, VIEW
 from reskin.models.recipe import HEADLINE
 from reskin.seeds import rng_for
 
-NOT_CHOSEN = "not chosen by the study"  # `Check.found` begins with this for a setting that the study did not choose
+NOT_CHOSEN = "not chosen by the study"  # beginning of `Check.found` for a setting that the study did not choose
 COLLAPSE = "collapse"
 COPIES = "copies"
 
@@ -49,8 +49,8 @@ NOTHING_ACCEPTED = AuditSettings(settings="for speed")
 class Check:
     """The result of one check: the rule, what was found, and whether the rule holds.
 
-    `what` names the rule, `where` the fold or the network. With `known`, a violation is reported in the results and
-    does not fail the stage. `remedy` is for the error message only.
+    `what` names the rule; `where` names the fold or the network. If `known`, a violation is reported in the results and
+    does not fail the stage. `remedy` is used only in the error message.
     """
 
     what: str
@@ -153,7 +153,7 @@ def audit_fold(
 ) -> list[Check]:
     """Check that neither the test rows of a fold nor copies of them were used for training or adaptation.
 
-    accepted: skins that the scene accepts as similar or weak. scene: its name, for remedies.
+    accepted: skins that the scene accepts as similar or weak. scene: name of the scene, for remedies.
 
     >>> skin = np.array(["s1", "s1", "s2"])
     >>> labels = Labels(np.array(["b1", "b1", "b2"]), skin, np.array([0, 0, 1]), capture=skin)
@@ -283,14 +283,14 @@ def _first_names(names: np.ndarray) -> str:
 # Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
 # 4.4-5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-# Smallest |dB| of the indentations that are compared, in units of a reading's noise. The direction of weaker dB is
-# dominated by noise.
+# Smallest |dB| of the compared indentations, in units of a reading's noise. The direction of a weaker dB is dominated
+# by noise.
 STRONG_NOISES = 10.0
 # Largest distance between a copy and its original, in units of a reading's noise. Two readings of the same contact
 # differ by 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
 COPY_DISTANCE_NOISES = 2.0
-# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. In a copied capture, all indentations have the
-# same ratio; between different skins, the ratio varies with the depth of the indentation.
+# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. All indentations of a copied capture have the
+# same ratio. Between different skins, the ratio varies with the depth of the indentation.
 FACTOR_TOLERANCE = 0.1
 # A capture counts as a copy if at least this fraction of its indentations look copied. Measured fractions: 0 % between
 # four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least 55 % in a
@@ -300,7 +300,7 @@ COPIED_SHARE_MAX = 0.3
 # more pairs.
 PAIRS_MAX_N = 100_000_000
 SAMPLE_MIN_N = 100  # smallest number of indentations sampled from a capture, if it has as many
-CHUNK_PAIRS_N = 4_000_000  # number of pairs that are compared at once, which takes 16 MB of memory
+CHUNK_PAIRS_N = 4_000_000  # number of pairs that are compared at once, in 16 MB of memory
 
 
 @dataclass(frozen=True)
@@ -358,7 +358,7 @@ def nearest_rays(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Find, for each row of `db_uT`, the index of the row of `others_uT` that is nearest in direction.
 
-    The second result is the distance in uT from the row to the line through the origin in that direction.
+    The second result is the distance in uT from the row of `db_uT` to the line through the origin in that direction.
     """
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))
@@ -384,9 +384,9 @@ def _copied_shares(sample_uT: Float32[np.ndarray, "n ch"], train: MeanFields) ->
 
 # --- Networks ---
 
-# Largest relative difference between two scalers fitted to the same rows: 4 float32 roundings, or 5e-7. The order of
-# float64 sums may differ, which changes a float32 result by at most one rounding. In comparison, one additional row
-# among 100,000 moves a column's mean by about 1e-5 of the column's standard deviation.
+# Largest relative difference between two scalers that are fitted to the same rows: 4 float32 roundings, or 5e-7. The
+# order of float64 sums may differ, which changes a float32 result by at most one rounding. For comparison, one
+# additional row among 100,000 rows moves a column's mean by about 1e-5 of the column's standard deviation.
 SCALER_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
 
 Arrays = Mapping[str, np.ndarray]
@@ -436,7 +436,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a network's scaler was fitted to the training rows only, and not to training and test rows."""
+    """Check that a network's scaler was fitted to the training rows alone, rather than to training and test rows."""
     both_sides = np.concatenate([sides.train, sides.test])
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
@@ -466,7 +466,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
 def audit_tuning(
     where: str, tuning: Mapping[str, Any], *, bases: set[str], sides: Sides, indentation: Int[np.ndarray, " f"]
 ) -> list[Check]:
-    """Check, in section `tuning` of a model card, which pretrained network was adapted, and to which pokes.
+    """Check which pretrained network was adapted, and to which pokes, according to section `tuning` of a model card.
 
     `bases` are the keys of the pretrained networks that have the fold and seed of the adapted network.
     """
@@ -487,7 +487,7 @@ def audit_tuning(
 
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
-    """Count a variant's collapsed networks (nearly constant predictions), and how often training was repeated."""
+    """Count a variant's collapsed networks, whose predictions are nearly constant, and its repeated training runs."""
     collapsed = [
         f"{card['question']}.{card['recipe_name']}.{card['fold']}.seed{card['seed_i']}"
         for card in cards
@@ -504,13 +504,13 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
 
 # --- Settings ---
 
-SAME_AS = {"train_single": "train_multi"}  # variants that use the recipe that the study chose for another variant
+SAME_AS = {"train_single": "train_multi"}  # a variant that uses the recipe chosen for another variant
 
 
 class Choice(Strict, extra="allow"):
     """The record of the study that chose the training settings.
 
-    Contains the boards and skins of the study, and the recipe that it chose for each variant of the networks.
+    The record contains the boards and skins of the study, and the recipe chosen for each variant of the networks.
     """
 
     scene: str

@@ -1,7 +1,7 @@
 """Smallest error that the noise of the chips allows, compared with a network's scores (paper section 4).
 
-Computes the Cramér-Rao bound for estimates of place and force from one input row. The skin is simulated, and its
-properties are assumed to be known.
+The experiment computes the Cramér-Rao bound for estimates of place and force from one input row. The skin is simulated,
+and its properties are assumed to be known.
 """
 
 from collections.abc import Callable, Mapping
@@ -144,7 +144,7 @@ def expected_scores(
 def probability_within(
     limits: Float[np.ndarray, "n 2"], correlation: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Return P(|x| <= h and |y| <= k) for correlated standard normal x and y.
+    """Return the probability of |x| <= h and |y| <= k for correlated standard normal x and y.
 
     `limits` contains h and k, which must be positive. The result is exact: the probability outside the limits is
     computed with Owen's T function (Owen 1956, equation 2.1).
@@ -160,7 +160,7 @@ def probability_within(
 def by_depth(
     depth_mm: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n 3 3"], labels: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Return expected scores averaged over places, for each depth and over all depths.
+    """Return expected scores, averaged over places, for each depth and for all depths together.
 
     `signal` contains the scores for exact labels, `with_label_errors` the scores for labels whose errors have the
     standard deviations `labels`.

@@ -1,10 +1,10 @@
 """Compare recorded changes of field with simulated ones, poke by poke, on boards with known forces (not in the paper).
 
-Each board is simulated in three ways: with the nominal skin, with a physical model (law) fitted to the board, and with
-the law of another board after refitting only the parameters that may differ between boards. The experiment also
-examines:
+Each board is simulated in three ways: with the nominal skin, with a physical model (law) that is fitted to the board,
+and with the law of another board. In the third way, only the parameters that may differ between boards are refitted.
+The experiment also examines:
 - the friction under the tip,
-- the memory: the fraction of a poke's change of field that remains in the next no-load reading,
+- the memory, which is the fraction of a poke's change of field that remains in the next no-load reading,
 - whether labels, chips and skin are oriented as the scene's settings state.
 """
 
@@ -43,9 +43,9 @@ CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against fo
 LIGHT_N = 1e-3  # force of a light touch
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
-# Values of k / mu in N/mm (spring constant with which the skin is held / friction coefficient under the tip). This
-# ratio limits how far a tip can slide a skin. The first value means no limit (full slide at any force), the last a
-# slippery tip.
+# Values of k / mu in N/mm, where k is the stiffness of the springs that hold the skin, and mu the friction coefficient
+# under the tip. This ratio limits how far a tip can slide the skin. The first value means no limit (full slide at any
+# force), and the last value a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -55,16 +55,17 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 class Compare(SectionWithRows):
     """Settings section `compare`: orientation of the recorded board, its labels and skin, and simulated memory.
 
-    Instead of the keys from `design` to `labels_middle_mm` and `tip_radius_mm`, the scene's file may have `layout`: the
-    layout of a board as in `reskin/universal/layouts`, or the name of one of these.
+    The scene's file may have key `layout` instead of `tip_radius_mm` and of the keys from `design` to
+    `labels_middle_mm`. Its value is the layout of a board, as in `reskin/universal/layouts`, or the name of a layout in
+    that folder.
     """
 
     layout: BoardLayout | None = None
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # whether all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
+    skin_flipped: bool  # whether all magnetic poles are swapped, as by a quarter turn of a checkerboard skin
     labels_middle_mm: tuple[float, float]  # label (x, y) of the place at the board's middle
-    labels_mirrored: bool  # whether the labels' y has the opposite sign of the board's y
+    labels_mirrored: bool  # whether y of the labels points opposite to y of the board
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
     memory: Annotated[float, Field(ge=0, lt=1)]
@@ -92,14 +93,14 @@ class Compare(SectionWithRows):
 
     @property
     def stated_by(self) -> str:
-        """What states the orientations, in messages."""
+        """Name, in messages, of what states the orientations."""
         return "the scene" if self.layout is None else f"layout {self.layout.name}"
 
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
     """Compare the recorded changes of field of a scene's boards with simulated ones, and write the results.
 
-    Of boards without known forces, only the orientation of labels, chips and skin is compared.
+    For boards without known forces, only the orientations of labels, chips and skin are compared.
     """
     design = settings.shared_section(SkinDesign, "skin")
     boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))), with_force=False)
@@ -133,7 +134,7 @@ def compare_boards(
             | {"beyond_n": beyond_n(laws.get(name), setup, aligned_presses.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
-        whole = len(aligned_presses.recorded) == len(boards[board])  # memory needs successive presses
+        whole = len(aligned_presses.recorded) == len(boards[board])  # the estimate of memory needs successive presses
         frictions = fit_frictions(aligned_presses, setup, fitted[board])
         curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
         by_board[board] = (
@@ -166,7 +167,7 @@ def _outline(section: Compare) -> dict[str, Any]:
 
 
 def _without_law(aligned: AlignedPresses, recorded: RecordedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Return the numbers of a board that need no fitted law, and therefore no forces; `recorded`: all its presses."""
+    """Return a board's numbers that need no fitted law, and thus no forces; `recorded` contains all its presses."""
     noise_uT = recorded.noise_uT
     noise = {"noise_uT": dict(zip("xyz", noise_uT.tolist(), strict=True))} if np.isfinite(noise_uT).all() else {}
     counts = {"pokes_n": len(recorded), "left_out_n": recorded.excluded_n}
@@ -198,7 +199,7 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
     """Return the agreement of a simulation with a board's recordings.
 
-    The mapping of a board holds the agreement of the fitted law itself, and that of other simulations by name.
+    The numbers of a board contain the agreement of the fitted law, and the agreement of other simulations by name.
     """
     agreement_numbers: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
     return agreement_numbers
@@ -207,7 +208,7 @@ def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, An
 def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Return the data for the figures: changes of field at a few places, and |dB| against force.
 
-    All places are from one group of pokes: the middle one in the board's list of groups.
+    All places are from one group of pokes, which is the middle group in the board's list.
     """
     in_group = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
     order = in_group[np.argsort(np.hypot(*aligned.place_mm[in_group].T), kind="stable")]
@@ -283,7 +284,7 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
     Memory is the fraction of a poke's change of field that remains in the next no-load reading. Returns an empty dict
     if either estimate is impossible.
     """
-    pokes = aligned.recorded  # in the chips' axes; the memory is the same in any axes
+    pokes = aligned.recorded  # in the chips' axes, because the memory is the same in any axes
     if not np.isfinite(pokes.noise_uT).all():
         return {}
     rng = rng_for(seed, "compare", pokes.board)
@@ -298,7 +299,7 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
 
 
 def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
-    """Return the simulated |dB| in uT for each of the forces `CURVE_N`: the median over every fifth place."""
+    """Return the simulated |dB| in uT for each force in `CURVE_N`, as the median over every fifth place."""
     places_mm = np.unique(place_mm.round(2), axis=0)[::PLACE_STRIDE]
     tips_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
     length_uT = magnitudes_uT(simulate_uT(law, setup, tips_mm, force_N)).reshape(len(places_mm), -1)
@@ -306,7 +307,7 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
 
 
 def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
-    """Refit the law for each friction under the tip in `GRIPS_N_MM`; return agreement, and |dB| of a light touch.
+    """Refit the law for each friction in `GRIPS_N_MM` under the tip; return agreement, and |dB| of a light touch.
 
     In the result, `grip_N` is the force at which the slide in the skin's middle reaches two thirds of its limit.
     """
@@ -327,13 +328,14 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 
 # --- Frames: are labels, chips and skin oriented as the scene states? ---
 
-# An orientation other than the scene's is reported only if it raises the sum, over chips, of the cosines between
-# recorded and simulated fields by this much. Assumed: wrong axes lower the cosine of a chip by 0.5 or more, and a skin
-# displaced by 0.5 mm changes every cosine by less than 0.1.
+# An orientation that differs from the scene's is reported only if it raises the sum of cosines by this much. The sum is
+# over chips, and each cosine is between the recorded and the simulated field of a chip. The value is assumed. Wrong
+# axes lower the cosine of a chip by 0.5 or more, while a skin displaced by 0.5 mm changes every cosine by less than
+# 0.1.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin are oriented as {} states."
-ASSUMED_N = 1.0  # force of presses of unknown force, in simulations that are only compared in direction
+ASSUMED_N = 1.0  # replaces unknown forces in simulations of which only the direction is compared
 
 
 @dataclass(frozen=True)
@@ -357,9 +359,9 @@ class Turn:
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
-# The 16 different orientations. (Mirroring x and rotating by a half turn is the same as mirroring y, so some
-# combinations of turns and signs are left out.) The first is the orientation that the scene states. The first eight
-# leave z unchanged; only these are possible for labels.
+# The 16 different orientations. Some combinations of turns and signs are left out, because they are equal to others:
+# mirroring x and rotating by a half turn is the same as mirroring y. The first orientation is the one that the scene
+# states. The first eight orientations leave z unchanged; only these are possible for labels.
 PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
 TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
 
@@ -374,9 +376,10 @@ def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
 class Frames:
     """The orientations of labels, skin and chips with which recordings and the nominal skin agree best.
 
-    `chips[i]` is the position of recorded chip i, in the scene's numbering; `turns[i]` is its orientation. `cosines`
-    are between recorded and simulated fields in these orientations, `as_written` in those that the scene states.
-    `worth` is the sum of the cosines minus penalties for differences from the scene.
+    `chips[i]` is the position of recorded chip i, in the scene's numbering; `turns[i]` is the orientation of this chip.
+    `cosines` are the cosines between recorded and simulated fields in the found orientations, and `as_written` those in
+    the orientations that the scene states. `worth` is the sum of `cosines` minus penalties for differences from the
+    scene.
     """
 
     labels: Turn
@@ -445,8 +448,8 @@ def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dic
 def describe_outside(place_mm: Float[np.ndarray, "n 2"], section: Compare) -> str | None:
     """Describe the presses that are not on the skin, according to the scene; return None if all are on it.
 
-    `place_mm` are places relative to the board's centre. If presses seem to be elsewhere, the orientations that agree
-    best with them mean nothing.
+    `place_mm` are places relative to the board's centre. If presses seem to be outside the skin, their best
+    orientations mean nothing.
     """
     outside_n = int((np.abs(place_mm) > np.array(section.skin_mm) / 2).any(axis=1).sum())
     if not outside_n:
@@ -482,15 +485,15 @@ def find_frames(
     """Find the orientations of labels, skin and chips with which recordings and the nominal skin agree best.
 
     `read_uT` are recorded changes of field in the chips' axes; `chips_turn` are the rotations of the chips according to
-    the scene. `nominal` simulates pokes at places in the board's axes. A chip at the position of another chip is
-    assumed to have the rotation of that chip.
+    the scene. `nominal` simulates pokes at places in the board's axes. If a chip is found at another chip's position,
+    it is assumed to have the rotation that the scene states for that position.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
     as_written, candidate_frames = np.empty(0), []
     for labels in TURNS[:8]:
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
-        # Entry [k, l, t] of `cosine`: cosine, over all pokes, between the field of recorded chip k after orientation t
-        # and the field simulated at chip l.
+        # Entry [k, l, t] of `cosine` is the cosine, over all pokes, between two fields: that of recorded chip k after
+        # orientation t, and that simulated at chip l.
         rotated_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
         moments = np.einsum("nka,nlb->klab", read_uT, rotated_uT)
         sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
@@ -507,8 +510,9 @@ def _best_chips(
 ) -> Frames:
     """Find the best positions and orientations of the chips for given orientations of labels and skin.
 
-    `common` is the orientation that most chips share. If it differs from the scene's, this counts as one difference
-    whose penalty is 1.5 times as large, because a flipped skin can look like such a common turn.
+    `common` is the orientation that most chips share. If `common` differs from the scene's orientation, this counts as
+    one difference. Its penalty is 1.5 times as large as others, because a flipped skin can look like such a common
+    turn.
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
@@ -521,16 +525,16 @@ def _best_chips(
 
 
 CHIPS_MIN_N = 4  # orientations are checked only on boards with at least four chips, on all sides of the middle
-# With fewer pokes, the check is unreliable. With more, it takes seconds and is no more reliable (in scene lab, every
-# third of 65 places is enough).
+# With fewer pokes, the check is unreliable. With more pokes, it takes seconds and is no more reliable: in scene lab,
+# every third of 65 places is enough.
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
     """Describe how places, labels, chips and skin of a capture differ from what the scene states.
 
-    Presses outside the skin are described instead of orientations. Returns None if there is no difference, or too
-    little data to decide. `blocks` are the readings of the capture.
+    If presses are outside the skin, they are described instead of orientations. Returns None if there is no difference,
+    or if the data are too few to decide. `blocks` are the readings of the capture.
     """
     if not any(_pressed_rows(block).any() for block in blocks):
         return None
@@ -715,7 +719,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 
 def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
-    """Plot |dB| against force, from 0.3 mN on: recorded presses, and simulated presses with several frictions."""
+    """Plot |dB| against force, from 0.3 mN, for recorded presses, and for simulated presses with several frictions."""
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]

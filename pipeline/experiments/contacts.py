@@ -1,7 +1,8 @@
 """Two contacts at once, modelled as the sum of two pokes of a held-out skin (paper section 7, future work).
 
-Tests what networks trained on single contacts predict for two contacts, whether two contacts can be detected, and how
-closely the field change of two contacts equals the sum of the field changes of the single contacts.
+The experiment tests what networks that were trained on single contacts predict for two contacts, and whether two
+contacts can be detected. It also tests how closely the field change of two contacts equals the sum of the field changes
+of the single contacts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -51,8 +52,8 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
 SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
 DRAWN_N = 60  # number of pairs in the figure, for each board and separation
-SAME_PLACE = 0.0  # separation of 0 mm: two pokes at the same place show the effect of signal strength and noise alone
-TOLERANCE_MM = 0.5  # tolerance of a pair's separation, assumed; needed because places are on a grid
+SAME_PLACE = 0.0  # pokes at the same place (0 mm) show the effect of signal strength and noise alone
+TOLERANCE_MM = 0.5  # assumed tolerance of a pair's separation, needed because places are on a grid
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
 
 Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
@@ -84,7 +85,8 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # Two detectors use networks that were trained on all other boards, including the contacts that set thresholds.
+        # Two detectors use networks. These were trained on all other boards, including the contacts that set
+        # thresholds.
         "threshold_set_on": (
             f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
@@ -206,16 +208,16 @@ def _pairs_at_distance(
     rows_at = np.split(skin_rows[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
-    # A place is paired with itself only at 0 mm, although 0 mm is also within the tolerance of small separations.
+    # A place is paired with itself only for a separation of 0 mm, although 0 mm is also within the tolerance of small
+    # separations.
     return rows_at, np.argwhere(np.triu(near, k=1) if separation_mm else np.eye(len(places_mm), dtype=bool))
 
 
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Split training rows into those that detectors are fitted to, and those that set the thresholds.
+    """Split training rows into rows to which detectors are fitted, and rows that set the thresholds.
 
-    The thresholds are set with the rows of the last board. If there is only one board, they are set with the rows of
-    its last skin; if there is only one skin, with those of its last pass. The third return value is `board`, `skin` or
-    `pass`.
+    The thresholds are set with the rows of the last board. If there is only one board, the rows of its last skin are
+    used; if there is only one skin, the rows of its last pass. The third return value is `board`, `skin` or `pass`.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
@@ -231,7 +233,7 @@ def compare_prediction(
 ) -> dict[str, float]:
     """Compare a prediction of one contact (x_mm, y_mm, F_N) with the two true contacts of each pair.
 
-    The result has ratios of forces only if all true forces are known.
+    The result contains ratios of forces only if all true forces are known.
     """
     off_mm = np.stack([predicted[:, :2] - side[:, :2] for side in (weaker, stronger)])
     numbers = {
@@ -253,7 +255,7 @@ def compare_prediction(
 def position_along_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Return the position of each prediction along the line through both contacts: 0 is the weaker, 1 the stronger."""
+    """Return each prediction's position along the line from the weaker contact (0) to the stronger contact (1)."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
     return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 
@@ -266,8 +268,9 @@ def detection_rates(
 ) -> dict[str, Any]:
     """Return, for each detector, the percentages of single and of double contacts that score above its threshold.
 
-    `aside` contains the scores of the single contacts that set the thresholds, `single` those of other single contacts.
-    `double` maps each separation in mm to the scores of double contacts. The result also has areas under ROC curves.
+    `aside` contains the scores of the single contacts that set the thresholds, and `single` the scores of other single
+    contacts. `double` maps each separation in mm to the scores of double contacts. The result also has areas under ROC
+    curves.
     """
     limits = thresholds(aside, false_alarm_fraction)
     separated = {
@@ -289,10 +292,10 @@ def residual(
     predicted: Float[np.ndarray, "f 3"],
     db_uT: Float[np.ndarray, "f ch"],
 ) -> Float[np.ndarray, " f"]:
-    """Return the difference between dB and the dB of a single contact at the prediction, relative to |dB| plus noise.
+    """Return the difference between dB and the dB of a single contact as predicted, relative to |dB| plus noise.
 
-    The dB of that single contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; dB in uT) that are nearest
-    to the prediction in place and, if forces are known, in force.
+    The dB of that single contact is interpolated from `known` contacts (x_mm, y_mm, F_N; dB in uT). These are the
+    contacts that are nearest to the prediction in place and, if forces are known, in force.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 
@@ -305,9 +308,9 @@ def residual(
 
 
 def disagreement(predicted: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
-    """Return how much networks of several seeds disagree on each contact's place.
+    """Return the disagreement of networks of several seeds on each contact's place.
 
-    This is the rms distance, in mm, of the predicted places from their mean.
+    The disagreement is the rms distance, in mm, of the predicted places from their mean.
     """
     place_mm = predicted[:, :, :2]
     return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
@@ -333,7 +336,7 @@ def superposition(
 ) -> list[dict[str, Any]]:
     """Return, by depth and separation, the rms error of adding the field changes of two single contacts.
 
-    The skin is the first of the scene. The two depths are half the largest commanded depth, and the largest.
+    The skin is the first one of the scene. The two depths are the largest commanded depth, and half of it.
     """
     board_name, skin_name = list_captures(simulation, MAIN)[0]
     board = draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board_name)

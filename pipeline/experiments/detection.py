@@ -1,4 +1,4 @@
-"""Novelty detection: scores for how unlike a reading is to known readings, thresholds, and areas under ROC curves."""
+"""Novelty detection: scores of how unlike known readings a reading is, thresholds, and areas under ROC curves."""
 
 from collections.abc import Mapping
 
@@ -26,8 +26,8 @@ def direction_distance(
 ) -> Float[np.ndarray, " f"]:
     """Return, for each row of `tested_uT`, the mean distance to its `NEIGHBOURS_N` nearest rows of `known_uT`.
 
-    Distances are between the vectors dB / (|dB| + noise), which have the direction of dB. Their length is near 1 for
-    strong fields, and near 0 for weak fields.
+    Distances are between the vectors dB / (|dB| + noise). These vectors have the direction of dB. Their length is near
+    1 if the field change is strong, and near 0 if it is weak.
     """
     known, tested = (
         db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, tested_uT)
@@ -36,7 +36,8 @@ def direction_distance(
 
 
 def _neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    # Imported here because importing scikit-learn takes a second, and commands that only check scenes do not need it.
+    # Imported here because importing scikit-learn takes a second, and commands that only check scenes do not need
+    # scikit-learn.
     from sklearn.neighbors import NearestNeighbors
 
     neighbours = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)

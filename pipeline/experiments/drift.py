@@ -1,7 +1,7 @@
 """Drift: networks trained on a skin's first contacts and tested on later contacts (paper section 4, figure 5).
 
-A no-load policy states how often the no-load reading is renewed; each policy has its own networks. The paper's
-statements about the policies, and about the force bias after many contacts, are tested over boards.
+A no-load policy states when a new no-load reading is taken; each policy has its own networks. The paper makes
+statements about the policies, and about the force bias after many contacts. These statements are tested over boards.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -58,8 +58,8 @@ POINTS_MAX_N = 2000  # largest number of points in the scatter plot
 DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 
 Count = Annotated[int, Field(ge=1)]
-# When a new no-load reading is taken: `initial`: only at the start; `regular`: every `regular_n` contacts; `each`:
-# before each contact; `free`: whenever a reading is judged free of contact.
+# No-load policies, by when a new no-load reading is taken. `initial`: only at the start. `regular`: every `regular_n`
+# contacts. `each`: before each contact. `free`: whenever a reading is judged free of contact.
 PolicyName = Literal["initial", "regular", "each", "free"]
 UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
 # Errors by metric. Rows are networks (one per skin and seed), columns are test windows.
@@ -75,8 +75,8 @@ class Drift(SectionWithTraining):
     every_n: Count
     policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
     regular_n: Count | None = None  # indentations from one no-load reading to the next under policy `regular`
-    # Step sizes (standard deviation per contact and channel) of the random walks that are added to all readings after
-    # the training contacts; simulated scenes only.
+    # Step sizes (standard deviation per contact and channel) of random walks, which are added to all readings after the
+    # training contacts. For simulated scenes only.
     wander_uT: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = ()
     training: Training
 
@@ -106,7 +106,7 @@ class WindowPredictions:
     seed_i: int
     window_i: int
     contacts_n: int  # number of contacts of the skin before the window
-    noload_off_uT: float  # rms difference between the policy's no-load field and the one read just before each contact
+    noload_off_uT: float  # rms difference of the policy's no-load field from the one before each contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
@@ -277,7 +277,7 @@ def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
 def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
     """Return, by metric, the errors of each network (rows) in each window (columns).
 
-    Row i has the same skin and seed under every policy, so the rows of two policies form pairs.
+    Row i is for the same skin and seed under every policy, so that the rows of two policies form pairs.
     """
     policy_scores = scores[scores["policy"] == policy]
     return {
@@ -300,7 +300,7 @@ def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
 
 
 def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Return the index of the first window after 45,000 contacts (paper figure 5b), or of the last if there is none."""
+    """Return the index of the first window after 45,000 contacts (paper figure 5b), or else of the last window."""
     late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
     return late[0] if late else len(rows) - 1
 
@@ -320,7 +320,7 @@ class ContactForces:
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
     """Average true and predicted forces over the readings of each indentation, because readings are not independent.
 
-    All `predictions` must be for the same window, and no two of them for the same skin.
+    All `predictions` must be for the same window, and each for a different skin.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -337,7 +337,7 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
 
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
-    """Return the mean of predicted minus true force, the standard error of this mean over contacts, and the slope.
+    """Return the mean of predicted minus true force, the standard error of this mean over contacts, and a slope.
 
     The slope is the least-squares slope of predicted force against true force.
     """
@@ -366,8 +366,8 @@ def late_force(
     if len(contacts[0].true_N) < 2:
         return None
     biases = [force_bias(contacts_of_seed) for contacts_of_seed in contacts]
-    # Standard errors over indentations are averaged over seeds. They do not shrink with the number of seeds, because
-    # all seeds have the same indentations.
+    # Standard errors over indentations are averaged over seeds. More seeds do not make them smaller, because all seeds
+    # have the same indentations.
     means = {name: float(np.mean([bias[name] for bias in biases])) for name in biases[0]}
     means["indentations_n"] = biases[0]["indentations_n"]
     network_bias_N = [force_bias(contact_forces([network]))["bias_N"] for network in window]
@@ -419,8 +419,8 @@ def force_left(early: Readings, late: Readings) -> float | None:
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
     """Return two rms values over channels: the change of field by a contact, and the noise of a no-load reading.
 
-    The change is relative to the no-load reading just before each contact, whatever the policy. The noise is
-    estimated from the differences between successive no-load readings, between which there is little drift.
+    Under every policy, the change is relative to the no-load reading just before the contact. The noise is estimated
+    from differences between successive no-load readings, because little drift occurs between them.
     """
     changes_uT = [subtract(capture.b_uT, capture.noload_uT)[~np.isnan(capture.x_mm)] for capture in captures]
     steps_uT = [np.diff(capture.noload_uT[_first_rows(capture)].astype(float), axis=0) for capture in captures]
@@ -479,8 +479,8 @@ def score_wandering(
 ) -> dict[str, list[dict[str, Any]]]:
     """Test each network again on its last test window, after a random walk has been added to all readings.
 
-    Returns, for each policy, one row per step size of the walk, with mean scores over skins and seeds; `spread`
-    contains the standard deviations.
+    For each policy, returns one row per step size of the walk. A row contains mean scores over skins and seeds;
+    `spread` contains the standard deviations.
     """
     from reskin.models.network import Predictor  # imported here because it imports torch, which takes seconds
 
@@ -533,13 +533,13 @@ EACH_IS_WORSE = '"errors are also higher when no-load measurements are updated b
 OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
-INDENTATION_SES = 2.0  # half-width of the interval over a window's indentations, in standard errors (about 95 %)
+INDENTATION_SES = 2.0  # half-width, in standard errors, of the 95 % interval over a window's indentations
 ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # MSE_F is absent if forces are unknown
 PER_CONTACTS_N = 10_000
 
 
 class Comparison(NamedTuple):
-    """Differences of a quantity between paired networks; they are positive if the paper's statement is right."""
+    """Differences of a quantity between paired networks, which are positive if the paper's statement is right."""
 
     text: str
     over_boards: Stat
@@ -627,8 +627,8 @@ def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float
 def late_bias(late: Mapping[str, Any]) -> Comparison:
     """Compare the force bias after many contacts with 0.
 
-    The interval over training runs is widened to two standard errors over indentations if these are larger; it is None
-    if there is only one network.
+    The interval over training runs is widened, where necessary, to extend by two standard errors over indentations to
+    each side of the bias. It is None if there is only one network.
     """
     over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
     reach_N = INDENTATION_SES * late["bias_se_N"]
@@ -639,7 +639,7 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
 
 
 def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Combine the verdicts of all comparisons into the verdicts of a finding: over boards, and over training runs."""
+    """Combine the verdicts of all comparisons into two verdicts on a finding: over boards, and over training runs."""
     judged = combine_verdicts([verdict(comparison.over_boards) for comparison in comparisons])
     trainings = [comparison.over_trainings for comparison in comparisons]
     of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])
@@ -741,7 +741,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
 
 
 def _error(numbers: Mapping[str, Any]) -> str:
-    """Return the name of the error to show beside accuracy: of the force, or of the place if no force is known."""
+    """Return the name of the error shown beside accuracy: of the force or, if no force is known, of the place."""
     [(_, rows), *_] = _policies(numbers).values()
     return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
 

@@ -27,9 +27,9 @@ from reskin.metrics import score
 from reskin.models.trained import networks_held_out
 
 WINDOW_N = 5  # number of readings that the paper averages for a press at rest (section 3)
-FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose place is hard to estimate
+FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, from which places are hard to estimate
 BINS_N = 5  # number of ranges of duration for which presses are scored separately
-LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # lags of the predicted force that are tried
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidate lags of the predicted force
 METHODS = ("one", "mean5", "mean5_of_middle")
 
 Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]  # dB in uT -> x and y in mm, F in N
@@ -84,7 +84,7 @@ def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) ->
 
 
 def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]:
-    """Average each row with the four rows before it, or with all earlier rows if there are fewer than four."""
+    """Average each row with the four rows before it, or with all rows before it if these are fewer than four."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0, dtype=np.float64)])
     end = np.arange(1, len(values) + 1)
     start = np.maximum(end - WINDOW_N, 0)
@@ -95,7 +95,7 @@ def score_presses(presses: Presses, networks: Sequence[Predict], *, board: str) 
     """Score estimates from each reading alone and from the mean of the last five readings.
 
     The estimate from the mean is also compared with the true values at the middle one of its five readings. All presses
-    are on one skin of this `board`, so the comparison of the first two methods (`paired`) has no confidence interval.
+    are on one skin of `board`. Therefore `paired`, which compares the first two methods, has no confidence interval.
     """
     mean_uT = running_mean(presses.db_uT).astype(np.float32)
     single, averaged = ([network(inputs_uT) for network in networks] for inputs_uT in (presses.db_uT, mean_uT))
@@ -125,7 +125,7 @@ def score_presses(presses: Presses, networks: Sequence[Predict], *, board: str) 
 def _scores(
     presses: Presses, predictions: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
 ) -> dict[str, Any]:
-    # The middle one of the last five readings is two rows earlier. It is of the same press if the row is scored.
+    # The middle reading of the last five is two rows earlier. If a row is scored, this reading is of the same press.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
     true = {"one": presses.true[rows], "mean5": presses.true[rows], "mean5_of_middle": presses.true[middle]}
     scores = {
@@ -156,7 +156,7 @@ def lag_ms(
 ) -> float:
     """Return the delay in ms at which the delayed true force, times a constant, fits the predicted force best.
 
-    For each candidate delay in `LAGS_MS`, the constant is fitted by least squares.
+    The constant is fitted by least squares for each candidate delay in `LAGS_MS`.
     """
     delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
     explained = (delayed_N @ predicted_N) ** 2 / (delayed_N**2).sum(axis=1)

@@ -38,8 +38,8 @@ from reskin.seeds import rng_for
 DEPTH_DECIMALS = 2  # commanded depths in mm are rounded to this many decimals
 DRAWN_N = 400  # number of points in a panel of the figure
 FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
-# Optional recipe whose inputs are the direction and length of dB; expected to depend less on the gap between skin and
-# chips.
+# Optional recipe whose inputs are the direction and length of dB. Its networks are expected to depend less on the gap
+# between skin and chips.
 SHAPE = "shape"
 
 
@@ -119,7 +119,7 @@ def gaps(data: SceneData) -> dict[str, Any]:
 
 
 def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, Any]:
-    """Summarise over boards: the scores and the force bias of each variant, and the change of scores by adaptation."""
+    """Summarise scores and force bias of each variant, and the change of scores by adaptation, over boards."""
     differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(predictions, AFTER, BEFORE)}
     return summarise_variants(predictions) | force_biases(predictions) | {"paired": differences}
 
@@ -153,7 +153,7 @@ OF_SHAPE = "direction and length of the change of field (ours): "
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the variants of the paper's recipe, and those of recipe `shape` if the scene has it."""
+    """Tabulate the variants of the paper's recipe and, if the scene has recipe `shape`, of this recipe."""
     lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
     if SHAPE in numbers:
         shape_numbers = numbers[SHAPE]

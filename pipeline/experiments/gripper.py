@@ -1,4 +1,4 @@
-"""Gripper: force control by the force estimates of networks or of the universal model (paper section 6).
+"""Gripper: force control with the force estimates of networks or of the universal model (paper section 6).
 
 A simulated gripper squeezes objects of several stiffnesses. The true force is compared with the intended force (the
 aim). The force estimates are used without correction, or are corrected with one press of known force.
@@ -31,14 +31,14 @@ from reskin.seeds import rng_for
 from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
-# Rate of the controller, duration of a run, and time after which forces are scored.
+# Rate of the controller, duration of a run, and the time in a run after which forces are scored.
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0
 SWING = 3.0  # an object's stiffness varies between a third of its nominal value and three times this value
-# Assumed indentation of the skin by a force of 1 N with a round tip; it grows as in Hertz's law. It affects how fast a
-# force is reached, but not which force is reached.
+# Assumed indentation of the skin by a round tip with a force of 1 N; for other forces, the indentation follows Hertz's
+# law. It affects how fast a force is reached, but not which force is reached.
 DEPTH_OF_1_N_MM = 0.8
-READINGS_N = 5  # number of readings averaged for the press of known force, as for each indentation (paper section 3)
-WITHIN = 0.1  # tolerance of the held force, relative to the aim; our choice, because the paper states none
+READINGS_N = 5  # readings averaged for the press of known force, as the paper does for indentations (section 3)
+WITHIN = 0.1  # tolerance of the held force, relative to the aim; assumed, because the paper states none
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
 Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # dB in uT -> x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
@@ -54,7 +54,7 @@ class Gripper(Strict):
 
 @dataclass(frozen=True)
 class Finger:
-    """The skin on a gripper's finger: depth and change of field for each force at its middle; the first force is 0."""
+    """The skin on a gripper's finger: depth and field change for each force at its middle; the first force is 0."""
 
     board: str
     force_N: Float64[np.ndarray, " p"]
@@ -71,7 +71,7 @@ class Finger:
     def squeezed_N(
         self, closed_mm: Float64[np.ndarray, " r"], stiffness_N_mm: Float64[np.ndarray, " r"]
     ) -> Float64[np.ndarray, " r"]:
-        """Return the force on skin and object (in series) of each run, when the gripper has closed by `closed_mm`."""
+        """Return each run's force on skin and object, which are in series, after the gripper closed by `closed_mm`."""
         return np.array([
             np.interp(closed, self.depth_mm + self.force_N / stiffness, self.force_N)
             for closed, stiffness in zip(closed_mm, stiffness_N_mm, strict=True)
@@ -117,7 +117,7 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
 
 def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
-    """Yield every force estimator: name of the model, use of the press of known force, and function of readings."""
+    """Yield every force estimator: its model's name, use of the press of known force, and function of readings."""
     unlabelled = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])
@@ -138,7 +138,7 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
 
 def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
-    """Scale the estimates by a factor that makes the estimate for the press of known force correct."""
+    """Scale all estimates by the factor that makes the estimate for the press of known force correct."""
     factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)  # networks may predict 0 or less
     return lambda b_uT: factor * estimate(b_uT)
 
@@ -146,7 +146,7 @@ def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
 def hold(
     finger: Finger, estimate: Estimate, aim_N: float, section: Gripper, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f r"]:
-    """Simulate one run per object stiffness; return the true force by control step (rows) and run (columns)."""
+    """Simulate one run per object stiffness; return the true forces, with control steps as rows and runs as columns."""
     nominal_N_mm = np.array(section.stiffness_N_mm)
     closed_mm, force_N = np.zeros(len(nominal_N_mm)), np.zeros(len(nominal_N_mm))
     touch_uT = finger.noise_uT * (np.sqrt(len(finger.noload_uT)) + CONTACT_SDS)

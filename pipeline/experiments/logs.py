@@ -1,7 +1,7 @@
-"""Logs: force and place over time from a log on an SD card, as recorded in a dog shoe or a glove (paper section 6).
+"""Logs: force and place over time from a log on an SD card, such as a log of a dog shoe or a glove (paper section 6).
 
-Networks that were trained without the log's board estimate the contacts from the log. A simulated log is also scored:
-as it is, and as if its board rotated in the earth's field.
+Networks that were trained without the log's board estimate the contacts in the log. A simulated log is also scored,
+both as it is and as if its board rotated in the earth's field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 
-PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of the pitch angle of a shoe during each step
+PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of a shoe's pitch angle during a step
 PERIOD_S = 1.0  # assumed period of the steps for a log with fewer than two contacts
 SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 
@@ -99,8 +99,9 @@ def score_pitches(
 ) -> list[dict[str, Any]]:
     """Score the networks on a log whose board pitches in the earth's field after the quiet start.
 
-    Returns one row per amplitude in `PITCHES_DEG`: the scores as logged, and under `reference_chip` the scores after
-    subtracting the reading of a reference chip. `instrument.noise_uT` is the noise of one reading of that chip.
+    Returns one row per amplitude in `PITCHES_DEG`. A row contains the scores as logged and, under `reference_chip`, the
+    scores after the reading of a reference chip was subtracted. `instrument.noise_uT` is the noise of one reading of
+    that chip.
     """
     period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
     rows = []
@@ -130,8 +131,8 @@ def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) ->
 def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
     """Return the earth's field in the axes of a board that pitches about its y axis.
 
-    At rest, the board's x axis points north. This is the worst direction, because the whole field is in the plane in
-    which the x axis moves.
+    At rest, the board's x axis points north. This direction is the worst case, because the whole field is in the plane
+    in which the x axis moves.
     """
     return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
 

@@ -45,11 +45,11 @@ from reskin.errors import SchemaError
 from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
 
-GRID = "grid"  # name of the variant that is adapted with the same number of robot pokes instead of hand pokes
+GRID = "grid"  # name of the variant that is adapted with equally many robot pokes instead of hand pokes
 
 
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt networks to every skin with its hand pokes, and with equally many robot pokes; test on the robot's grid."""
+    """Adapt networks to every skin with its hand pokes, or with equally many robot pokes; test on the robot's grid."""
     preload_training()
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)

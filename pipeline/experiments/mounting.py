@@ -1,8 +1,8 @@
 """How reliably the universal model finds the orientation of a skin and of its labels.
 
 The shipped model is used as a user would use it, on changed data of recorded boards and simulated skins. Fields are
-changed as if the skin had been glued on after a quarter turn, or as if the chips were connected in another order.
-Labels are changed as if their axes were mirrored or turned.
+changed as if the skin had been turned by a quarter before it was glued on, or as if two chips had been exchanged.
+Labels are changed as if their axes had been mirrored or turned.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -54,7 +54,7 @@ class Mounting(Strict):
 
 
 class Skin(NamedTuple):
-    """No-load field and presses of one skin, as the universal model takes them: chips' axes, labels' frame."""
+    """No-load field and presses of a skin, as inputs of the universal model: chip axes, label coordinates."""
 
     name: str
     rest_uT: Float[np.ndarray, " ch"]
@@ -63,7 +63,7 @@ class Skin(NamedTuple):
     force_N: Float[np.ndarray, " m"]
 
     def changed(self, change: str) -> "Skin":
-        """Return the skin with fields as after a change of its mounting."""
+        """Return the skin with the fields that it would have after a change of its mounting."""
         rest_uT, db_uT = (_changed(field_uT, change) for field_uT in (self.rest_uT, self.db_uT))
         return self._replace(rest_uT=rest_uT, db_uT=db_uT)
 
@@ -100,14 +100,14 @@ def mounting(settings: Settings, section: Mounting, indentations: Path, folds: P
 
 
 def skin_of_board(board: BoardPresses) -> Skin:
-    """Return the presses of a recorded board as the universal model takes them."""
+    """Return the presses of a recorded board as inputs of the universal model."""
     presses = raise_forces(board.presses)
     rest_uT, db_uT = to_chips(board.rest_uT[None])[0], to_chips(presses.db_uT)
     return Skin(board.board, rest_uT, db_uT, presses.place_mm + CENTRE_MM, presses.force_N)
 
 
 def simulated_skins(setup: Setup, skins_n: int, seed: int, name: str) -> list[Skin]:
-    """Draw skins from the prior of the shipped model, with errors of the law as in its training.
+    """Draw skins from the prior of the shipped model, with errors of the law as in the training of the model.
 
     name: name of the random stream.
     """
@@ -124,7 +124,7 @@ def simulated_skins(setup: Setup, skins_n: int, seed: int, name: str) -> list[Sk
 
 
 def orientations(skins: Sequence[Skin], seed: int) -> dict[str, Any]:
-    """Count what the model finds from no-load fields, and how many skins have a large misfit of 65 presses."""
+    """Count turned orientations and warnings from no-load fields, and skins whose 65 presses have a large misfit."""
     turned, warned, log_odds, misfits = [], [], [], []
     for skin in skins:
         model = load_universal().zero(skin.rest_uT)
@@ -145,7 +145,10 @@ def percentage(conditions: Iterable[bool]) -> float:
 
 
 def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int, draws_n: int) -> list[dict[str, Any]]:
-    """Return how often a warning names the labels' axes, for each of the eight orientations of these axes."""
+    """Return, for each of the eight orientations of the labels' axes, how often a warning names this orientation.
+
+    If the axes are right, every warning counts, because it is a false alarm.
+    """
     warned: dict[tuple[int, str], list[bool]] = {}
     for skin in skins:
         model = load_universal().zero(skin.rest_uT)
@@ -154,7 +157,7 @@ def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int,
             for labels_n in section.labels_n:
                 chosen = order[:labels_n]
                 for name, matrix in frames().items():
-                    # labels in axes that must be changed by `matrix` to be right
+                    # labels in wrong axes, which `matrix` would correct
                     place_mm = (skin.place_mm[chosen] - CENTRE_MM) @ matrix + CENTRE_MM
                     model.label(place_mm, skin.force_N[chosen], skin.rest_uT + skin.db_uT[chosen])
                     frame = model.label_frame
@@ -169,7 +172,8 @@ def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int,
 def accuracy_rows(board: BoardPresses, section: Mounting, seed: int) -> list[dict[str, Any]]:
     """Score places on a recorded board, as recorded and turned, with and without the check of the orientation.
 
-    Protocol: 65 unlabelled presses at random places; labels at places of one colour of a checkerboard, tests at others.
+    The calibration uses 65 unlabelled presses at random places. Labels are at places of one colour of a checkerboard,
+    and tests at places of the other colour.
     """
     rows = []
     for change in (AS_RECORDED, TURNED):

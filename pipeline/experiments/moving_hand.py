@@ -1,12 +1,12 @@
 """Contacts and places of the universal model on a moving hand, with and without `external_uT`.
 
-When a robot moves a skin, the earth's field turns relative to it, and magnets and other skins come near. The experiment
-counts how often such a change of the field is mistaken for a contact, and how much it shifts the estimated place of a
-press. Column `source` of the tables states the kind of each result:
+When a robot moves a skin, the earth's field turns relative to the skin, and magnets and other skins come near. The
+experiment counts how often such a change of the field is mistaken for a contact, and how much it shifts the estimated
+place of a press. Column `source` of the tables states the kind of each result:
 
 - *recorded*: changes of the field at the pads of a hand that moves without contact;
 - *superposed*: recorded presses of other boards, plus recorded changes of the hand. A superposition contains the noise
-  of both recordings, and no effect of a press on the hand;
+  of both recordings, but no effect of a press on the hand;
 - *simulated*: skins from the prior of the shipped model, in fields that are computed.
 """
 
@@ -54,11 +54,11 @@ Size_uT = Annotated[float, Field(ge=0, le=10_000)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
-MOVING_COUNTS = 5  # joints whose positions have a smaller standard deviation are at rest: only their noise changes
-TOUCH_STEP = 20  # every twentieth reading of the boards is a touch; a press has 100 nearly equal readings
+MOVING_COUNTS = 5  # joints whose positions have a smaller standard deviation, from noise, are at rest
+TOUCH_STEP = 20  # every twentieth reading of the boards is used as a touch; a press has 100 nearly equal readings
 NO_FIELD, TURNED, MAGNET = "none", "turned in the earth's field", "beside a moving magnet"
 OTHER, FIRST_HALF = "the other recording", "the first half"
-# Candidates for the most likely distance and size of the fields that a pad experiences
+# Candidate distances of sources, and candidate sizes, of the fields that a pad experiences
 DISTANCES_MM = (30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 85.0, 100.0, 150.0, 300.0)
 SIZES_uT = (5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0, 140.0, 200.0, 280.0)
 
@@ -69,8 +69,8 @@ Row = dict[str, Any]
 class Group(Strict):
     """Recordings of pads in one situation.
 
-    Each pad is a capture in `threshold`, on which thresholds are set, and the capture with the same position in
-    `tested`.
+    A pad has two captures at the same position of `threshold` and `tested`. The first sets thresholds, and the second
+    is tested.
     """
 
     name: str
@@ -82,7 +82,7 @@ class MovingHand(Strict):
     """Section moving_hand: recordings of the hand, sizes of fields, and numbers of draws."""
 
     groups: Annotated[tuple[Group, ...], Field(min_length=1)]
-    pad_chips: tuple[int, int, int, int, int]  # for each chip of the board of `presses`, the chip of a pad
+    pad_chips: tuple[int, int, int, int, int]  # chip of a pad for each chip of the board of `presses`
     external_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # values of the option, for contacts
     compensated_uT: tuple[Size_uT, ...]  # values of the option with compensation learnt from joint positions
     boosting_iterations_n: Count
@@ -90,12 +90,12 @@ class MovingHand(Strict):
     detected_fraction: Fraction
     places_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # values of the option, for places
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-    draws_n: Count  # of presses and labels of each board
-    readings_n: Count  # tested in each draw
+    draws_n: Count  # number of draws of presses and labels, for each board
+    readings_n: Count  # number of tested readings in each draw
     skins_n: Annotated[int, Field(ge=2, le=10_000)]  # simulated
-    changes_n: Count  # of the external field, for each simulated skin
-    turned_uT: Size_uT  # field in which a simulated skin is turned
-    magnet_uT: Size_uT  # root mean square of the component of the magnet's field where it is nearest
+    changes_n: Count  # number of changes of the external field, for each simulated skin
+    turned_uT: Size_uT  # size of the field in which a simulated skin is turned
+    magnet_uT: Size_uT  # rms of a component of the magnet's field at its smallest distance
     magnet_mm: tuple[Annotated[float, Field(ge=20)], Annotated[float, Field(ge=20)]]  # smallest and largest distance
     presses: Compare  # orientation of the boards with presses, and their skin
 
@@ -113,7 +113,7 @@ class MovingHand(Strict):
 
 @dataclass(frozen=True)
 class Pad:
-    """A recording of one pad: changes of the field and joint positions, row by row, and the noise of a channel."""
+    """A recording of one pad: field changes and joint positions in each row, and the noise of a channel."""
 
     db_uT: Changes
     joint_counts: Float[np.ndarray, "f j"]
@@ -207,7 +207,7 @@ def read_boards(settings: Settings, section: Compare, captures: Sequence[Reading
 
 
 def describe_pad(capture: str, pad_name: str, pad: Pad) -> Row:
-    """Return the noise and the changes of one recording, and the most likely distance and size of their source."""
+    """Return noise and field changes of one recording, and the most likely distance and size of the changes' source."""
     length_uT = np.linalg.norm(pad.db_uT, axis=1)
     distance_mm, size_uT = find_source(to_board(pad.db_uT), pad.noise_uT)
     return {
@@ -218,7 +218,7 @@ def describe_pad(capture: str, pad_name: str, pad: Pad) -> Row:
 
 
 def find_source(db_uT: Changes, noise_uT: float) -> tuple[float, float]:
-    """Return the candidates of distance and size of a dipole with the largest likelihood, for changes in board axes."""
+    """Return the candidate distance and size of a source with the largest likelihood; changes are in board axes."""
     second_uT2 = db_uT.T @ db_uT / len(db_uT)
     likelihoods = {}
     for distance_mm in DISTANCES_MM:
@@ -250,10 +250,10 @@ def contact_rows(group: str, pairs: Sequence[Pair], touches_uT: Changes, section
 
 
 def compensate(learner: str, trained_on: str, pair: Pair, boosting_iterations_n: int) -> Pair:
-    """Subtract the changes that a regression predicts from the joint positions.
+    """Subtract the field changes that a regression predicts from the joint positions; only moving joints are inputs.
 
-    It is trained on the pad's other recording, or on the first half of the tested one; then the threshold is set on the
-    first half, and tested on the second half. Only joints that move are inputs.
+    The regression is trained on the pad's other recording, or on the first half of the tested recording. The threshold
+    is then set on the first half of the tested recording, and tested on the second half.
     """
     from sklearn.ensemble import HistGradientBoostingRegressor
     from sklearn.linear_model import RidgeCV
@@ -282,11 +282,11 @@ def compensate(learner: str, trained_on: str, pair: Pair, boosting_iterations_n:
 def count_contacts(
     pairs: Sequence[Pair], touches_uT: Changes, external_uT: float, section: MovingHand, rng: np.random.Generator
 ) -> Row:
-    """Count contacts per 100 readings at the threshold of live, and at thresholds for the stated detection rate.
+    """Count contacts per 100 readings at the threshold of `reskin live`, and at thresholds for a stated detection rate.
 
-    Each touch is a recorded press, times a factor, plus a random change of a random pad. The threshold for a factor is
-    the strength that `detected_fraction` of the touches exceed, with changes of the rows for the threshold; detection
-    is then counted with changes of the tested rows.
+    Each touch is a recorded press, times a factor, plus a random change of a random pad. Each factor has its own
+    threshold, which is set with changes from the rows for thresholds, such that `detected_fraction` of the touches
+    exceed it. Detected touches are then counted with changes from the tested rows.
     """
     model = load_universal(external_uT=external_uT)
     matrices = [[model.suppressor(pad.noise_uT) for pad in pair] for pair in pairs]
@@ -317,8 +317,8 @@ def count_contacts(
 def live_threshold(noise_uT: float, suppressor: Float[np.ndarray, "15 15"] | None) -> float:
     """Return the strength above which `reskin live` reports a contact, for the noise of one channel.
 
-    Live adds `CONTACT_SDS` to the median strength of many no-load readings. Noise alone makes that strength about as
-    large as the root mean square used here.
+    `reskin live` adds `CONTACT_SDS` times the noise to the median strength of many no-load readings. This function
+    replaces the median by the root mean square strength of noise alone, which is about as large.
     """
     channels_n = 3 * len(CHIPS_MM) if suppressor is None else float((suppressor**2).sum())
     return noise_uT * (np.sqrt(channels_n) + CONTACT_SDS)
@@ -339,20 +339,21 @@ def draw_fields(skin: Skin, section: MovingHand, seed: int) -> dict[str, Changes
 
 
 def turn(field_uT: float, n: int, rng: np.random.Generator) -> Changes:
-    """Draw changes of a uniform field on a board that is turned from one random orientation to n others."""
+    """Draw changes of a uniform field on a board that is turned from one random orientation to n other orientations."""
     direction = _directions(1 + n, rng)
     return to_chips(np.tile(field_uT * (direction[1:] - direction[0]), len(CHIPS_MM)))
 
 
 def move_magnet(size_uT: float, distance_mm: tuple[float, float], n: int, rng: np.random.Generator) -> Changes:
-    """Draw changes of the field of a magnet that moves from one random position relative to the board to n others.
+    """Draw field changes of a magnet that moves from one random position relative to the board to n other positions.
 
-    The magnet is a dipole of constant size, turned at random. Its position is uniform in distance from the board's
-    centre and random in direction. size_uT: root mean square of a component of its field at the smallest distance.
+    The magnet is a dipole of constant size in random orientation. Its distance from the board's centre is uniformly
+    distributed, and its direction is random. size_uT: root mean square of a component of the magnet's field at the
+    smallest distance.
     """
     near_mm, far_mm = distance_mm
     places_m = 1e-3 * rng.uniform(near_mm, far_mm, (1 + n, 1)) * _directions(1 + n, rng)
-    # The mean square of |B| of a dipole, over all directions, is 2 (mu0/4pi m / d^3)^2.
+    # The mean square of |B| of a dipole with moment m at distance d, over all directions, is 2 (mu0/4pi m / d^3)^2.
     moment_A_m2 = 1e-6 * size_uT * np.sqrt(3 / 2) * (1e-3 * near_mm) ** 3 / MU0_4PI * _directions(1 + n, rng)
     chips_m = 1e-3 * np.column_stack([CHIPS_MM, np.zeros(len(CHIPS_MM))])
     field_uT = 1e6 * np.moveaxis(field_of_each(places_m, moment_A_m2, chips_m), 1, 0).reshape(1 + n, -1)
@@ -367,7 +368,7 @@ def _directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
 def simulated_contact_rows(
     skins: Sequence[Skin], fields_uT: Sequence[Mapping[str, Changes]], section: MovingHand, seed: int
 ) -> list[Row]:
-    """Count false contacts on simulated skins, and detected presses: a threshold is set on every other skin."""
+    """Count false contacts and detected presses on simulated skins; every second skin sets the threshold."""
     noise_uT = float(np.sqrt(np.mean(np.square(NOISE_uT))))
     sd_uT = np.tile(NOISE_uT, len(CHIPS_MM))
     rows = []
@@ -403,9 +404,10 @@ def _above_pct(strengths_uT: Sequence[Float[np.ndarray, " f"]], limit_uT: float)
 
 
 def board_rows(board: BoardPresses, fields_uT: Mapping[str, Changes], section: MovingHand, seed: int) -> Iterator[Row]:
-    """Score superpositions of a board's presses and changes of the hand; the model is calibrated at rest.
+    """Score superpositions of a board's presses and field changes of the hand; the model is calibrated at rest.
 
-    Protocol: 65 unlabelled presses at random places; labels at places of one colour of a checkerboard, tests at others.
+    The calibration uses 65 unlabelled presses at random places. Labels are at places of one colour of a checkerboard,
+    and tests at places of the other colour.
     """
     skin = skin_of_board(board)
     readings_uT = to_chips(board.readings.db_uT)
@@ -463,7 +465,7 @@ def score_places(
 
 
 def summarise_places(rows: Sequence[Row], unit: str) -> list[Row]:
-    """Average over draws, then summarise over units, which are boards or simulated skins."""
+    """Average scores over draws, then summarise them over units, which are boards or simulated skins."""
     keys = ["field", "external_uT", "labels_n"]
     summary = []
     for key, group in pd.DataFrame(rows).groupby(keys, sort=False):
@@ -521,7 +523,7 @@ RECORDED, SUPERPOSED, SIMULATED = "recorded", "superposed", "simulated"
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate recorded, superposed and simulated results, each kind in tables of its own."""
+    """Tabulate recorded, superposed and simulated results in separate tables."""
     detected, (near_mm, far_mm) = 100 * numbers["detected_fraction"], numbers["magnet_mm"]
     simulated = OF_SIMULATED.format(
         skins_n=numbers["skins_n"], turned=numbers["turned_uT"], near=near_mm, far=far_mm, magnet=numbers["magnet_uT"]
@@ -602,7 +604,7 @@ def _place_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[Row]:
         for name, title in (("accuracy_pct", "within 1 mm, %"), ("mse_xy_mm2", "MSE_xy, mm²")):
             line[option + title] = show(row[name])
         line[option + "in 90 % interval, %"] = round(row["coverage_pct"]["mean"])
-    alone = RECORDED if source == SUPERPOSED else source  # without a change, nothing is superposed
+    alone = RECORDED if source == SUPERPOSED else source  # without a change of field, nothing is superposed
     return [line | {"source": alone if field == NO_FIELD else source} for (field, _), line in lines.items()]
 
 

@@ -38,10 +38,10 @@ WARMER_K = 1.0  # rise of the skin's temperature
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # the earth's field at a middle latitude
 # Places of the indentations for effects inside the skin: between middle and edge, and near the edge.
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))
-BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of magnetic powder, to compute the powder's own field
+BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of magnetic powder, whose own field is computed
 FRICTION = Friction(coefficient=0.8)  # between skin and tip; assumed, within a range of 0.5 to 1.2
 FEW = 5  # number of indentations for effects that take long to compute
-COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects whose computation tracks every node separately
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects that are computed by tracking every node separately
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class Effect:
     rest_uT: float | None
     force_pct: float | None
     how: str
-    # Names of the protocols that neglect the effect, and of those that compute it. Both are empty if protocols cannot
-    # choose whether the effect is computed.
+    # Names of the protocols that neglect the effect, and of the protocols that compute it. Both are empty if a protocol
+    # cannot choose whether the effect is computed.
     left_out_by: tuple[str, ...] = ()
     computed_by: tuple[str, ...] = ()
 
@@ -159,7 +159,7 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate how the base holds the skin: compare with an infinite linearly elastic layer that slides freely."""
+    """Evaluate the hold of the base, by comparison with an infinite linearly elastic layer that slides freely."""
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
@@ -173,10 +173,10 @@ def _hold(subject: Subject) -> list[Effect]:
 
 
 def _free_edge(subject: Subject) -> list[Effect]:
-    """Evaluate the free edge: compare the simulated infinite layer with a disc of radius R whose edge is free.
+    """Evaluate the free edge, by comparison of the simulated infinite layer with a disc of radius R whose edge is free.
 
-    With a constant c, material at radius r moves outwards by c / r in the infinite layer, and by
-    c / r + c r / (3 R^2) in the disc.
+    Material at radius r moves outwards by c / r in the infinite layer, where c is a constant. In the disc, it moves
+    outwards by c / r + c r / (3 R^2).
     """
     if subject.skin.base == "bonded":
         return []
@@ -199,7 +199,7 @@ def _free_edge(subject: Subject) -> list[Effect]:
 
 
 def _inside(subject: Subject) -> list[Effect]:
-    """Evaluate parts of the deformation model: omit or change one part at a time, for a few indentations."""
+    """Evaluate parts of the deformation model by omitting or changing one part at a time, for a few indentations."""
     skin, depth_m = subject.skin, float(subject.tip_m[..., 2].max()) + subject.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
@@ -233,7 +233,8 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
     """Return the displaced nodes under each indentation, for an indentation in small steps.
 
-    A single call to `follow` tracks the nodes of all indentations, because the contact pressures are the same.
+    A single call to `follow` tracks the nodes of all indentations, because all indentations have the same contact
+    pressures.
     """
     r_m = np.concatenate([np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(subject.coarse.nodes_m[:, 2], len(PLACES_M))
@@ -273,7 +274,7 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     """Evaluate, to first order, the effect of the powder's own field on the magnetisation of the powder.
 
-    The field of the powder is that of uniformly magnetised boxes (magpylib).
+    The powder's field is computed as the field of uniformly magnetised boxes (magpylib).
     """
     rest = midpoints(subject.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, subject.skin.thickness_m, simulation.skin.polarity)
@@ -297,7 +298,7 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
 def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
     """Return the effect of depths beyond 0.6 of the thickness, which published solutions do not cover.
 
-    No error is known; the description states the percentage of stops at such depths, over all skins.
+    The error at such depths is unknown. The description states the percentage of stops at such depths, over all skins.
     """
     depth_m = milli * simulation.main.plan(rng_for(seed, "left out"), simulation.main_boards.skin_mm).depth_mm.ravel()
     skins = [

@@ -1,8 +1,8 @@
 """The universal model, built from simulated skins alone and tested on held-out skins of a simulated scene.
 
-The model is calibrated to each skin with its no-load field, unlabelled presses and labelled presses. Estimated forces
-are also corrected with a press by one known weight. Networks trained on different numbers of simulated skins show how
-the error depends on this number.
+The model is calibrated to each skin with the skin's no-load field, unlabelled presses and labelled presses. Estimated
+forces are also corrected with one known weight, which is put on the skin. Networks trained on different numbers of
+simulated skins show how the error depends on this number.
 """
 
 import hashlib
@@ -51,22 +51,22 @@ from reskin.universal.model import Evaluation, PriorModel
 from reskin.universal.network import Weights, draw_weights
 from reskin.universal.population import PLACES_N, Forces, Population, draw_population
 
-EXPERIMENT = "lobo"  # experiment whose folds are used, with the pools of unlabelled pokes from adaptation
+EXPERIMENT = "lobo"  # experiment whose folds are used; their pools contain the unlabelled pokes
 POOL_MAX_N = 65  # one press at each place of the paper's grid, at any of the depths pressed there
 TESTED_MAX_N = 2000  # at most this number of test rows per skin, drawn at random
-CALIBRATION_SKINS_N = 16  # simulated skins for choosing likelihood powers and weight shares
+CALIBRATION_SKINS_N = 16  # simulated skins that determine likelihood powers and weight shares (see `Calibration`)
 FRESH_N = 32  # further simulated skins for measuring the coverage of intervals
 BY = ("way", "pokes_n", "labels_n")
 WAYS = ("map", "universal", "network")  # the map alone, map and networks, the networks alone
 WEIGHT_N = 5.0  # known weight (500 g) on the skin's middle, the place most informative about forces at other places
-WEIGHT_SD = 0.02  # sd of the log of the assumed force, from friction in the weight's guide and the error of its mass
+WEIGHT_SD = 0.02  # sd of the log of the assumed force: friction in the weight's guide, and error of its mass
 LOG_FORCE_MIN_N = 0.2  # presses with less force hardly change the field; they are left out of errors of log F
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINING_MODULE = "reskin.universal.training"
 PART_N = 100  # number of skins in one cached array
 LOG_FORCE_STEP = 0.6  # largest step of log F between two tabulated forces
-FORCE_SHARES = (0.7, 1.5)  # factors for the design's smallest and largest force, because skins differ from it
+FORCE_SHARES = (0.7, 1.5)  # factors that widen the design's range of forces, because skins differ from the design
 
 
 class CalibrationSize(NamedTuple):
@@ -79,9 +79,9 @@ class CalibrationSize(NamedTuple):
 class PopulationSettings(Strict):
     """Settings section `population`.
 
-    skins_n: number of simulated training skins of each network; all networks use the first skins of one population.
-    steps_n: steps of each training run. unlabelled_n, labels_n: numbers of unlabelled and labelled presses that the
-    model is calibrated to.
+    skins_n: number of simulated training skins of each network; a network uses the first skins of a population that all
+    networks share. steps_n: steps of each training run. unlabelled_n, labels_n: numbers of unlabelled and of labelled
+    presses to which the model is calibrated.
     """
 
     skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
@@ -90,7 +90,7 @@ class PopulationSettings(Strict):
     labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
 
     def sizes(self) -> list[CalibrationSize]:
-        """List all numbers of unlabelled presses without labels, then the largest with each number of labels."""
+        """List all numbers of unlabelled presses without labels, then the largest number with each number of labels."""
         most_n = max(self.unlabelled_n)
         return [CalibrationSize(n, 0) for n in self.unlabelled_n] + [CalibrationSize(most_n, n) for n in self.labels_n]
 
@@ -144,7 +144,7 @@ def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, 
 
 
 def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -> Population:
-    """Draw a population of `skins_n` training skins in parts, each of which is cached; report after each part."""
+    """Draw a population of `skins_n` training skins in parts; cache each part, and report when it is done."""
     parts = []
     for first in range(0, skins_n, PART_N):
         which = slice(first, min(first + PART_N, skins_n))
@@ -213,7 +213,7 @@ class TestSkin:
 
     board: str
     rest_uT: Float[np.ndarray, " ch"]
-    pool: LabelledPresses  # presses for calibration, which uses the first of them
+    pool: LabelledPresses  # presses for calibration, which may use only the first ones
     weight: KnownWeight
     test_uT: Float[np.ndarray, "n ch"]
     true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
@@ -240,7 +240,7 @@ def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str,
 
 
 def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> LabelledPresses:
-    """Draw one indentation at each place; return presses that are the means of these indentations' readings."""
+    """Draw one indentation at each place; return presses, each of which is the mean of an indentation's readings."""
     rows = data.rows
     first = np.unique(rows.indentation[own], return_index=True)[1]
     _, place_i = np.unique(rows.target[own[first], :2].round(2), axis=0, return_inverse=True)
@@ -253,9 +253,9 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
 
 
 def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> KnownWeight:
-    """Return the press that serves as the known weight.
+    """Return the press that serves as the press of the known weight.
 
-    Among the presses nearest to the skin's middle, it is the one whose force is nearest to `WEIGHT_N`.
+    This is the press whose force is nearest to `WEIGHT_N`, among the presses nearest to the skin's middle.
     """
     rows = data.rows
     off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
@@ -272,7 +272,7 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
 
 
 def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> KnownWeight:
-    """Return a press as a press by a known weight; its assumed force is drawn around the true force."""
+    """Return a press as if a known weight had caused it; its assumed force is drawn around the true force."""
     return KnownWeight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 
@@ -287,8 +287,8 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
 def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
     """Return the skins of a simulated population as test skins, with noise added to their field changes.
 
-    The first `PLACES_N` presses (on the grid) are the pool, the last one is the press of the known weight, and all
-    others are test presses.
+    The first `PLACES_N` presses (on the grid) are the pool, the last press is that of the known weight, and all other
+    presses are test presses.
     """
     tested = []
     for i in range(len(skins)):
@@ -307,7 +307,8 @@ def estimate(
 ) -> list[dict[str, Estimate]]:
     """Calibrate a model to a skin; estimate its test presses and, last, the press by the known weight.
 
-    Returns, for each mapping in `powers`, a mapping from way (map, universal, network) to estimate.
+    `powers` contains mappings from way (map, universal, network) to likelihood power. For each of them, a mapping from
+    way to estimate is returned.
     """
     labels = skin.pool[: size.labels_n]
     labels = replace(labels, force_N=np.maximum(labels.force_N, model.skin.tables.force_N[0]))
@@ -326,7 +327,8 @@ def estimate(
 class Calibration:
     """For each way (map, universal, network): the likelihood power, and the correction of forces by a known weight.
 
-    weight_share: fraction of the error of log F for the weight that is added to log F of all presses.
+    weight_share: the error log(true / estimated F) of the known weight, times this fraction, is added to log F of all
+    presses.
     """
 
     power: Mapping[str, float]
@@ -336,7 +338,8 @@ class Calibration:
 def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: CalibrationSize) -> Calibration:
     """Choose likelihood powers and weight shares on simulated skins that are not scored."""
     covered = {way: np.zeros((len(BOARD_POWERS), len(skins))) for way in WAYS}
-    # Errors of log F by power and skin: for the weight (index 0), and the mean over test presses (index 1).
+    # Errors of log F by power and skin. Index 0 is the error for the known weight, and index 1 the mean error over test
+    # presses.
     log_force_errors = {way: np.zeros((len(BOARD_POWERS), 2, len(skins))) for way in WAYS}
     candidates = [dict.fromkeys(WAYS, power) for power in BOARD_POWERS]
     for j, skin in enumerate(skins):
@@ -350,7 +353,7 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 
 
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
-    """Return the least-squares slope, over skins, of the other presses' error in log F against the weight's error."""
+    """Return the factor of the weight's error in log F that best fits the test presses' mean error, over skins."""
     return float(weight_off @ others_off / (weight_off @ weight_off))
 
 
@@ -359,8 +362,8 @@ def score_skin(
 ) -> list[dict[str, Any]]:
     """Score each way (map, universal, network) on a skin.
 
-    The error of forces is also computed after two corrections: by the known weight, and, as a diagnosis, by the factor
-    that fits the true forces best.
+    The error of forces is also computed after a correction by the known weight. As a diagnosis, it is also computed
+    after a correction by the factor that fits the true forces best.
     """
     rows = []
     (by_way,) = estimate(model, skin, size, [calibration.power])
@@ -380,7 +383,7 @@ def score_skin(
 
 
 def _off_log_N(estimated: Estimate, skin: TestSkin) -> tuple[float, float]:
-    """Return the error log(true / estimated F) for the weight, and its mean over test presses."""
+    """Return the error log(true / estimated F) for the known weight, and the mean error over test presses."""
     felt = skin.true[:, 2] > LOG_FORCE_MIN_N
     weight = np.log(skin.weight.force_N / estimated.force_N[-1])
     return float(weight), float(np.log(skin.true[felt, 2] / estimated.force_N[:-1][felt]).mean())

@@ -1,8 +1,9 @@
 """The universal model on recorded boards, calibrated to presses at random places and tested at other places.
 
-Presses of a held-out board are drawn at random over all places and forces. Their places stay unknown to the model.
-Labels are drawn at random from one part of the places; all tested presses are in the other part. With one known weight,
-the only label is a press in the middle of the skin.
+Unlabelled presses of a held-out board are drawn at random over all places and forces; the model does not know their
+places. Labels are drawn at random from one part of the places; all tested presses are in the other part. To test
+calibration with one known weight, the only label is a press in the middle of the skin, as if a user had put the weight
+there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +48,7 @@ from reskin.universal.model import (
     load_universal,
 )
 
-SPACING_MM = 2.0  # of the places; presses are assigned to the nearest place of a grid with this spacing
+SPACING_MM = 2.0  # spacing of places; presses are assigned to the nearest place of a grid with this spacing
 MIDDLE_MM = 1.0  # presses with |x| and |y| below this are in the middle of the skin
 CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
 WEIGHT = "weight"
@@ -74,11 +75,11 @@ class BoardPresses:
 
     @property
     def middle(self) -> Bool[np.ndarray, " m"]:
-        """Which presses are in the middle of the skin."""
+        """Whether each press is in the middle of the skin."""
         return (np.abs(self.presses.place_mm) < MIDDLE_MM).all(axis=1)
 
     def part(self, split: str, draw_i: int) -> Int64[np.ndarray, " m"]:
-        """Return 1 for presses in the part of the places for labels, -1 in the other part, and 0 between the parts.
+        """For each press, return 1 in the part of the skin for labels, -1 in the other part, and 0 between the parts.
 
         The parts alternate from draw to draw.
         """
@@ -91,7 +92,7 @@ class BoardPresses:
 
 @dataclass(frozen=True)
 class Draw:
-    """Indices of the unlabelled presses, of the labels in random order, of the weight, and of the tested readings."""
+    """Indices of unlabelled presses, labels in random order, the press of known weight, and the tested readings."""
 
     unlabelled: Int64[np.ndarray, " n"]
     labels: Int64[np.ndarray, " m"]
@@ -134,9 +135,10 @@ def board_presses(known: KnownBoards, board: str) -> BoardPresses:
 
 
 def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, draw_i: int) -> Draw:
-    """Draw unlabelled presses, labels and the weight at random; all other presses outside the labels' part are tested.
+    """Draw unlabelled presses, labels and the press of known weight at random.
 
-    Raises SchemaError if no press is in the middle of the skin, or if no press is left for the test.
+    The tested presses are all other presses in the part of the skin without labels, except those in the middle. Raises
+    SchemaError if no press is in the middle of the skin, or if no press is left for labels or for tests.
     """
     rng = rng_for(seed, "random presses", split, presses_n, draw_i)
     n, middle = len(board.presses), np.flatnonzero(board.middle)
@@ -179,7 +181,7 @@ def score_draw(
 
 
 def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
-    """Return the labels to calibrate with, and their names: each number of labels and, after 0, the known weight."""
+    """Return sets of labels for calibration, with names: each number of labels and, after 0, the known weight."""
     if max(labels_n, default=0) > len(draw.labels):
         what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
         raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
@@ -192,13 +194,13 @@ def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list
 
 
 def raise_forces(labels: LabelledPresses) -> LabelledPresses:
-    """Raise forces below the smallest force of the map to this force."""
+    """Replace forces below the smallest force of the map by this smallest force."""
     return replace(labels, force_N=np.maximum(labels.force_N, FORCE_MIN_N))
 
 
 @dataclass(frozen=True)
 class CalibratedBoard:
-    """A variant calibrated to the no-load field and the unlabelled presses of a board, and their median misfit."""
+    """A variant calibrated to a board's no-load field and unlabelled presses, and the presses' median misfit."""
 
     calibration: PressCalibration
     misfit: float
@@ -206,7 +208,7 @@ class CalibratedBoard:
     def score(
         self, labels: LabelledPresses, tested: LabelledPresses, powers: LikelihoodPowers, presses_n: int
     ) -> dict[str, float]:
-        """Calibrate to labels and score the tested readings, also with forces that are not calibrated."""
+        """Calibrate to labels and score the tested readings, both with calibrated and with uncalibrated forces."""
         folds, power = self._held_out(labels, powers, presses_n)
         model = self.calibration.with_labels(labels)
         line = line_of_labels(folds)
@@ -239,7 +241,7 @@ class CalibratedBoard:
 
 
 def line_of_combined(folds: Sequence[HeldOutLabels]) -> ForceLine:
-    """Fit the line without a selection of the estimator."""
+    """Fit the calibration line to the combined force estimates, without selecting one estimator."""
     if not folds:
         return prior_line()
     log_N = np.concatenate([fold.evaluation.log_forces()[0] for fold in folds])
@@ -262,7 +264,7 @@ def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str,
     """Score the reference method: place and force of the label with the most similar field change.
 
     Similarity is the Euclidean distance between features: the direction of the field change, and the logarithm of its
-    magnitude. `r2_line_f` is that of a constant, the mean force of the labels.
+    magnitude. `r2_line_f` is the R² of a constant prediction, the mean force of the labels.
     """
     magnitude_uT = [np.linalg.norm(part.db_uT, axis=1, keepdims=True) for part in (labels, tested)]
     pairs = zip((labels, tested), magnitude_uT, strict=True)
@@ -294,7 +296,7 @@ def force_scores(force_N: Float[np.ndarray, " t"], true_N: Float[np.ndarray, " t
 
 
 def score_estimate(estimate: Estimate, tested: LabelledPresses) -> dict[str, float]:
-    """Score estimates of tested readings, and coverage and score of their 90 % intervals."""
+    """Score estimates of tested readings, with coverage and interval score of their 90 % intervals."""
     error_mm, half_width_mm = estimate.place_mm - tested.place_mm, NORMAL_90 * estimate.sd_mm
     error_log = np.log(estimate.force_N / tested.force_N)
     scores = place_scores(error_mm) | force_scores(estimate.force_N, tested.force_N)

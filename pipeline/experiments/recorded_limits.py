@@ -1,8 +1,8 @@
 """Three limits of the recorded boards: rigid registration, shear force, and the smallest detected force.
 
-- *Registration*: a few presses at known places correct a model of another board by a rotation and a shift, as in the
-  procedure published for skins that are mounted again. Other presses of the board test the result.
-- *Shear*: how much of the recorded sideways force can be estimated from the field.
+- *Registration*: a few presses at known places determine a rotation and a shift that correct a model of another board,
+  as in the procedure published for skins that are mounted again. Other presses of the board test the result.
+- *Shear*: the part of the recorded sideways force that can be estimated from the field.
 - *Detection*: the smallest field change and force that can be distinguished from no-load readings.
 """
 
@@ -56,10 +56,10 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 class RecordedLimits(SectionWithRows):
     """Settings section `recorded_limits`.
 
-    known_n, presses_n, draws_n: numbers of presses at known places, of unlabelled presses, and of draws of both.
-    methods: regressors that are trained on the other boards. folds_n: folds of the cross-validation over places.
-    false_alarm_fraction: fraction of no-load readings above the threshold. detected_fraction: fraction of readings in
-    contact above it, for which the smallest force is determined.
+    known_n, presses_n, draws_n: numbers of presses at known places, of unlabelled presses, and of random draws of these
+    presses. methods: regressors that are trained on the other boards. folds_n: folds of the cross-validation over
+    places. false_alarm_fraction: fraction of no-load readings above the threshold. detected_fraction: fraction of
+    contact readings that must be above the threshold at the smallest detected force.
     """
 
     known_n: Annotated[int, Field(ge=2)]
@@ -167,8 +167,8 @@ class Draw:
 def draw_presses(board: BoardPresses, section: RecordedLimits, seed: int, draw_i: int) -> Draw:
     """Draw presses at known places that are far from each other, and unlabelled presses anywhere.
 
-    Tested readings are of all presses that are neither unlabelled nor at one of the known places. Raises SchemaError if
-    the board has too few presses.
+    Tested readings belong to all presses that are neither unlabelled nor at one of the known places. Raises SchemaError
+    if the board has too few presses.
     """
     rng = rng_for(seed, "recorded limits", "known presses", board.board, draw_i)
     place_i = number_places(board.presses.place_mm)
@@ -186,7 +186,7 @@ def draw_presses(board: BoardPresses, section: RecordedLimits, seed: int, draw_i
 
 
 class Predictions(NamedTuple):
-    """Places in the board's frame that several models of one method predict for all readings of a board."""
+    """Predictions by several models of one method: places in the board's frame, for all readings of a board."""
 
     method: str
     place_mm: Sequence[Float[np.ndarray, "f 2"]]  # one array per model
@@ -200,7 +200,7 @@ def predict_by_regressors(
     The models are the networks of stage train_multi, one per seed, and the regressors `methods`.
     """
     data, rows = known.data, known.data.rows
-    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))  # the rows of `board_presses`
+    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))  # the same rows as in `board_presses`
     others = np.flatnonzero(rows.board != board)
 
     def places(predicted: Float32[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 2"]:
@@ -244,7 +244,7 @@ def score_draw(
 def score_universal(
     model: PriorModel, board: BoardPresses, draw: Draw, unlabelled: Int64[np.ndarray, " n"]
 ) -> list[dict[str, Any]]:
-    """Score the universal model without known places, with motions that are fitted to them, and with labels."""
+    """Score the universal model without known places, with motions fitted to known places, and with labels."""
     true_mm, tested_uT = board.readings.place_mm[draw.tested], board.readings.db_uT[draw.tested]
     known, presses_uT = raise_forces(board.presses[draw.known]), board.presses.db_uT[unlabelled]
     calibration = model.calibrate(CalibrationData(board.rest_uT, presses_uT, area_uT=presses_uT))
@@ -256,7 +256,7 @@ def score_universal(
 
 
 def estimate_places(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n 2"]:
-    """Estimate places by map and networks; they do not depend on the likelihood power."""
+    """Estimate places by map and networks; the estimates do not depend on the likelihood power."""
     return model.estimate(db_uT, [1.0])[0].place_mm
 
 
@@ -266,10 +266,10 @@ def score_motions(
     estimated_mm: Float[np.ndarray, "k 2"],
     known_mm: Float[np.ndarray, "k 2"],
 ) -> list[dict[str, Any]]:
-    """Score places of tested readings before and after motions from the estimated to the known places of presses.
+    """Score places of tested readings, as they are and after motions fitted from estimated to known places of presses.
 
-    `rigid_limit_mm2` is the smallest mean squared error that a rigid motion can reach: that of the motion fitted to the
-    tested readings themselves.
+    `rigid_limit_mm2` is the smallest mean squared error that a rigid motion can reach, which is the error of the motion
+    fitted to the tested readings themselves.
     """
     best_mm = fit_rigid(place_mm, true_mm).apply(place_mm)
     limit = {"rigid_limit_mm2": float(((best_mm - true_mm) ** 2).mean())}
@@ -316,7 +316,7 @@ OTHER_BOARD, OTHER_PLACES = "other board", "other places of the same board"
 class ForcePresses:
     """Means over the readings of each press: place as labelled, force on the skin (Fx, Fy, Fz), and field change.
 
-    sd_N is the standard deviation of each force within the press.
+    sd_N is the standard deviation of each force component within a press.
     """
 
     board: np.ndarray
@@ -359,7 +359,7 @@ def evaluate_shear(rows: Rows, section: RecordedLimits, seed: int) -> dict[str, 
 
 
 def shear_regressors(methods: Mapping[str, Classical]) -> list[tuple[str, Classical | None]]:
-    """List the pairs of inputs and regressor; None is the mean of the training presses."""
+    """List the pairs of inputs and regressor; regressor None predicts the mean of the training presses."""
     first = next(iter(methods.values()))
     return [(CONSTANT, None), *((FIELD, method) for method in methods.values()), (PLACE_AND_FORCE, first)]
 
@@ -426,8 +426,8 @@ def explained(
 ) -> float:
     """Return R²: 1 - mean squared error / variance.
 
-    With several groups, the mean over each group is subtracted from true values and errors. With one group, errors keep
-    their mean, so R² is negative if the prediction is worse than the mean of the true values.
+    If there are several groups, the mean over each group is subtracted from true values and errors. If there is one
+    group, errors keep their mean, so that R² is negative if the prediction is worse than the mean of the true values.
     """
     error = predicted - true
     if group.max() > 0:
@@ -452,7 +452,7 @@ def summarise_shear(scored: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
 # --- Smallest detected force ---
 
 EACH, PREVIOUS, START = "before each press", "before the previous press", "at the start of the recording"
-BASELINES = (EACH, PREVIOUS, START)  # no-load reading that is subtracted
+BASELINES = (EACH, PREVIOUS, START)  # names of no-load readings that are subtracted
 BY_RATE, BY_LIVE = "set by false alarms", "as in reskin live"  # rules for the threshold
 
 
@@ -470,7 +470,7 @@ class Recording:
 
 
 def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Recording:
-    """Combine the readings of a capture with its single no-load readings, of which `readings` have only the means."""
+    """Combine the readings of a capture with its single no-load readings; `readings` have only the means of these."""
     header = read_header(raw)
     if header.layout != "lab":
         what = f"capture {readings.capture}: layout {header.layout} has no single no-load readings"
@@ -486,8 +486,8 @@ def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Record
 class Changes(NamedTuple):
     """Field changes relative to one kind of baseline.
 
-    The thresholds are set on the no-load readings of presses with odd numbers (`setting`) and verified on those of the
-    other presses (`verifying`). `contact` and `force_N` are of the readings in contact.
+    Thresholds are set on the no-load readings before presses with odd numbers (`setting`), and verified on the no-load
+    readings before presses with even numbers (`verifying`). `contact` and `force_N` belong to the readings in contact.
     """
 
     setting: Float[np.ndarray, "a ch"]
@@ -499,9 +499,9 @@ class Changes(NamedTuple):
 def changes(recording: Recording, baseline: str) -> Changes:
     """Subtract a baseline from the readings of a recording.
 
-    If each press has its own baseline, a no-load reading is not part of its own baseline: the mean of the other no-load
-    readings of the press is subtracted, and presses with only one are omitted. With the other kinds of baseline, the
-    first press is omitted.
+    If each press has its own baseline, the baseline of a no-load reading is the mean of the press's other no-load
+    readings, so that the reading is not part of its own baseline. No-load readings of presses with only one no-load
+    reading are then omitted. For other kinds of baseline, the first press is omitted.
     """
     mean_uT = mean_by(recording.noload_press_i, recording.noload_uT)
     base_uT = {EACH: mean_uT, PREVIOUS: np.roll(mean_uT, 1, axis=0), START: np.broadcast_to(mean_uT[0], mean_uT.shape)}
@@ -533,10 +533,11 @@ def magnitude(db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, " f"]:
 def needed_changes_uT(
     direction: Float[np.ndarray, "m ch"], noise_uT: Float[np.ndarray, "r ch"], threshold_uT: float
 ) -> Float[np.ndarray, "m r"]:
-    """Return the size that the field change of each press needs to exceed the threshold together with each noise.
+    """For each press and each noise, return the size of the field change that a reading needs to exceed the threshold.
 
-    A reading is u s + n, with the unit vector u of a press, the size s and the recorded noise n. |u s + n| is above the
-    threshold for all s above the larger root of a quadratic equation; if there is no positive root, the size is 0.
+    A reading is u s + n, where u is the unit vector of a press's field change, s the size and n the recorded noise.
+    |u s + n| is above the threshold for all s above the larger root of a quadratic equation. If there is no positive
+    root, the returned size is 0.
     """
     along_uT = direction @ noise_uT.T
     beyond = along_uT**2 + threshold_uT**2 - (noise_uT**2).sum(axis=1)
@@ -546,9 +547,9 @@ def needed_changes_uT(
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """|dB| = a F^b, with one exponent b for a board and one factor a for each of its places.
+    """Power law |dB| = a F^b of force F, with one exponent b for a board and one factor a for each of its places.
 
-    r2 is the explained fraction of the variance of log |dB| between the presses of a place.
+    r2 is the explained fraction of the variance of log |dB| among the presses at a place.
     """
 
     exponent: float
@@ -620,9 +621,10 @@ class ContactPresses:
     direction: Float[np.ndarray, "m ch"]
 
     def proportional_N(self, change_uT: Float[np.ndarray, "m r"], law: PowerLaw) -> Float[np.ndarray, "m r"]:
-        """Return forces if the field change is proportional to the force below the weakest press of a place.
+        """Return forces under the assumption that |dB| is proportional to the force below the weakest press at a place.
 
-        A field change above that of the weakest press is in the recorded range, where the power law is used.
+        For larger field changes than that of the weakest press, which are in the recorded range, the power law is used
+        instead.
         """
         order = np.lexsort((self.force_N, self.place_i))
         weakest = order[np.unique(self.place_i[order], return_index=True)[1]][self.place_i]
@@ -655,9 +657,9 @@ def contact_presses(recordings: Sequence[Recording]) -> ContactPresses:
 def evaluate_threshold(
     parts: Changes, threshold_uT: float, presses: ContactPresses, law: PowerLaw, fraction: float
 ) -> dict[str, float]:
-    """Return false alarms and detected readings for a threshold, and the field change and force that it needs.
+    """Return false alarms and detected readings for a threshold, and the field change and force needed to exceed it.
 
-    All pairs of a recorded press and a no-load reading count equally. Results that do not exist are left out.
+    All pairs of a recorded press and a no-load reading have equal weight. Results that do not exist are left out.
     """
     needed_uT = needed_changes_uT(presses.direction, parts.verifying, threshold_uT)
     detected = np.asarray(magnitude(parts.contact) > threshold_uT)
@@ -673,9 +675,10 @@ def evaluate_threshold(
 
 
 def smallest_force_N(force_N: Float[np.ndarray, " f"], detected: Bool[np.ndarray, " f"], fraction: float) -> float:
-    """Return the smallest recorded force F such that enough readings are detected at F and at all larger forces.
+    """Return the smallest recorded force at and above which at least `fraction` of the readings are detected.
 
-    At a force, the readings from this force up to twice this force count. NaN if there is no such force.
+    The fraction at a force is computed from the readings between this force and twice this force. Returns NaN if there
+    is no such force.
     """
     order = np.argsort(force_N, kind="stable")
     force_N, before_n = force_N[order], np.concatenate([[0], np.cumsum(detected[order])])
@@ -766,7 +769,7 @@ LAW_MEANING = (
     "presses. R²: explained variance of log |dB| between the presses of a place."
 )
 IMPLIED = {"power_law_N": "force by power law, N", "proportional_N": "force in proportion, N"}
-ALARMS_MAX = 10  # forces are shown only for thresholds with at most this multiple of the intended false alarms
+ALARMS_MAX = 10  # forces are shown only if false alarms are at most this multiple of the intended ones
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -797,7 +800,7 @@ def tabulate_registration(numbers: Mapping[str, Any], source: str) -> pd.DataFra
 
 
 def show_force(force_N: float | None, least_N: float, mark: str) -> str:
-    """Write a force; `mark` is the format of forces that are not above the smallest recorded force."""
+    """Write a force; `mark` is the format for forces that are not above the smallest recorded force."""
     if force_N is None:
         return "–"
     return mark.format(f"{force_N:.3g}") if force_N <= least_N else f"{force_N:.3g}"

@@ -2,11 +2,11 @@
 
 The methods use the folds and test rows of experiment `labels`:
 
-- Regressors and networks trained on known boards. The inputs are aligned with the new board by its unlabelled pokes,
-  or by a few labelled ones.
+- Regressors and networks trained on known boards. The inputs are aligned with the new board by its unlabelled pokes, or
+  by a few labelled pokes.
 - The universal model, and the inversion of a fitted physical model. Both receive unlabelled pokes of the new skin, no
   pokes, or pokes of another skin.
-- Alarms: whether the residual of a fitted model detects that readings come from a foreign board.
+- Alarms, which test whether the residual of a fitted model detects that readings come from a foreign board.
 """
 
 import time
@@ -64,7 +64,7 @@ from reskin.universal.model import PriorModel
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # which unlabelled pokes a method receives
 Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
 Point = dict[str, Any]  # scores of one method on one fold
-RNG = "rivals"  # name of the random streams; an earlier name of this experiment
+RNG = "rivals"  # name of the random streams, which is an earlier name of this experiment
 
 
 class ReferenceMethods(SectionWithRows):
@@ -125,7 +125,7 @@ def reference_methods(
 
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
-    """Return the fold of the next board in the same random draw; it provides the pokes of another skin."""
+    """Return the fold of the next board in the same random draw, which provides the pokes of another skin."""
     same_draw = [candidate for candidate in folds if candidate.draw_i == fold.draw_i]
     names = [candidate.name for candidate in same_draw]
     return same_draw[(names.index(fold.name) + 1) % len(same_draw)]
@@ -144,7 +144,7 @@ def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float
 def point(
     data: SceneData, fold: Fold, predicted: Float[np.ndarray, "b 3"], *, method: str, pokes: str, labels_n: int = 0
 ) -> Point:
-    """Score predictions (x and y in the labels' axes, F) for the test rows of a fold."""
+    """Score predictions (x and y in the labels' axes, and the force F) for the test rows of a fold."""
     keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": fold.board, "seed_i": fold.draw_i}
     return keys | {"scores": score_test(data, fold.test, predicted.astype(np.float32))}
 
@@ -170,8 +170,8 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
 
 # --- Models of known boards with aligned inputs ---
 
-EVERY_N = 10  # every tenth reading of a labelled poke is a training row; readings of a poke differ only by noise
-SAME_MM = 0.5  # pokes closer together than this count as pokes at one place
+EVERY_N = 10  # only every tenth reading of a labelled poke is a training row, as its readings differ only by noise
+SAME_MM = 0.5  # pokes closer to each other than this are at one place
 ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
 ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without it"
@@ -180,8 +180,8 @@ ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
     """Score a regressor that was fitted to known boards on a new board, in several variants.
 
-    The variants are: the regressor as it is; inputs aligned with the new board by its unlabelled pokes; direct
-    standardisation by labelled pokes; and labelled pokes as additional training rows.
+    The variants are the regressor as it is, alignment of the inputs with the new board by unlabelled pokes, direct
+    standardisation of the inputs by labelled pokes, and labelled pokes as additional training rows.
     """
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
     known, new, test = (view(rows.db_uT[side]) for side in (fold.train, fold.pool, fold.test))
@@ -209,8 +209,8 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
     """Map the test fields of a new board to fields that known boards would read (direct standardisation).
 
     The linear map is fitted by ridge regression to pairs of fields: the field of a labelled poke of the new board, and
-    the field of known boards at the same place and force. All pairs have the same weight, independent of the strength
-    of the poke. The ridge penalty is chosen on the same pairs.
+    the field of known boards at the same place and force. All pairs have the same weight, whatever the strength of the
+    poke. The ridge penalty is chosen on the same pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     paired = np.isfinite(old_uT).all(axis=1)
@@ -229,8 +229,8 @@ def pairs_uT(
 ) -> Float[np.ndarray, "m ch"]:
     """Return the mean field of the known boards at the place and force of each poke of a new board.
 
-    A row is NaN if no known board was poked at this place. Between the forces recorded on a board at the place,
-    channels are interpolated linearly in log F; beyond these forces, they are constant.
+    A row is NaN if no known board was poked at this place. Between the forces F that were recorded on a board at the
+    place, channels are interpolated linearly in log F. Beyond these forces, channels are constant.
     """
     old_uT = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
@@ -288,7 +288,7 @@ def train_until_converged(
 ) -> tuple[Weights, dict[str, Any]]:
     """Train a network; while it collapses, repeat with other random draws, up to `MAX_ATTEMPTS_N` times.
 
-    The draws do not depend on the adversarial `weight`, so a network and its control differ only in this weight.
+    The draws do not depend on the adversarial `weight`, so that a network and its control differ only in this weight.
     """
     for attempt_i in range(MAX_ATTEMPTS_N):
         weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
@@ -319,7 +319,7 @@ ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor times in s: to calibrate a method to a skin, and to estimate one of many readings in one call."""
+    """Processor times in s: of a calibration to a skin, and of one estimate among many readings in one call."""
 
     name: str
     train_s: float
@@ -334,7 +334,7 @@ def score_unlabelled(
 ) -> tuple[list[Point], list[Seconds]]:
     """Score the universal models and the inversion with three sets of unlabelled pokes.
 
-    The sets are: pokes of the test skin, no pokes, and pokes of another skin. Returns the scores with all sets, and the
+    The sets are: pokes of the test skin, no pokes, and pokes of another skin. Returns the scores with each set, and the
     processor times with pokes of the test skin.
     """
     points, times = [], []
@@ -370,7 +370,7 @@ def estimate_universal(
     by_network = calibrated.evaluate_networks(test_uT)
     network_s = time.process_time()
     map_seconds = Seconds("", ready_s - start_s, (both_s - ready_s) / len(test_uT))
-    # The time of calibration is 0, because the network is calibrated together with the map.
+    # The time of the network's calibration is 0, because the network is calibrated together with the map.
     network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))
     places = by_map.place_mm, by_network.place_mm, combined.place_mm
     forces = by_map.force_N, np.exp(by_network.log_N), combined.force_N
@@ -383,7 +383,8 @@ def estimate_inversion(
 ) -> Iterator[Estimated]:
     """Yield the estimates of a physical model that is fitted to unlabelled pokes and inverted for the test readings.
 
-    Yields them twice: as they are, and with places shifted so that the mean place of the pokes is the board's middle.
+    Each estimate is yielded twice: as it is, and with places shifted so that the mean place of the pokes is the board's
+    middle.
     """
     start_s = time.process_time()
     known = chart(fit_unlabelled(pool.db_uT, rest_uT, setup), setup)
@@ -396,7 +397,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the controls of methods without pokes or with another skin's: the same methods with the skin's pokes."""
+    """Return the controls of methods without pokes, or with another skin's pokes: the methods with the skin's pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
@@ -408,7 +409,7 @@ OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, simulated by changing the readings of a board as a wrong plug, driver or skin would change them.
+# Foreign boards, which are simulated by changing the readings of a board as a wrong plug, driver or skin would.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -435,8 +436,9 @@ class Board:
 def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Evaluate the residual of the inversion, both as an alarm for foreign boards and as a flag for wrong estimates.
 
-    A physical model is fitted to the unlabelled pokes of each board's first fold. It is inverted for test readings of
-    this board, and of foreign boards. The limits are set for the fraction `fraction` of false alarms.
+    A physical model is fitted to the unlabelled pokes of each board's first fold. The model is inverted for test
+    readings of this board, and of foreign boards. The limits are set such that `fraction` is the fraction of false
+    alarms.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
@@ -486,10 +488,10 @@ def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
 
 
 def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Summarise over boards: percentage of alarms, area under the ROC curve, and median residual.
+    """Summarise percentage of alarms, area under the ROC curve, and median residual over boards.
 
-    `residuals` are those of the evaluated readings; `own_residuals` are those of each board's own readings, which are
-    the negatives of the ROC curve.
+    `residuals` are the residuals of the evaluated readings. `own_residuals` are the residuals of each board's own
+    readings, which are the negatives of the ROC curve.
     """
     by_board = {
         "alarm_pct": [100 * float((values > limits[board]).mean()) for board, values in residuals.items()],
@@ -502,8 +504,8 @@ def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping
 def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
     """Summarise over boards the errors of flagged readings and of all other readings.
 
-    A reading is flagged if its `value` is above the limit. Boards without flagged readings do not contribute to the
-    errors of flagged readings.
+    A reading is flagged if its `value` is above the limit of its board. Boards without flagged readings do not
+    contribute to the errors of flagged readings.
     """
     scores_by_name: dict[str, list[float]] = {}
     for board, limit in limits_of(value, fraction).items():

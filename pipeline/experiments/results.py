@@ -9,7 +9,7 @@ from reskin.errors import SchemaError
 from reskin.schema import Readings
 
 Capture = TypeVar("Capture")
-# For experiments without captures of their own; the losses of the main captures are in other results.
+# Losses for experiments without captures of their own; the losses of the main captures are in other results.
 NO_LOSSES: Mapping[str, Any] = {"accounts": [], "left_out": {}}
 
 
@@ -22,7 +22,7 @@ def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readi
 
 
 def only(captures: Sequence[Capture], folder: Path) -> Capture:
-    """Return the only capture read from `folder`; raise `SchemaError` if there are several, or none."""
+    """Return the only capture in `captures`, which were read from `folder`; raise `SchemaError` unless there is one."""
     if len(captures) != 1:
         remedy = "Set skins_n: 1 for the experiment's protocol, and simulate the captures again."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
@@ -30,7 +30,7 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
-    """Return the ingest counts of each capture in a folder (they include lost readings), and the counts `left_out`.
+    """Return the ingest counts of each capture in a folder, which include lost readings, and the counts `left_out`.
 
     left_out: the number of rows that the experiment excluded, by reason.
     """
@@ -48,8 +48,8 @@ def write_results(
     """Write the results of an experiment.
 
     numbers: the results that are added to numbers.json. drawn: data that only the figures need. losses: the result of
-    `read_losses` if the experiment has captures of its own. trainings: the number of networks trained, and of those
-    that collapsed (see `pipeline.statistics.tally`).
+    `read_losses` if the experiment has captures of its own. trainings: the numbers of trained and of collapsed networks
+    (see `pipeline.statistics.tally`).
     """
     content = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
     io.write_json(results, content if trainings is None else content | {"trainings": dict(trainings)})

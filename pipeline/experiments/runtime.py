@@ -1,4 +1,4 @@
-"""Error and run time of quadratures of the magnetised skin, and of integrators of the skin's relaxation."""
+"""Errors and run times of quadrature rules for the magnetised skin, and of integrators for the skin's relaxation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +41,7 @@ Changes = Float[np.ndarray, "n k 3"]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A prepared computation: `call` computes dB of all indentations of a trial; `nodes_n` is its number of nodes."""
+    """A prepared computation: `call` computes dB of all indentations of a trial, with `nodes_n` nodes."""
 
     nodes_n: int
     call: Callable[[], Changes]
@@ -62,13 +62,13 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Indentations(Strict):
-    """Settings of indentations: at every place, relative to the skin's centre, to every depth."""
+    """Places, relative to the skin's centre, and depths of indentations; each place is pressed to each depth."""
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # method name of the row whose error is an upper bound of the reference's own error
+REFERENCE = "reference"  # method name of the row that bounds the reference's own error from above
 CANDIDATES = "Gauss in z"  # method name of the rules that the simulator can use (`magnet.place_nodes`)
 ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
@@ -91,7 +91,7 @@ class Row:
 class Precision(Row):
     """Relative error of one method with one setting, or the reason why it failed."""
 
-    work_n: int  # number of nodes, or of evaluations of the right-hand side
+    work_n: int  # number of nodes, or number of evaluations of the right-hand side
     error: float | None  # None if the method failed
     failure: str | None = None
     parts: dict[str, float] = field(default_factory=dict)  # error by depth; empty if the study has no depths
@@ -118,8 +118,8 @@ class TimedCall:
 class Choice:
     """The cheapest acceptable quadrature rule, and the rule that the scene uses.
 
-    The first three fields are None if no rule is acceptable. `used_nodes_n` and `used_error` are None if the rule in
-    use was not tried. `differs` says whether the two rules differ.
+    The first three fields describe the cheapest acceptable rule, and are None if no rule is acceptable. `used_nodes_n`
+    and `used_error` are None if the rule in use was not tried. `differs` says whether the two rules differ.
     """
 
     setting: str | None
@@ -160,14 +160,14 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
 def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
     """Time all calls once in each of `repeats_n` rounds; return the median time per indentation of each call.
 
-    In rounds, a busy period of the machine affects all calls equally. Each call has been run before, to compute its
-    error, so the times include neither compilation nor filling of caches.
+    Calls are timed in rounds, so that a busy period of the machine affects all calls equally. Each call has already
+    been run to compute its error, so the times include neither compilation nor filling of caches.
     """
     if repeats_n < 1:
         raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase it.")
     times_s = np.empty((repeats_n, len(calls)))
     for round_i in range(repeats_n):
-        # Every second round runs in reverse order, so that a call does not always follow the same other call.
+        # Every second round runs in reverse order, so that a call does not always follow the same call.
         for i in range(len(calls))[:: -1 if round_i % 2 else 1]:
             start_s = perf_counter()
             calls[i].call()
@@ -201,11 +201,11 @@ class Quadratures(Indentations):
 
 @dataclass(frozen=True)
 class Reference:
-    """Gauss rules along x, y and z: the finer rule is the reference, and the coarser rule bounds its error.
+    """Gauss rules along x, y and z: the finer rule is the reference, and the coarser rule bounds the reference's error.
 
     Magnetised boxes that move with the material would be an obvious reference, but rigid boxes overlap where the skin
-    is compressed. The field of such boxes converges to this reference with the square of the cell size: its error is
-    5-9 % at 0.4 mm x 20 layers, and below 1 % when extrapolated to cells of size 0.
+    is compressed. The field of such boxes converges to this reference with the square of the cell size. Its difference
+    from the reference is 5-9 % at 0.4 mm x 20 layers, and below 1 % when extrapolated to cells of size 0.
     """
 
     coarser: Quadrature
@@ -221,8 +221,8 @@ def study_quadratures(
 ) -> tuple[list[Precision], list[TimedCall]]:
     """Compare every rule of every method with the reference on all trials.
 
-    Returns one row per rule, and the calls to time, which compute dB of the first trial. `parts` of a row contains, for
-    each depth, the error of the skin with the largest error; `error` is the largest value in `parts`.
+    Returns one row per rule, and the calls to time, which compute dB of the first trial. For each depth, `parts` of a
+    row contains the largest error of any skin; `error` is the largest value in `parts`.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -245,7 +245,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return rms error / rms dB, for each depth (the largest ratio of any skin) and over all depths and skins."""
+    """Return rms error / rms dB for each depth, as the largest ratio of any skin, and for all depths and skins."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -266,12 +266,13 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
-ATOL = 1e-3  # absolute tolerance / relative tolerance; the states are a few percent of the force, which is 1
+ATOL = 1e-3  # absolute / relative tolerance; states are a few percent of the elastic force, which is 1
 DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
-DOWN_S, HELD_S = 0.3, 0.7  # times of lowering and holding the tip; the tip is lifted in the rest of the period
+DOWN_S, HELD_S = 0.3, 0.7  # times of lowering and of holding the tip, which is lifted for the rest of the period
 
-# Times in s, and the elastic forces at these times. The elastic force is linear between two times (a linear piece).
+# Times in s, and the elastic forces at these times. Between two successive times, the elastic force is linear; this is
+# called a linear piece.
 History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]
 Forces = Float[np.ndarray, " u"]  # relaxed force / peak elastic force, at the end of each linear piece
 State = Float[np.ndarray, " p"]  # one state per relaxation time
@@ -307,7 +308,8 @@ class Counter:
     def rates(self, prony: Prony, speed: float) -> Rates:
         """Return the right-hand side q' = -q / tau + share e', for one linear piece of the elastic force e.
 
-        `speed` is e', the constant rate of the elastic force.
+        q are the states; tau and share are the relaxation times and shares of the Prony series. `speed` is e', the
+        constant rate of the elastic force.
         """
         driven = prony.share * speed
 
@@ -323,7 +325,7 @@ class Counter:
 def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCall]]:
     """Compare every integrator with a 50-digit solution at every stiffness ratio.
 
-    Returns one row per integrator and ratio, and the calls to time, which are those that did not fail.
+    Returns one row per integrator and ratio, and the calls that did not fail, which are to be timed.
     """
     history, calls_max_n = repeated_presses(tried.pokes_n), tried.pokes_n * tried.calls_per_poke_max_n
     rows, calls = [], []
@@ -340,12 +342,12 @@ def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCa
 
 
 def study_name(ratio: float) -> str:
-    """Return the name of the study, in tables and figures, for one stiffness ratio."""
+    """Return the name, in tables and figures, of the study of one stiffness ratio."""
     return f"relaxation, stiffness {ratio:.0e}"
 
 
 def repeated_presses(pokes_n: int) -> History:
-    """Return the history of identical presses, each to an elastic force of 1, held and then released.
+    """Return the history of identical presses: each increases the elastic force to 1, holds it, and releases it.
 
     As the presses are identical, error and run time per press hardly depend on the number of presses.
     """
@@ -462,9 +464,9 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
     """Prepare only the sum over nodes, with the compiled kernel and precomputed displacements.
 
-    The run time can be compared with those of the magpylib methods, with one difference. The kernel computes the field
-    of each node at rest and displaced, which avoids subtracting two large sums; with magpylib, the field at rest is
-    computed only once.
+    The run time can be compared with the run times of the magpylib methods, except for one difference. For every
+    indentation, the kernel computes the field of each node both at rest and displaced, which avoids the subtraction of
+    two large sums. With magpylib, the field at rest is computed only once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
@@ -492,7 +494,7 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_dipoles(trial: Trial, rule: Quadrature) -> Prepared:
-    """Prepare the sum over nodes with magpylib objects: one Dipole per node, whose path has all indentations."""
+    """Prepare the sum over nodes with magpylib objects: one Dipole per node, whose path contains all indentations."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     return _by_objects(trial, skin, lambda i: Dipole(moment=skin.moments_A_m2[i]))
 
@@ -577,7 +579,7 @@ def _slide(
 class _DeformationSplines:
     """Splines over (r, z) of the changes of r, z and rotation angle.
 
-    Beyond the range of the splines, r^2 grows by `grown_m2`, and z and the angle do not change.
+    Beyond the range of the splines, r^2 grows by `grown_m2`, while z and the angle do not change.
     """
 
     splines: tuple[RectBivariateSpline, ...]
@@ -613,7 +615,7 @@ COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a random ski
 def draw_trial(
     board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Indentations
 ) -> Trial:
-    """Draw a random skin without rotation and without variation over its area, and its indentations.
+    """Draw a random skin that is not rotated and does not vary over its area, and its indentations.
 
     The places of `pokes` are relative to the skin's centre. Raises `ParamsError` if a poke does not reach the skin.
     """

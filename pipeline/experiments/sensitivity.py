@@ -103,7 +103,7 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
     """Return the fraction of correctly ordered pairs of readings, for weight differences of 1 step, 2 steps, ...
 
     A pair is correctly ordered if the reading under the larger weight has the larger response; equal responses count
-    half. Both readings of a pair are of the same filling, and so have the same no-load reading.
+    half. Both readings of a pair are of the same filling of the glass, and therefore have the same no-load reading.
     """
     levels_n = response_uT.shape[1]
     shares = []
@@ -114,7 +114,7 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
 
 
 def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | None:
-    """Return the smallest weight difference such that this and all larger differences are resolved.
+    """Return the smallest weight difference at and above which all differences are resolved.
 
     `share` is the fraction of correctly ordered pairs by difference (see `ordered_share`). Returns None if even the
     largest difference is not resolved.
@@ -129,11 +129,11 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
 
     `step_N` is the smallest multiple of the step between weights at which the mean rise exceeds the noise of one
     filling in 95 % of cases. With smaller steps, noise alone would make the response fall. `step_N` is computed from
-    noise and gain, and not from the observed responses: otherwise an observed fall would increase `step_N` until the
-    fall disappears. If no step is large enough, the result has no `step_N`.
+    noise and gain rather than from the observed responses, because an observed fall would otherwise increase `step_N`
+    until the fall disappears. If no step is large enough, the result has no `step_N`.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
-    # `noise_uT` is the noise of a rise in one filling.
+    # `noise_uT` is the noise of the rise between two weights in one filling.
     noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan
     gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # mean rise per step between weights
     result: dict[str, Any] = {
@@ -149,7 +149,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
         step_N = steps_n * float(weight_N[1] - weight_N[0])
         result |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
-    if noise_uT > 0:  # number of falls expected from noise, for a linear response and the standard error of the mean
+    if noise_uT > 0:  # number of falls that noise causes in a linear response, from the standard error of the mean
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
         result["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
     return result

@@ -1,4 +1,4 @@
-"""Shear: place and all three force components of dragged lines (paper section 4).
+"""Shear: estimates of place and of all three force components along dragged lines (paper section 4).
 
 The readings of every skin are split in two ways: random readings are held out, or whole lines are held out.
 """
@@ -111,7 +111,7 @@ def summarise_shear(
 ) -> dict[str, Any]:
     """Summarise the scores of both splits over folds, and add the rms forces.
 
-    `by_reading` and `by_line` have one pair (fold, scores) per network. The score of a fold is the mean over its seeds;
+    `by_reading` and `by_line` have one pair (fold, scores) per network. The score of a fold is the mean over its seeds.
     `sd_seeds` is the standard deviation over the `seeds_n` networks of one fold, averaged over folds. `lines_n` is the
     number of dragged lines over all passes; each pass drags along the same lines.
     """

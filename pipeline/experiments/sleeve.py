@@ -31,14 +31,14 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-NEAR_MM = 4.0  # places closer to a border between boards count as near it (assumed: twice the skin's thickness)
-Stats = dict[str, dict[str, float]]  # by metric: mean, n and, for several training runs, sd
+NEAR_MM = 4.0  # a place this close to a border between boards is near it (assumed: twice the skin's thickness)
+Stats = dict[str, dict[str, float]]  # for each metric: mean, n and, for several training runs, sd
 
 
 class Sleeve(SectionWithTraining):
     """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # fraction of each capture's pokes: the last ones are held out
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # held-out fraction of each capture's pokes, the last ones
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 
@@ -49,7 +49,7 @@ class Area:
 
     sides_mm: tuple[float, float]
     chips_mm: Float[np.ndarray, "k 2"]
-    # Borders between boards: x of the borders that are parallel to the y axis, and y of those parallel to the x axis.
+    # Borders between boards: x of the borders parallel to the y axis, and y of the borders parallel to the x axis.
     borders_mm: tuple[tuple[float, ...], tuple[float, ...]]
 
     def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
@@ -217,7 +217,7 @@ def draw_errors(
 ) -> dict[str, Any]:
     """Return the data for the figure.
 
-    Contains place and mean error of every test indentation, and the chips and the borders between boards.
+    The data are the place and the mean error of every test indentation, the chips, and the borders between boards.
     """
     _, first, indentation_i = np.unique(indentation, return_index=True, return_inverse=True)
     mean_mm = np.bincount(indentation_i, error_mm) / np.bincount(indentation_i)

@@ -1,8 +1,8 @@
 """Recorded touches at numbered places of a real pad, one or two at once (paper section 7, future work).
 
-Estimates the place and force of a touch. Tests whether the change of field by two touches is the sum of the changes by
-two single touches, and whether two touches can be detected. Each recording of single touches is split by time into
-training rows, rows that set thresholds, and test rows.
+The experiment estimates the place and force of a touch. It tests whether the change of field by two touches is the sum
+of the changes by two single touches, and whether two touches can be detected. Each recording of single touches is split
+by time into training rows, rows that set thresholds, and test rows.
 """
 
 import re
@@ -103,7 +103,7 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
 
 @dataclass(frozen=True)
 class Touched:
-    """The rows of one recording with enough force, in order of time. `places`: numbers of the one or two places."""
+    """The rows of one recording with enough force, in order of time; `places` are its one or two place numbers."""
 
     name: str
     places: tuple[int, ...]
@@ -161,10 +161,11 @@ class Sorted:
 
 
 def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
-    """Sort recordings by their number of places, and leave out those that cannot be used.
+    """Sort recordings by their number of places, and leave out recordings that cannot be used.
 
-    A recording needs `ROWS_MIN_N` touched rows; each place of a pair must also have been recorded alone. If a place was
-    recorded alone twice, only the first recording is used, so that two periods of time are not mixed.
+    A recording needs `ROWS_MIN_N` touched rows. Each place of a recording of two places must also have been recorded
+    alone. If a place was recorded alone twice, only the first recording is used, so that two periods of time are not
+    mixed.
     """
     # Recordings of a single place come first.
     ordered = sorted(recordings, key=lambda recording: (len(recording.places), recording.places, recording.name))
@@ -232,7 +233,7 @@ def relative_residual(
 ) -> Float64[np.ndarray, " f"]:
     """Fit each row by a non-negative combination of the directions of these places; return residual / |dB|.
 
-    The force at each place was not recorded, so the amplitudes that give the smallest residual are used.
+    The force at each place was not recorded, so the amplitudes with the smallest residual are used.
     """
     basis = np.stack([known[place] for place in places], axis=1)
     rows_uT = db_uT.astype(np.float64)
@@ -244,7 +245,7 @@ def score_unlike_one(
 ) -> Scores:
     """Score how unlike a single touch each tested row is.
 
-    The detectors are those of experiment `contacts` that do not use a network, and the smallest residual of a fit by
+    The detectors are the detectors of experiment `contacts` that use no network, and the smallest residual of a fit by
     one place.
     """
     residuals = [relative_residual(known, (place,), tested_uT) for place in known]
@@ -261,7 +262,7 @@ def score_unlike_one(
 def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
     """Return how often the place of later single touches is predicted correctly.
 
-    Also returns how often the place that is predicted for two touches is one of their two places.
+    For two touches, also returns how often the predicted place is one of their two places.
     """
     known_uT, place_numbers = stack_touches([block.train for block in blocks])
     right_pct = [
@@ -281,7 +282,8 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
     """Return squared force errors of ridge regression on dB of single touches, and the variance of the force.
 
-    `by_time` is tested on later rows of the training recordings, `place_left_out` on recordings of other places.
+    `by_time` contains the errors on later rows of the training recordings, `place_left_out` those on recordings of
+    other places.
     """
     by_time = [_force_error(blocks, block.test, rng) for block in blocks]
     left_out = [
@@ -320,7 +322,7 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Return the median residuals of two touches, after fits by their two places, by single places, and by other pairs.
+    """Return the median residuals of two touches after fits by their two places, by single places and by other pairs.
 
     `rank` is the rank of the true pair among all pairs of places, where 1 is the pair with the smallest residual.
     """
@@ -343,7 +345,7 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
 def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
-    """Return how often each detector calls a touch double, with thresholds set for a fraction of false alarms.
+    """Return how often each detector reports two touches, with thresholds set for a fraction of false alarms.
 
     Besides recordings of two touches, the detectors are tested on sums of two single touches, and on single touches at
     a place that they do not know.

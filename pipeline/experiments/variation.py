@@ -1,4 +1,4 @@
-"""Variation: how the field of equal indentations differs over time and between skins (paper figure 4)."""
+"""Variation of the field of equal indentations over time and between skins (paper figure 4)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # labels (commanded values in float32) count as equal if they differ by less than this
+SAME_MM = 1e-3  # labels (commanded values in float32) that differ by less than this count as equal
 LISTED_N = 8  # largest number of places or depths listed in an error message
 LINES_MAX_N = 40  # largest number of lines (visits of a place) in a panel of the figure
 DECIMALS = 1  # fields in uT are rounded to this many decimals for the figures
@@ -45,8 +45,8 @@ class Variation(Strict):
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
     """Compare the fields of equal indentations, over time and between skins.
 
-    The worn skin, which is compared over time, is in `indentations`; the skins that are compared with one another are
-    in `main`.
+    Folder `indentations` contains the worn skin, which is compared over time. Folder `main` contains the skins that are
+    compared with one another.
     """
     worn_capture = read_captures(indentations)[0]
     boards: dict[str, str] = {}
@@ -101,7 +101,7 @@ def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | Non
 
 
 def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
-    """Describe, for an error message, the depths visited at a place; if there are none, all depths and some places."""
+    """Describe the depths visited at a place or, if there are none, all depths and some places, for an error."""
 
     def join(values_mm: np.ndarray) -> str:
         return ", ".join(f"{value:g}" for value in values_mm[:LISTED_N])
@@ -118,8 +118,8 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the visits within a skin's first `contacts_n` contacts with the first of these visits.
 
-    Returns the rms differences over channels between the last and the first visit, of the field as read and of the
-    change of field. Also returns the lines to draw: the fields minus the field of the first visit.
+    Returns two rms differences over channels between the last and the first visit: of the field as read, and of the
+    change of field. Also returns the lines to draw, which are the fields minus the field of the first visit.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
@@ -154,7 +154,7 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
 
 
 def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Return how long a skin's first `contacts_n` contacts took, and how much the chips' temperature rose in that time.
+    """Return the duration of a skin's first `contacts_n` contacts, and the rise of the chips' temperature in that time.
 
     Values that were not recorded are left out.
     """

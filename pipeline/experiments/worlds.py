@@ -1,7 +1,7 @@
-"""Which properties of simulated skins determine the scores of table 2 (not in the paper).
+"""Find which properties of simulated skins determine the scores of table 2 (not in the paper).
 
-The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from
-those of the scene in one factor, for example a spread between skins, or an error of the simulation.
+The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from the
+scene's in one factor, such as a spread between skins or an error of the simulation.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,17 +50,17 @@ WAVES_N = 48  # number of random cosines whose sum is the smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
-# Row of table 2 -> experiment whose networks it scores.
+# For each row of table 2, the experiment whose networks the row scores.
 EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 
 class Residual(Strict):
-    """A smooth random error that is added to the simulated changes of field: sizes, and correlation lengths."""
+    """Sizes and correlation lengths of a smooth random error that is added to the simulated changes of field."""
 
     sizes: Sizes  # rms sizes relative to |dB|, one world per size
     length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation length along x and y
     length_log_N: Annotated[float, Field(gt=0, le=10)]  # correlation length along the logarithm of the force
-    # Fraction of the error's variance that is specific to each skin; the rest of the error is the same on all skins.
+    # Fraction of the error's variance that is drawn for each skin; the rest of the error is the same on all skins.
     own_share: Annotated[float, Field(ge=0, le=1)]
 
 
@@ -196,8 +196,8 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
 def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
     """Draw the folds of one world, whose names begin with the name of the world.
 
-    `rows` are the rows of this world, which follow the `before_n` rows of the previous worlds; the folds contain row
-    numbers in the rows of all worlds.
+    `rows` are the rows of this world. The row numbers in folds refer to the concatenated rows of all worlds, in which
+    `before_n` rows of earlier worlds precede `rows`.
     """
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
@@ -205,7 +205,7 @@ def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> 
 
 
 def worlds(settings: Settings, section: Worlds, results: Path) -> None:
-    """Train the networks of table 2 in every world, and score them in the same world."""
+    """Train the networks of table 2 in every world; score each network in the world in which it was trained."""
     preload_training()
     split = settings.section(Split, "split")
     listed = worlds_of(simulation_settings(settings), section)
@@ -293,7 +293,7 @@ MEANING = (
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
     "error. {folds_n} boards are held out in turn; one network per row, fold and world, trained for {steps_n} steps."
 )
-DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # default values; those of the other factors are in the numbers
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # default values; the numbers have those of other factors
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -1,6 +1,6 @@
 """Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, and register it.
 
-The scene is added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
+The scene is also added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
 changes are undone.
 """
 
@@ -31,7 +31,7 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # number of the scene's latest captures with which the places of a new capture are compared
+COMPARED_N = 3  # number of latest captures of the scene whose places are compared with a new capture's
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
@@ -84,7 +84,7 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
     """Return the names of a capture; names that are not given (empty) are taken from the file's name, `BOARD_SKIN.csv`.
 
     The skin is then named `BOARD_SKIN`, so that skins of different boards have different names. Further parts of the
-    file's name (`BOARD_SKIN_MORE.csv`) distinguish the captures of a skin.
+    file's name, as in `BOARD_SKIN_MORE.csv`, distinguish the captures of a skin.
     """
     if given.board and given.skin:
         return given
@@ -103,7 +103,7 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
 
 @contextmanager
 def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
-    """Undo all changes if the `with` block fails; `captures` are those that were added in the block until then."""
+    """Undo all changes if the `with` block fails; the block appends the captures that it has added to `captures`."""
     with io.restoring(root / REGISTRY, root / PLAN):
         try:
             yield
@@ -147,10 +147,10 @@ class Counts:
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], Counts]:
-    """Read a whole capture as stage ingest does; return its fingerprints, and counts.
+    """Read a whole capture as stage ingest does; return its fingerprints and its counts.
 
-    The fingerprints are the SHA-256 of the readings and of the stream. Copies of a recording with other names or in
-    another layout have a fingerprint in common. An unknown force (NaN) counts as a touch.
+    The fingerprints are the SHA-256 of the readings and of the byte stream. Copies of a recording have a fingerprint in
+    common, even if they have other names or another layout. An unknown force (NaN) counts as a touch.
     """
     _, blocks, counts = open_capture(folder, policy)
     rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
@@ -179,7 +179,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
 
 
 def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
-    """Warn if the first capture of a skin has fewer passes or indentations than the scene's section split needs."""
+    """Warn if the first capture of a skin has fewer passes or indentations than section split of the scene needs."""
     for what, have_n, key in (
         ("passes", counts.passes_n, "pool_passes_n"), ("indentations", counts.indentations_n, "labels_pool_n")
     ):  # fmt: skip
@@ -194,7 +194,7 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
 
 
 def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
-    """Warn if the orientation of chips, labels or skin seems to differ from section `compare` of the scene."""
+    """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
         find_departure,  # imported late: importing the physics takes seconds
@@ -214,7 +214,7 @@ def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
     """Warn if a capture's places seem rotated, mirrored or with x and y swapped.
 
-    They are compared with the latest of `others`, the names of the scene's other captures.
+    The places are compared with those of the latest captures in `others`, the names of the scene's other captures.
     """
     orientations = []
     presses = presses_of(open_capture(folder, policy)[1])
@@ -231,7 +231,7 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """Replace paths of copied files in errors by the paths of the user's files, because the copies are deleted."""
+    """In errors, replace the paths of copies by the paths of the user's files, because the copies are deleted."""
     try:
         yield
     except ReskinError as error:
@@ -265,7 +265,7 @@ def _remove_files(target: Path) -> None:
 
 
 def _track(folder: Path, root: Path) -> None:
-    """Track a folder with DVC, as `dvc add` does, but in this process, because starting another one takes seconds."""
+    """Track a folder with DVC like `dvc add`, but in this process, because starting another process takes seconds."""
     from dvc.exceptions import DvcException  # imported late: the import takes a second
     from dvc.repo import Repo
 

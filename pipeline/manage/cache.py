@@ -1,7 +1,7 @@
 """Check DVC's cache for damaged objects, and set them aside.
 
-DVC names an object by the MD5 of its content, and restores outputs from a read-only object without checking it again.
-An object that a failing disk has damaged would therefore be restored as a result.
+DVC names an object by the MD5 of its content. It restores outputs from a read-only object without checking the content
+again. If a failing disk has damaged an object, the damaged object would therefore be restored as a result.
 """
 
 import hashlib
@@ -49,13 +49,13 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
 def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
     """Move a damaged object away, and repair the cache; return a sentence that says what was done.
 
-    The object is restored from an intact output. If there is none, its damaged copies are deleted from outputs, so that
-    the stages of these outputs run again.
+    The object is restored from an output that contains an intact copy. If there is no such output, the damaged copies
+    are deleted from outputs, so that the stages of these outputs run again.
     """
     damaged_md5, aside = _md5(file), root / DAMAGED / name
     outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]
     aside.parent.mkdir(parents=True, exist_ok=True)
-    shutil.move(file, aside)  # not deleted: there may be no other copy of a recording
+    shutil.move(file, aside)  # moved rather than deleted, because it may be the only copy of a recording
     for path, digest in outputs:
         if digest == name:
             with io.replacing(file) as temporary:

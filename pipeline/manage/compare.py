@@ -19,9 +19,9 @@ from pipeline import plan
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # a row of a list is named by at most this many of its leading texts and counts
+LABEL_N = 3  # at most this many leading texts and counts name a row of a list
 LISTED_N = 10  # number of largest differences to list
-# Verdicts at the beginning of cells; yes and no occur only in results from before 2026-11.
+# Verdicts at the beginning of cells. Only results from before 2026-11 contain yes and no.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|within interval|significant difference|"
     r"not judged \([^)]*\))(?![\w ])"
@@ -31,7 +31,7 @@ EXPECTED = (
     "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
     "processor with AVX2; a GPU or other versions may differ. If none of these explains a difference, please report it."
 )
-MISSING: Any = object()  # in place of a value that one of the two runs does not have
+MISSING: Any = object()  # placeholder for a value that one of the two runs lacks
 
 Leaf = bool | int | float | str | None
 Echo = Callable[[str], None]
@@ -50,7 +50,7 @@ class Difference:
 
     @property
     def relative(self) -> float | None:
-        """The absolute difference divided by the larger magnitude (0 to 2); None unless both values are numbers."""
+        """Absolute difference divided by the larger magnitude (0 to 2); None unless both values are numbers."""
         old, new = self.committed, self.fresh
         if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (old, new)):
             return None
@@ -58,14 +58,14 @@ class Difference:
 
     @property
     def verdicts(self) -> tuple[str, str] | None:
-        """The verdicts that two texts begin with; None if these are equal, or if a text has no verdict."""
+        """The verdicts at the beginning of both texts; None if the verdicts are equal, or if a text has no verdict."""
         old, new = (VERDICT.match(value) if isinstance(value, str) else None for value in (self.committed, self.fresh))
         return (old[1], new[1]) if old and new and old[1] != new[1] else None
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The values that differ, the names that only one of two runs has, and the number of equal values by section."""
+    """Values that differ, names that only one of two runs has, and numbers of equal values by section."""
 
     equal: Counter[str]
     differing: list[Difference]
@@ -118,7 +118,7 @@ def leaves(value: Any) -> Iterator[tuple[str, Leaf]]:
 
 
 def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name, the old and the new value of every value in `old` or `new`; a missing value is `MISSING`."""
+    """Yield the name, the old value and the new value of each entry of `old` or `new`; a missing value is `MISSING`."""
     present = [value for value in (old, new) if value is not MISSING]
     if all(isinstance(value, Mapping) for value in present):
         before, after = ({} if value is MISSING else value for value in (old, new))
@@ -136,7 +136,7 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Label the rows of two lists by their leading values, so that an additional row does not shift the others.
+    """Label the rows of two lists by their leading values, so that an additional row does not shift the other rows.
 
     If the labels differ but the lists are equally long, rows are paired by position.
     """
@@ -147,7 +147,7 @@ def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any],
 
 
 def _labels(rows: Sequence[Any]) -> list[str]:
-    """Label rows by the fewest leading texts and counts that make labels unique; number labels that are still equal."""
+    """Label rows by as few leading texts and counts as make the labels unique; number labels that are still equal."""
     if not all(isinstance(row, Mapping) for row in rows):
         return [str(i) for i in range(len(rows))]
     leading: list[list[str]] = []
@@ -183,8 +183,8 @@ class Report:
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     """Compare `reports/<scene>` with the scene's report in a git revision or a folder; return the exit status.
 
-    If a scene cannot be compared, this prints the error and returns its exit status, so that other scenes are still
-    compared.
+    If the scene cannot be compared, the function prints the error and returns the exit status of the error, so that the
+    caller can continue with other scenes.
     """
     try:
         folder = root / "reports" / scene

@@ -1,6 +1,6 @@
 """Fetch public recordings (`pipeline/fetch.yaml`) from a git repository or a folder, check them, and add them.
 
-From a git repository, only the needed commit and files are transferred, if its server supports that.
+If the server of a git repository supports it, only the needed commit and files are transferred.
 """
 
 import os
@@ -31,7 +31,8 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
-# Disk space must be free for this many copies of each file: as fetched, in data/raw, in DVC's cache, one in reserve.
+# The free disk space must suffice for this many copies of each file: as fetched, in data/raw, in DVC's cache, and one
+# in reserve.
 COPIES_N = 4
 USE_FROM = "--from takes a git mirror or a folder that contains the files."
 PART = "pad"  # option that selects one of several captures in the same files (layout leaphand)
@@ -51,7 +52,7 @@ Commit = Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")]
 class File(Strict):
     """A file to fetch: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk.
 
-    commit: the commit that has the file, if it is not the commit of the source.
+    commit: the commit that contains the file, if this is not the commit of the source.
     """
 
     path: RelativePath
@@ -151,7 +152,7 @@ def _is_unchanged(path: Path, file: File) -> bool:
 
 
 def download(source: Source, where: str, folder: Path) -> None:
-    """Read and check the files of a source, and replace a folder with them; on failure, leave the folder unchanged."""
+    """Read and check the files of a source, then replace a folder with them; on failure, the folder does not change."""
     try:
         with io.replacing(folder) as temporary:
             needed_B = COPIES_N * sum(file.bytes_n for file in source.files)
@@ -176,7 +177,7 @@ def download(source: Source, where: str, folder: Path) -> None:
 
 
 def _read_checked(origin: "Origin", file: File) -> bytes:
-    """Read a file, convert it to CSV if it is an archive of pickled samples, and check its hash."""
+    """Read a file, convert an archive of pickled samples to CSV, and check the hash of the result."""
     path = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if path is None:
         remedy = f"Is this the right source? {USE_FROM}"
@@ -215,7 +216,7 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
 def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
     """Return the name of the scene's capture with the same files as a prepared recording; None if there is none.
 
-    If the files contain several captures, it is the same part of the files.
+    If the files contain several captures, the capture must also be the same part of the files.
 
     A capture whose files are not on disk is compared by its name.
     """
@@ -235,7 +236,7 @@ def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
 
 
 def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Say) -> None:
-    """Say whether the scene is in the plan, and what to run next; `before`: the scenes planned before the fetch."""
+    """Say whether the scene is in the plan, and what to run next; `before` has the scenes planned before the fetch."""
     running = list(read_plan(root / PLAN).scenes)
     if scene not in running:
         return say(
@@ -256,7 +257,7 @@ class Origin:
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path that shares the most trailing parts with path `wanted`; None if no file has the same name."""
+        """Return the path with the most trailing parts in common with `wanted`; None if no file has the same name."""
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)
@@ -268,7 +269,7 @@ class Origin:
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
-    """Open a folder, or a git repository at a commit (None: the newest); git creates the folder `scratch`."""
+    """Open a folder, or a git repository at a commit (None means the newest); git creates the folder `scratch`."""
     folder = Path(where)
     if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither an existing path nor a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")
@@ -280,7 +281,7 @@ def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
-    """Fetch one commit, without its files, which are fetched when they are read.
+    """Fetch one commit without its files; each file is fetched when it is read.
 
     If the server does not support this, the whole repository is fetched.
     """
@@ -317,7 +318,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _git(*arguments: str, repository: Path | None = None) -> bytes:
-    """Run git; give up on a dead connection, and never ask for a password."""
+    """Run git such that it gives up on a dead connection, and never asks for a password."""
     command = ["git", "-c", "http.lowSpeedLimit=1000", "-c", "http.lowSpeedTime=60"]
     command += [] if repository is None else ["--git-dir", str(repository)]
     silent = {"GIT_TERMINAL_PROMPT": "0", "GIT_ASKPASS": "true", "GIT_SSH_COMMAND": "ssh -oBatchMode=yes"}

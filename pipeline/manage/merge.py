@@ -1,4 +1,4 @@
-"""Resolve merge conflicts in registry, plan, dvc.lock and reports, between branches with different recordings.
+"""Resolve conflicts in registry, plan, dvc.lock and reports when branches with different recordings are merged.
 
 Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """
@@ -56,7 +56,7 @@ def merge(root: Path) -> str:
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
-    """Apply the changes from base to theirs to our registry; raise if one of their captures conflicts with ours."""
+    """Apply the changes from base to theirs to our registry; raise an error if their captures conflict with ours."""
     merged, before, after = ours, _entries(base), _entries(theirs)
     for (scene, name), entry in before.items():
         if after.get((scene, name)) != entry == _entries(ours).get((scene, name)):
@@ -72,7 +72,8 @@ def merge_stages(
 ) -> tuple[dict[str, Any], list[str]]:
     """Merge the stages of dvc.lock, taking each entry from the side that changed it.
 
-    If both sides changed an entry, ours is kept. Returns the merged stages, and the names of entries that both changed.
+    If both sides changed an entry, ours is kept. Returns the merged stages, and the names of the entries that both
+    sides changed.
 
     >>> merge_stages({"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 3, "b": 3, "c": 3})
     ({'a': 2, 'b': 3, 'c': 3}, ['a'])
@@ -90,7 +91,7 @@ def merge_stages(
 
 
 def merge_scenes(base: Sequence[str], ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
-    """Return the scenes to run: ours, without the scenes that theirs removed, and with the scenes that theirs added."""
+    """Return the scenes to run: our scenes, without those that their side removed, and with those that it added."""
     added = [name for name in theirs if name not in ours and name not in base]
     return [name for name in ours if name in theirs or name not in base] + added
 
@@ -105,7 +106,7 @@ def _registries(root: Path, blobs: Mapping[str, str]) -> tuple[Registry, Registr
 
 
 def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
-    """Return the scenes of the merged plan; without a conflict (None), those of the plan on disk."""
+    """Return the scenes of the merged plan, or of the plan on disk if there is no conflict (None)."""
     if blobs is None:
         return list(read_plan(root / PLAN).scenes)
     return merge_scenes(*(list(content.get("scenes", {})) for content in _versions(root, blobs)))
@@ -122,7 +123,7 @@ def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
 
 
 def _versions(root: Path, blobs: Mapping[str, str]) -> Versions:
-    """Read the base, our and their version of a YAML file from git; a missing version is an empty mapping."""
+    """Read three versions of a YAML file (base, ours, theirs) from git; a missing version is an empty mapping."""
     from dvc.utils.serialize import loads_yaml
 
     base, ours, theirs = (

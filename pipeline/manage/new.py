@@ -86,9 +86,10 @@ def new(
 ) -> tuple[Path, list[str]]:
     """Write `pipeline/scenes/<scene>.yaml`; return its path, and sentences on what to do next.
 
-    boards: names of two or more boards. presses_n: indentations of each skin in one pass; with two passes or more, the
-    scene also adapts networks. layout: a layout of the project, a YAML file whose text is copied, or None for the
-    layout of the paper's board as a text to edit. source: "simulated" for recordings of emulated boards.
+    boards: names of two or more boards. presses_n: indentations of each skin in one pass. passes_n: with two passes or
+    more, the scene also adapts networks. layout: the name of a layout of the project, or a YAML file whose text is
+    copied; with None, the text of the paper's layout is copied, to be edited. source: "simulated" for recordings of
+    emulated boards.
 
     Raises
     ------
@@ -121,7 +122,7 @@ def scene_text(
     fits, adapted = layout is not None and is_shipped(given), passes_n > 1
     model = SHIPPED if fits else f"{scene}.safetensors"
     experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit"]
-    # Experiment compare compares recorded fields with simulated ones.
+    # Experiment compare compares recorded fields with simulated fields.
     experiments += ["compare"] * (source == "recorded")
     pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
     return TEMPLATE.format(
@@ -135,7 +136,7 @@ def scene_text(
 
 
 def is_shipped(layout: BoardLayout) -> bool:
-    """Return whether the universal model that comes with the project is for this layout."""
+    """Return whether the shipped universal model was made for this layout."""
     return layout.model_copy(update={"name": paper_layout().name}) == paper_layout()
 
 

@@ -38,7 +38,7 @@ def read_registry(root: Path) -> Registry:
 def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
-    """Return the registry with one more capture; raise `CaptureError` if it is a copy of, or contradicts, another."""
+    """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another capture."""
     entry = Entry(
         board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
         fingerprints=fingerprints, copy_of=None,
@@ -47,7 +47,7 @@ def with_capture(
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Return the registry with one more entry, which may come from another clone; see `with_capture`."""
+    """Return the registry with one more entry, which may be from another clone; errors are as in `with_capture`."""
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None
@@ -93,7 +93,7 @@ def write_registry(root: Path, registry: Registry) -> None:
 
 
 def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
-    """Raise `CaptureError` for a copy of capture `original`, unless it has another board or skin and is allowed."""
+    """Raise `CaptureError` for a copy of `original`, unless the copy has another board or skin and is allowed."""
     relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return

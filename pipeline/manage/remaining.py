@@ -1,10 +1,10 @@
 """Estimate how long the running `dvc repro` still takes: `progress: 23 % after 1.2 min, about 4 min left`.
 
 The costs of all stages come from the provenance.json of each scene's last report. The estimate scales them by the speed
-of this run so far. A stage counts if DVC will probably run it: if its settings, code or inputs differ from dvc.lock, or
-an output is missing.
+of this run so far. The estimate includes the stages that DVC will probably run, because their settings, code or inputs
+differ from dvc.lock, or because an output is missing.
 
-No stage imports this module, so that it may change without making results stale.
+No stage imports this module, so that a change of the module does not make results stale.
 """
 
 import hashlib
@@ -21,16 +21,16 @@ from pipeline.provenance import is_experiment
 from reskin import io
 from reskin.config import read_yaml
 
-STATE = Path(".reskin/run.json")  # the current run: its process, its start, the planned stages and those that started
+STATE = Path(".reskin/run.json")  # the current run: process, start, planned stages and started stages
 LOCK = Path("dvc.lock")
 CODE, DIGESTS = "code", "data/code"  # the stage that writes digests of modules, and its output
 START_S = 1.5  # assumed time per stage for the start of Python and DVC's own work
-SIDE_BY_SIDE_N = 2  # number of training runs at the same time, by default
-TRUSTED = 0.1  # fraction of the work after which the speed of this run counts as much as that of the recorded one
+SIDE_BY_SIDE_N = 2  # default number of parallel training runs
+TRUSTED = 0.1  # fraction of work after which this run's speed has the same weight as the last report's
 
 
 def progress() -> str | None:
-    """Record that this stage starts; return a sentence on the progress of the run, or None if it is not known."""
+    """Record that this stage starts; return a sentence on the progress of the run, or None if it is unknown."""
     stage = os.environ.get(VARIABLE, "").rpartition(":")[2]
     if not stage or is_experiment():
         return None
@@ -50,7 +50,7 @@ def _continue_run(stage: str, process: int, command: str) -> dict[str, Any]:
     run = io.read_json(STATE) if STATE.exists() else {}
     if run.get("process") != process or stage in run["started"]:
         run = {"process": process, "start_s": time.time(), "started": []}
-    if not run["started"] or run["started"] == [CODE]:  # with the digests, it is known which stages run
+    if not run["started"] or run["started"] == [CODE]:  # after stage code, the digests show which stages will run
         order = stages_in_order()
         later = _until_targets(order[order.index(stage) :], command)
         run["seconds"] = expected_seconds(Path(), [*run["started"], *planned(Path(), stage, later)])
@@ -59,7 +59,7 @@ def _continue_run(stage: str, process: int, command: str) -> dict[str, Any]:
 
 
 def _until_targets(stages: Sequence[str], command: str) -> list[str]:
-    """Return the stages that a command like `dvc repro report@mine` may run: those of the scene up to the target."""
+    """Return the stages that a command like `dvc repro report@mine` may run: the scene's stages up to the target."""
     targets = {word.rpartition(":")[2] for word in command.split()} & set(stages)
     if not targets:
         return list(stages)
@@ -69,7 +69,7 @@ def _until_targets(stages: Sequence[str], command: str) -> list[str]:
 
 
 def _same_scene(item: str, other: str) -> bool:
-    """Return whether two items, such as `quick` and `quick-wear`, are of one scene; stages without item are of all."""
+    """Return whether two items, such as `quick` and `quick-wear`, are of one scene; an empty item is of every scene."""
     return not item or not other or item == other or item.startswith(f"{other}-") or other.startswith(f"{item}-")
 
 
@@ -100,9 +100,10 @@ def _duration(seconds: float) -> str:
 
 
 def planned(root: Path, stage: str, later: Sequence[str]) -> list[str]:
-    """Return which stages DVC will probably run: `stage`, and those of `later` that are not up to date.
+    """Return the stages that DVC will probably run: `stage`, and the stages in `later` that are not up to date.
 
-    A stage that needs an output of another planned stage is included, although DVC skips it if that output stays equal.
+    A stage that needs an output of another returned stage is included, although DVC skips it if the output does not
+    change.
     """
     locked = read_yaml(root / LOCK)["stages"] if (root / LOCK).exists() else {}
     names, changing = [], [DIGESTS] if stage == CODE and not (root / DIGESTS).exists() else []
@@ -161,7 +162,7 @@ def _expected_s(name: str, costs: Mapping[str, Mapping[str, Any]]) -> float | No
     scene = max(scenes, key=len)
     part = item.removeprefix(scene).strip("-")
     cost = costs[scene].get(f"{stage}-{part}" if part else stage)
-    if cost is None:  # not in the report, because the stage runs after it or takes very little time
+    if cost is None:  # not in the report: the stage runs later, or takes very little time
         return START_S
     return START_S + _without_reuse_s(cost)
 
@@ -169,7 +170,7 @@ def _expected_s(name: str, costs: Mapping[str, Mapping[str, Any]]) -> float | No
 def _without_reuse_s(cost: Mapping[str, Any]) -> float:
     """Return the time that a stage takes if it reuses no training runs.
 
-    The stage's own time is at most its processor time, because a busy machine makes the elapsed time longer.
+    The stage's own elapsed time is limited to its processor time, because a busy machine makes the elapsed time longer.
     """
     own_s = min(cost["seconds"], cost["cpu_s"])
     reused = cost["reused_n"] / cost["trainings_n"] if cost["trainings_n"] else 0.0

@@ -27,7 +27,7 @@ def dvc_processes(root: Path) -> dict[int, str]:
     """Return the command of each DVC process that runs a stage in this checkout, by the id of the process."""
     try:
         content = io.read_json(root / DVC_FILES / RWLOCK)
-    except SchemaError:  # the file is missing, or broken, in which case DVC itself does not run
+    except SchemaError:  # the file is missing, or broken; with a broken file, DVC does not run
         return {}
     entries = [
         *content.get("write", {}).values(),

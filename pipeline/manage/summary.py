@@ -1,4 +1,4 @@
-"""Summarise the scenes of the plan: their main scores, whether these equal the committed ones, where to look next."""
+"""Summarise the planned scenes: main scores, whether these equal the committed scores, and where to look next."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -74,7 +74,7 @@ def _differences(parts: Mapping[str, Comparison]) -> str:
 
 
 def _probable_reasons(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> list[str]:
-    """Name what differs between the runs: the code, and versions of packages."""
+    """List what differs between the runs: the code, and versions of packages."""
     old, new = (
         {f"package {name}": version for name, version in side.get("versions", {}).items()}
         | {"code": side.get("trained"), "code of the report": side.get("git")}

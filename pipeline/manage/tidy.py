@@ -19,9 +19,9 @@ LOCK = "dvc.lock"
 
 
 def stale_outputs(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """List the stages that ran here and are no longer in the plan, with their outputs that no planned stage writes.
+    """List the stages that ran here but are no longer in the plan, with those outputs that no planned stage writes.
 
-    Stages in dvc.lock without outputs on disk are left out: they ran only in other clones.
+    Stages in dvc.lock without outputs on disk are left out, because they ran only in other clones.
     """
     if not (root / LOCK).exists():
         return {}
@@ -60,7 +60,7 @@ def _outs(stage: Mapping[str, Any]) -> list[Path]:
 
 
 def _overlaps(path: Path, others: Iterable[Path]) -> bool:
-    """Return whether a path equals, contains or is inside one of the others."""
+    """Return whether a path equals, contains or is inside one of the paths in `others`."""
     return any(path.is_relative_to(other) or other.is_relative_to(path) for other in others)
 
 

@@ -1,4 +1,4 @@
-"""`reskin verify-reports`: run scenes again in a clone of the last commit, without any cache, and compare reports."""
+"""`reskin verify-reports`: rerun scenes in a clone of the last commit, without any cache, and compare the reports."""
 
 import os
 import shutil
@@ -26,7 +26,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
     """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
     for name in names:
         plan.scene_file(root, name)
-    # Committed reports are read before the rerun, which takes hours, so that errors in them are found early.
+    # Committed reports are read first, so that errors in them are found before the rerun, which takes hours.
     committed = {name: read_revision(root, name, "HEAD") for name in names}
     if against is None:
         rerun(root, names)
@@ -35,7 +35,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 
 
 def rerun(root: Path, names: Sequence[str]) -> None:
-    """Run scenes in a clone of the last commit, and keep their reports."""
+    """Run scenes in a clone of the last commit, and keep the new reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
         say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit is run")
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
@@ -46,7 +46,7 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         environment = {**QUIET, **os.environ, PUBLISH: "0", "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            _clear(clone / "reports" / name)  # otherwise committed reports could pass as new ones
+            _clear(clone / "reports" / name)  # otherwise committed reports could be mistaken for new ones
         # --force: every stage runs, even if this machine's cache contains its outputs.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:

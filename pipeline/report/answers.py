@@ -1,6 +1,6 @@
 """Answer, from the numbers of a scene, whether its models work on a skin that was not in training.
 
-The place and the force of a contact are answered separately, by what a user has to do with the new skin.
+Place and force of a contact have separate answers. Each answer states what a user has to do with the new skin.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +39,7 @@ WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the fi
 
 @dataclass(frozen=True)
 class Effort:
-    """The scores of a model on new skins, and what it needs of a new skin; `paper` has the paper's means.
+    """Scores of a model on new skins, and the data that it needs of a new skin; `paper` has the paper's means.
 
     `role`: `answer` if this model gives the answer of the scene, `compared` if a sentence compares it with the answer.
     """
@@ -71,7 +71,7 @@ class Effort:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer for the place or the force of a contact: a level, the answer in short, and sentences with numbers."""
+    """The answer for the place or the force of a contact: a level, a short answer, and sentences with numbers."""
 
     quantity: str
     level: str
@@ -102,7 +102,7 @@ def answers(numbers: Results) -> Answers:
 def rms(mse: Stat | None) -> Stat | None:
     """Return the square root of a mean squared error, with its interval or the values of its boards.
 
-    Standard deviations are omitted, because that of the squared errors is not that of their square roots.
+    Standard deviations are omitted, because they are those of the squared errors, not of their square roots.
 
     >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]})
     {'mean': 0.5, 'n': 6, 'ci95': [0.4, 0.6]}
@@ -125,14 +125,14 @@ def in_words(percent: float) -> str:
 
 
 def level(stat: Stat, yes: float, partly: float) -> str:
-    """Return the level that a score reaches; a yes needs the whole interval, or all boards, at `yes` or above."""
+    """Return the level of a score; for a yes, the whole interval, or all boards, must be at `yes` or above."""
     if min(stat.get("ci95", stat.get("values", [stat["mean"]]))) >= yes:
         return YES
     return PARTLY if stat["mean"] >= partly else NO
 
 
 def _efforts(numbers: Results) -> Iterator[Effort]:
-    """Yield the models to show; the one that needs most of the new skin comes last."""
+    """Yield the models to show; the model that needs the most data of the new skin comes last."""
     if numbers.get("labels"):
         yield from _efforts_by_labels(numbers["labels"])
         return
@@ -149,7 +149,7 @@ def _efforts(numbers: Results) -> Iterator[Effort]:
 
 
 def _efforts_by_labels(rows: Sequence[Mapping[str, Any]]) -> Iterator[Effort]:
-    """Yield the first network without labels, then the universal model, if there is one, by number of labels."""
+    """Yield the first network without labels, then the universal model, if there is any, for each number of labels."""
     by_method: dict[tuple[str, str], dict[int, Mapping[str, Any]]] = {}
     for row in rows:
         by_method.setdefault((row["method"], row["inputs"]), {})[row["labels_n"]] = row["as_labelled"]
@@ -244,7 +244,7 @@ def _forces(numbers: Results) -> list[str]:
 
 
 def _within_skin(numbers: Results) -> Answers:
-    """Answer for a scene that holds out no board: not tested, with the scores on skins that were in training."""
+    """Answer `not tested` for a scene that holds out no board, with the scores on skins that were in training."""
     split = next((name for name in WITHIN_SKIN if name in numbers), None)
     tested = "This scene holds out no board, so it does not test new skins."
     if split is None:

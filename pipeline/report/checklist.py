@@ -27,8 +27,8 @@ METRICS = {
 }  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
 CLAIM = "claim: "
-NEAR = 0.10  # assumed: relative tolerance if the paper gives no sd
-SIZEABLE = 0.5  # assumed: a gain is sizeable if it is at least this fraction of the paper's difference
+NEAR = 0.10  # assumed: relative tolerance if the paper gives no standard deviation (sd)
+SIZEABLE = 0.5  # assumed: a gain is sizeable if it is at least this fraction of the paper's gain
 SIGNIFICANT = 0.05  # convention: a claim of the family is significant if its adjusted p-value is at most this
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less than this, in percentage points
 NONE = "–"
@@ -65,7 +65,7 @@ NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # the name of a number in the text o
 
 
 class Reach(Strict):
-    """Size of the paper's experiment (a constant of `pipeline.report.paper`) and of ours (a path in numbers.json)."""
+    """Sizes of the paper's experiment (a constant of `pipeline.report.paper`) and of ours (a path in numbers.json)."""
 
     paper: str
     ours: str
@@ -101,14 +101,14 @@ class Row(Strict):
         "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
         "setting", "target", "view",
     ] = "near"  # fmt: skip
-    signs: tuple[str, str] | None = None  # what a negative and a positive number mean, in words
+    signs: tuple[str, str] | None = None  # meaning of a negative and of a positive number, in words
     family: bool = False  # whether the claim belongs to the family whose p-values are adjusted by Holm's method
     reach: Reach | None = None
-    only: Literal["recorded", "simulated"] | None = None  # the only source whose scenes show the row
+    only: Literal["recorded", "simulated"] | None = None  # only scenes of this source show the row
     stage: str | None = None
     shown: tuple[str, ...] = ()
     why: str = ""  # a possible reason, shown if our result misses the criterion; {name} becomes the number at that path
-    why_simulated: str = ""  # the same, for simulated scenes only
+    why_simulated: str = ""  # like `why`, for simulated scenes only
 
     @property
     def metric(self) -> str:
@@ -118,7 +118,7 @@ class Row(Strict):
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on a claim, the criterion, whether our mean meets the criterion, the adjusted p-value, and notes."""
+    """Verdict on a claim, its criterion, whether our mean meets the criterion, adjusted p-value, and notes."""
 
     verdict: str = NONE
     criterion: str = NONE
@@ -198,9 +198,10 @@ def adjusted_p_values(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[s
 def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
     """Compute the p-value of a claim about differences over boards; None if too few boards were compared.
 
-    A claim about every number of training skins has one p-value per number of skins. The claim holds only if it holds
-    for every number, so the p-value of the claim is the largest one. If the results for some numbers significantly
-    contradict the claim, its p-value is the smallest p-value of these, with Bonferroni's correction for all numbers.
+    A claim about every number of training skins has one p-value per number of skins. Such a claim holds only if it
+    holds for every number of skins. Its p-value is therefore the largest of these p-values. If the results for some
+    numbers of skins significantly contradict the claim, its p-value is the smallest p-value of the contradicting
+    results, with Bonferroni's correction for all numbers of skins.
     """
     if isinstance(ours, Sequence):
         parts = [contrast["accuracy_pct"] for contrast in ours]
@@ -228,7 +229,7 @@ def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
 
 
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Judgement:
-    """Judge our result by the rule of the row; claims about means over boards get a verdict from their interval.
+    """Judge our result by the row's rule; the verdict on a claim about a mean over boards follows from its interval.
 
     `pooled`: whether some network was trained on several skins. `simulated`: whether the readings are simulated.
     """
@@ -318,7 +319,7 @@ def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
 
 
 def sizeable(printed: float | None) -> float:
-    """Return the gain that counts as sizeable: half of the paper's own difference."""
+    """Return the smallest sizeable gain: half of the paper's own gain."""
     assert printed is not None, "a row with rule `sizeable` has a difference of the paper"
     return SIZEABLE * abs(printed)
 
@@ -357,7 +358,7 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
 
 
 def mean_of(value: Any) -> float | None:
-    """Return a number as a float: the mean of a summary or of a pair (mean, sd), or a plain number; else None."""
+    """Return the mean of a summary or of a pair (mean, sd), or a plain number, as a float; None for other values."""
     if isinstance(value, Mapping):
         return value.get("mean")
     if isinstance(value, tuple):
@@ -366,7 +367,7 @@ def mean_of(value: Any) -> float | None:
 
 
 def _paper_in_interval(printed: Any, ours: Any) -> str:
-    """Say whether our interval over boards includes the paper's number, if both exist."""
+    """If both exist, say whether our interval over boards includes the paper's number."""
     mean = mean_of(printed)
     if mean is None or not isinstance(ours, Mapping) or "ci95" not in ours:
         return NONE
@@ -385,7 +386,7 @@ def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
 
 
 def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
-    """Return the row's possible reason, with its numbers filled in, if our mean does not meet the criterion."""
+    """If our mean does not meet the criterion, return the row's possible reason with the numbers filled in."""
     why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
     if not why or judgement.met != "no":
         return []
@@ -409,7 +410,7 @@ def _see(row: Row) -> str:
 
 
 def _show(row: Row, value: Any) -> str:
-    """Write a number with its unit, which is taken from a suffix in the path `ours`; differences get a sign."""
+    """Write a number with the unit that a suffix of the path `ours` states; differences get a sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
     if row.rule in DIFFERENCES:

@@ -21,7 +21,7 @@ COMPUTED = (
     "training runs that were completed before."
 )
 MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
-# The size of rounding errors. Smaller errors are drawn at this value, because the axis is logarithmic.
+# Size of rounding errors. Smaller errors are drawn at this value, because a logarithmic axis cannot show 0.
 ERROR_SHOWN_MIN = 1e-16
 
 Row = Mapping[str, Any]
@@ -92,7 +92,7 @@ def stage_costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
 
 
 def study_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List every method and setting of a study: its work, error and time, or the reason for its failure."""
+    """List every method and setting of a study with its work, error and time, or with the reason for its failure."""
     lines = [
         {
             "study": row["study"],
@@ -115,7 +115,7 @@ def _time(row: Row, name: str) -> str:
 
 @dataclass(frozen=True)
 class Point:
-    """A method or setting in a figure of error against cost; `trade_off` labels only the Pareto front."""
+    """A method or setting in a figure of error against cost; `trade_off` labels only points on the Pareto front."""
 
     name: str
     label: str
@@ -124,7 +124,7 @@ class Point:
 
 
 def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
-    """Draw the errors of methods against the cost `key` on logarithmic axes; a step line joins the Pareto front."""
+    """Draw errors of methods against cost `key` on logarithmic axes; a step line joins points on the Pareto front."""
     points = trade_off_points(rows, key)
     members = [point for point in points if point.label]
     with drawing(4.7, 6.4) as figure:
@@ -132,7 +132,7 @@ def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
         for point in points:
             mark = axes.plot(*point.position, **point.look, linestyle="none")[0]
             mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
-            # A point on the front has no other point to its lower left.
+            # No point is to the lower left of a point on the Pareto front.
             style = {"xytext": (-5, -5), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
             axes.annotate(point.label, point.position, **style)
         steps = zip(*(point.position for point in members), strict=True)
@@ -220,8 +220,9 @@ def draw_study(
 ) -> str:
     """Draw error against median time on logarithmic axes, with one panel per study; list failures below the panels.
 
-    Each method has its own colour and marker, and a line joins its Pareto front. `limit` is drawn as a line. `rings`
-    maps a label to the study, method and setting of a point that gets a ring. Rows that were not timed are left out.
+    Each method has its own colour and marker, and a line joins the points on its Pareto front. `limit` is an error that
+    is drawn as a line. `rings` maps a label to the study, method and setting of a point that is marked with a ring.
+    Rows that were not timed are left out.
     """
     studies = list(dict.fromkeys(row["study"] for row in rows))
     methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]
@@ -266,7 +267,7 @@ def draw_study(
 
 
 def failures(rows: Rows) -> list[str]:
-    """List failures: one line per method and kind of failure, with the settings that failed in each study."""
+    """List failures, with one line per method and kind of failure that names the failed settings of each study."""
     failed: dict[tuple[str, str], dict[str, list[str]]] = {}
     for row in rows:
         if row["failure"] is not None:

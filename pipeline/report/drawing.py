@@ -1,6 +1,6 @@
 """SVG figures in a common style, whose marks show their values on hover.
 
-Matplotlib is imported in the functions that draw, so that modules that mainly compute do not load it.
+Matplotlib is imported inside the functions that draw, so that modules that mainly compute do not load Matplotlib.
 """
 
 import io
@@ -18,10 +18,10 @@ MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which wou
 # Matplotlib writes the marks of an artist as <use> tags if there are many, and as <path> tags if there are few.
 USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")
 GROUP = re.compile(r"<g[ >]|</g>")
-# Titles by id of an SVG group: one title per mark, in order, or one title for a line without marks.
+# Titles by the id of an SVG group: one title per mark, in the order of marks, or one title for a line without marks.
 Titles = Mapping[str, list[str]]
 Format = Callable[[float], str]
-FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana, the fallback, has letters of the same width
+FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # the fallback Verdana has letters of the same width
 # Removed from the file: indentation, metadata, comments, and the digits of coordinates beyond a hundredth of a point.
 REMOVED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
 COORDINATES = re.compile(r' (d|x|y|transform)="[^"]*"')
@@ -53,7 +53,7 @@ def name_marks(figure: Any) -> Titles:
 
 
 def put_titles(svg: str, titles: Titles) -> str:
-    """Write titles into the SVG groups with the given ids, unless the numbers of marks and titles of a group differ."""
+    """Write titles into the SVG groups with the given ids; skip a group whose numbers of marks and titles differ."""
     for name, texts in titles.items():
         before, head, after = svg.partition(f'<g id="{name}">')
         if head:  # the group is missing if nothing was drawn
@@ -127,7 +127,7 @@ def _value_format(axes: Any, which: str) -> Format:
     axis, siblings = getattr(axes, f"{which}axis"), getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
     labels = [labelled.get_label_text() for labelled in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
     name = " ".join(next((label for label in labels if label), which).split())
-    fixed = type(axis.get_major_locator()).__name__ == "FixedLocator"  # ticks that were set may have names
+    fixed = type(axis.get_major_locator()).__name__ == "FixedLocator"  # ticks at fixed positions may have names
     positions = axis.get_majorticklocs() if fixed else ()
     texts = zip(positions, axis.get_major_formatter().format_ticks(positions), strict=True)
     ticks = {position: " ".join(text.split()) for position, text in texts if any(map(str.isalpha, text))}
@@ -164,6 +164,7 @@ def svg(figure: Any, *, column: bool = True) -> str:
     buffer, titles = io.StringIO(), name_marks(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
-    # Matplotlib writes one font family for formulas. The others are added, or else browsers may use a serif font.
+    # For formulas, Matplotlib writes only one font family. The other families are added, because browsers without this
+    # family could use a serif font.
     text = text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\"")
     return put_titles(text.replace("</style>", f"{DARK}</style>", 1), titles)

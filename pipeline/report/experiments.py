@@ -1,6 +1,6 @@
 """Tables, figures, page sections and checklist rows that experiments add to a report.
 
-The module of an experiment makes its tables and figures; its YAML file has its section and its checklist rows.
+An experiment's module makes its tables and figures; its YAML file contains its section and its checklist rows.
 """
 
 from collections.abc import Iterable, Mapping

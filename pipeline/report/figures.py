@@ -21,22 +21,22 @@ from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 HEADLINE = "headline.svg"
 FORCE = "headline_force.svg"
 HEADLINES = {HEADLINE: ("accuracy_pct", "mse_xy_mm2"), FORCE: ("mse_f_N2", "r2_f")}  # metrics of places and of forces
-UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # the same, for boards that were never seen in training
+UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # metrics for boards that were never seen in training
 LABELS = "labels.svg"
-OFFSET = 0.17  # fraction of a row's height by which one mark is above the row's middle, and the other below it
+OFFSET = 0.17  # distance of both marks of a row from the row's middle, as a fraction of its height
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
 TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
 CHIP_MM = 3.0  # side of a chip
-MARGIN_MM = 0.5  # of the axes around the skin
+MARGIN_MM = 0.5  # margin of the axes around the skin
 # Metrics in figures, with their possible range.
 RANGES = {
     "accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf), "mse_f_N2": (0.0, np.inf), "r2_f": (-np.inf, 1.0),
 }  # fmt: skip
 MANY_N = 4  # a legend with so many entries has several columns
 SWEPT = ("accuracy_pct", "mse_xy_mm2")
-R2_MIN = -1.0  # a smaller R² is outside the axis: such a model is much worse than a constant
+R2_MIN = -1.0  # models with a smaller R² are much worse than a constant, and are outside the axis
 # The axis of the number of pokes is linear below this number, because a logarithmic axis cannot show 0.
 LINEAR_BELOW_N = 65
 SENSOR_METHODS = ("multi", "triplet", "adapted")
@@ -59,7 +59,7 @@ Rows = Sequence[Mapping[str, Any]]
 class Outline:
     """The outline of a skin, and the centres of the chips below it, in the coordinates of the labels."""
 
-    corner_mm: tuple[float, float]  # least x and y of the skin
+    corner_mm: tuple[float, float]  # smallest x and y of the skin
     sides_mm: tuple[float, float]
     chips_mm: Sequence[tuple[float, float]]
 
@@ -69,10 +69,10 @@ PAPERS_SKIN = Outline((-2.0, -2.0), (20.0, 20.0), ((8.0, 8.0), (1.0, 8.0), (15.0
 
 
 def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the scores on held-out boards, if there are any: places in one figure and forces in the other.
+    """Draw the scores on held-out boards, if there are any, with places in one figure and forces in another.
 
-    The figures show boards that were never seen in training, by number of labels; or otherwise the rows of table 2. If
-    the scene compares methods by number of labels, there is a figure of all methods too.
+    The figures show boards that were never seen in training, by number of labels; or, if there are none, the rows of
+    table 2. If the scene compares methods by number of labels, another figure shows all methods.
     """
     figures = {LABELS: labels_figure(numbers, source)} if "labels" in numbers else {}
     if rows := boards_rows(numbers):
@@ -144,7 +144,7 @@ def _limit(axes: Any, metric: str) -> None:
 
 
 def spread_of(scores: Mapping[Any, Mapping[str, Any]]) -> str:
-    """Name what the bars of scores by name show; scores with another kind of bars than most are named."""
+    """Say what the bars of scores show; name the scores whose bars are of another kind than most bars."""
     kinds = {name: _spread(row["accuracy_pct"]) for name, row in scores.items()}
     most = Counter(kinds.values()).most_common(1)[0][0]
     others = [f"{name}: {kind}" for name, kind in kinds.items() if kind != most]
@@ -179,8 +179,8 @@ def unseen_boards(
 ) -> str:
     """Draw places within 1 mm and rms errors of forces on boards never seen in training, by number of labels.
 
-    Each mark is one board. The paper's table 2 is below, as another kind of mark. A metric that the results lack has no
-    panel. `large`: for README.md, with panels beside each other and large letters.
+    Each mark is one board. Scores of the paper's table 2 are below, with other marks. A metric that the results lack
+    has no panel. With `large`, for README.md, panels are beside each other and have large letters.
     """
     rows = boards_rows(numbers)
     metrics = [metric for metric in metrics if all(metric in row for row in rows)]
@@ -224,7 +224,7 @@ def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:
 
 
 def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: float) -> None:
-    """Draw a metric of the paper's table 2 below ours on other skins; the bars of rms errors are not symmetric."""
+    """Draw a metric of the paper's table 2, for other skins, below ours; the bars of rms errors are not symmetric."""
     means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
     low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
     look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
@@ -233,7 +233,7 @@ def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: flo
 
 
 def papers_row(metric: str) -> list[Number]:
-    """Return a metric of the paper's table 2 in the rows that are beside ours."""
+    """Return a metric of those rows of the paper's table 2 that a figure of unseen boards shows."""
     return [TABLE_2[row][metric] for row in PAPERS_ROWS]
 
 
@@ -274,7 +274,7 @@ def _finish(figure: Any, title: str, letters_pt: float = 9.0, *, note: str = "")
     figure.suptitle(title, x=0.01, ha="left", fontsize=letters_pt + 1)
 
 
-HELD_OUT = {  # of the predictions in maps, by experiment
+HELD_OUT = {  # what is held out in a map of position errors, by experiment
     "single_random": "one skin, random readings held out",
     "single_indentation": "one skin, indentations held out",
     "single_pass": "one skin, passes held out",
@@ -363,7 +363,7 @@ def _places(table: pa.Table, side: str) -> Any:
 
 @dataclass(frozen=True)
 class Line:
-    """One line of a sweep: its counts and scores, and how they are drawn."""
+    """One line of a sweep: its counts and scores, and the style in which they are drawn."""
 
     name: str
     counts: Sequence[int]
@@ -412,8 +412,8 @@ def sweep_sensors(rows: Rows, source: str) -> str:
 def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Compute means and the lengths of their error bars (down, up), which show the interval over boards.
 
-    With few boards, bars reach from the smallest to the largest value. For statistics that are not over boards,
-    such as the paper's, bars extend one standard deviation to each side. All bars are clipped to possible values.
+    With few boards, bars reach from the smallest to the largest value. For statistics that are not over boards, such as
+    the paper's, bars extend by one standard deviation to each side. All bars are clipped to possible values.
     """
     means = np.array([row[metric]["mean"] for row in scores])
     ends = np.array([_ends(row[metric]) for row in scores]).clip(*RANGES[metric])

@@ -12,11 +12,12 @@ import pandas as pd
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.statistics import UNDECIDED, negate
 
-# Keys `mean` and `n`; if known, also `sd`, and `ci95` ([low, high]) or `values` (one value per board, for few boards).
+# A statistic with keys `mean` and `n`. If known, it also has `sd`, and either `ci95` ([low, high]) or, for few boards,
+# `values` (one value per board).
 Stat = Mapping[str, Any]
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
-FORCE_METRICS = ("mse_f_N2", "r2_f")  # an offset of positions does not change them
+FORCE_METRICS = ("mse_f_N2", "r2_f")  # metrics that do not depend on offsets of positions
 PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
 FEW_POINTS = 5.0  # assumed; the paper says of a drop of 3.4 points that it "slightly affects performance"
 MEANING = (
@@ -44,7 +45,7 @@ DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
 
 
 def reworded(text: str) -> str:
-    """Replace the verdict `UNDECIDED`, as the results of experiments write it, by the word that reports show.
+    """Replace the verdict `UNDECIDED` of experiments by the word that reports show.
 
     >>> reworded("undecided: +0.1"), reworded("Undecided: the interval includes the threshold.")
     ('inconclusive: +0.1', 'Inconclusive: the interval includes the threshold.')
@@ -54,7 +55,7 @@ def reworded(text: str) -> str:
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean, then its interval over boards or else its sd, and its sd over seeds; see `decimals`."""
+    """Write a mean, its interval over boards (or else its sd), and its sd over seeds, rounded as in `decimals`."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -63,7 +64,7 @@ def show(value: Stat | None) -> str:
 
 
 def show_deviation(value: Stat) -> str:
-    """Write a mean with its standard deviations over the n values and over seeds, if these are known."""
+    """Write a mean with its standard deviations over the n values and over seeds, if they are known."""
     over_n = f" ± {_rounded_sd(value, 'sd')}" if "sd" in value else ""
     return f"{_rounded_mean(value)}{over_n}{_show_seeds(value)}"
 
@@ -92,8 +93,8 @@ def decimals(value: Stat) -> int | None:
     """Return the number of decimals at which the uncertainty of a mean has two significant digits.
 
     The uncertainty is half of the interval over boards, half of the range of a few boards' values, or else the standard
-    deviation. The mean gets at most four significant digits, or three if there are few boards. If that would round an
-    end of the interval to 0, all get another digit, should it help. Returns None without an uncertainty, or if the
+    deviation. The mean gets at most four significant digits, or three if there are few boards. One more decimal is used
+    if it prevents an end of the interval from being rounded to 0. Returns None if there is no uncertainty, or if the
     numbers are too small to be written without an exponent.
 
     >>> decimals({"mean": 78.7, "n": 6, "ci95": [72.1234, 84.2234]}), decimals({"mean": 1234.5, "n": 3, "sd": 8.0})
@@ -122,7 +123,7 @@ def _rounded_mean(value: Stat) -> str:
 
 
 def _rounded_sd(value: Stat, name: str) -> str:
-    """Write a standard deviation with the decimals of its mean, or with one digit if these would round it to 0."""
+    """Write a standard deviation with the decimals of its mean, or with one significant digit instead of 0."""
     digits, sd = decimals(value), value[name]
     text = f"{sd:.2g}" if digits is None else f"{sd:.{digits}f}"
     return text if float(text) or not sd else f"{sd:.1g}"
@@ -138,7 +139,7 @@ def show_digits(value: Stat, digits: int) -> str:
 
 
 def show_both(value: Stat | None) -> str:
-    """Write a mean with both its standard deviation, as in the paper, and its interval over boards."""
+    """Write a mean with its standard deviation, which the paper also gives, and with its interval over boards."""
     if value is None or not {"ci95", "values"} & set(value):
         return show(value)
     return f"{show_deviation(value)} {show_interval(value)}"
@@ -150,7 +151,7 @@ def show_difference(value: Stat | None) -> str:
 
 
 def gain(difference: Stat, metric: str) -> Stat:
-    """Return the difference with a sign such that positive is better: differences of errors are negated."""
+    """Return the difference with a sign such that positive is better; differences of errors are negated."""
     return negate(difference) if metric.startswith("mse_") else difference
 
 
@@ -176,7 +177,7 @@ def scored(row: Mapping[str, Any]) -> dict[str, str]:
 def beside(
     row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
-    """Write every metric of a row, the paper's value of this metric (`printed`) and n; return cells by column title."""
+    """Write each metric of a row, the paper's value of it (`printed`), and n, as text; return cells by column title."""
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}
@@ -190,7 +191,7 @@ def n_of(row: Mapping[str, Any]) -> str:
 
 
 def tabulate(lines: Sequence[Mapping[str, str]], **notes: str) -> pd.DataFrame:
-    """Make a table with notes to show below it: `meaning`, and `spread`, which explains ± and brackets."""
+    """Make a table with two notes to show below it: `meaning`, and `spread`, which explains ± and brackets."""
     table = pd.DataFrame(lines)
     table.attrs.update(notes)
     return table
@@ -223,7 +224,7 @@ def rounded(value: Any, digits: int = 6) -> Any:
 
 @dataclass(frozen=True)
 class Model:
-    """A row of table 2: its title, a short title, and the paper's scores (empty if the paper has no such row)."""
+    """A row of table 2: title, short title, and the paper's scores (empty if the paper has no such row)."""
 
     title: str
     short: str
@@ -231,7 +232,7 @@ class Model:
 
 
 def models(numbers: Results) -> dict[str, Model]:
-    """Return the rows of table 2 in the paper's order; their titles mention if there was only one training skin."""
+    """Return the rows of table 2 in the paper's order; titles say so if networks had only one training skin."""
     titles = TABLE_2_ROWS | {"control": CONTROL}
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
         pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"

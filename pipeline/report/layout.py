@@ -5,21 +5,21 @@ from itertools import pairwise
 from textwrap import fill
 from typing import Any
 
-WIDTH_IN = 4.7  # greatest width of a figure whose panels are in one column
-LEGIBLE_PT = 8.0  # least size of letters; on a phone, a figure of this width is shown at about its size in points
-PANEL_IN = (1.3, 2.3)  # least and greatest height of a panel that was beside others
-EDGE_PT, HANDLE_PT = 10.0, 40.0  # width of a legend's edge, and of the edges and the handle of an entry
+WIDTH_IN = 4.7  # largest width of a figure whose panels are in one column
+LEGIBLE_PT = 8.0  # smallest size of letters; a phone shows a figure of this width at about its size in points
+PANEL_IN = (1.3, 2.3)  # smallest and largest height of a panel that was in a row of panels
+EDGE_PT, HANDLE_PT = 10.0, 40.0  # widths: edge of a legend; edges and handle of one entry
 SHORTEST_N = 12  # letters; shorter lines are not broken
-GAP_PT = 2.0  # least distance between the labels of neighbouring ticks
+GAP_PT = 2.0  # smallest distance between the labels of neighbouring ticks
 PLAIN = (1e-3, 1e4)  # range of numbers that logarithmic axes show without an exponent
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def lay_out(figure: Any, *, column: bool = True) -> None:
-    """Lay out a figure, and turn its layout engine off, so that saving does not lay it out again.
+    """Lay out a figure, and turn off its layout engine, so that saving the figure does not change the layout.
 
-    A row of panels becomes a column, and titles and legends are broken into lines of the figure's width, unless
-    `column` is False. Figures with several rows and columns of panels keep them.
+    Unless `column` is False, a row of panels becomes a column, and titles and legends are broken into lines that fit
+    the figure's width. Figures with several rows and columns of panels keep them.
     """
     from matplotlib.text import Text
 
@@ -59,14 +59,14 @@ def _put_in_column(figure: Any, panels: Sequence[Any], *, beside: bool) -> None:
 
 
 def _set_heights(figure: Any, panels: Sequence[Any], heights_in: Sequence[float]) -> None:
-    """Set the height of a figure such that its panels have these heights together."""
+    """Set the height of a figure such that the heights of its panels have the sum of `heights_in`."""
     _execute(figure)
     missing_in = sum(heights_in) - sum(map(_height_in, panels))
     figure.set_figheight(max(figure.get_figheight() + missing_in, 1.0))
 
 
 def _fit_texts(figure: Any, panels: Sequence[Any]) -> None:
-    """Break or turn texts that are longer than the figure's current layout allows."""
+    """Break or rotate texts that are longer than the figure's current layout allows."""
     for axes in panels:
         _turn_overlapping_labels(axes)
     for text, width in _texts(figure):
@@ -140,7 +140,7 @@ def _texts(figure: Any) -> Iterator[tuple[Any, float]]:
 
 
 def _break_lines(text: Any, width: float) -> None:
-    """Break the lines of a text that are longer than `width`, in pixels of the figure; the text may be turned."""
+    """Break the lines of a text that are longer than `width`, in pixels of the figure; the text may be rotated."""
 
     def length() -> float:
         extent = text.get_window_extent()
@@ -161,7 +161,7 @@ def _turn_overlapping_labels(axes: Any) -> None:
 
 
 def _label_powers(axes: Any) -> None:
-    """Label logarithmic axes at powers of ten, or also between them if fewer than two are shown."""
+    """Label logarithmic axes at powers of ten, and also between them if fewer than two powers are in the range."""
     from matplotlib.ticker import FuncFormatter, LogFormatter, LogLocator, NullFormatter
 
     for axis in (axes.xaxis, axes.yaxis):

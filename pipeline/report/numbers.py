@@ -38,19 +38,19 @@ Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[dict[str, Any]]]
 Seconds = Sequence[Row]  # times of training runs: name, train_s, one_reading_s
 
-CONTROL = "control"  # the recipe of adaptation that fine-tunes for as many steps, without the new skin's pokes
-# Pairs of rows of table 2: the scores of the first minus those of the second are computed.
+CONTROL = "control"  # recipe of adaptation that fine-tunes for equally many steps, without the new skin's pokes
+# Pairs of rows of table 2. The scores of the second row are subtracted from those of the first row.
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
-PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these that the scene ran is compared with the paper
+PAPERS_SPLITS = ("single_random", "single_temporal")  # the first one that the scene ran is compared with the paper
 STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # splits by indentation or pass
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # experiment by method
 OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
-# By experiment: the key of its sweep in numbers.json, and the key of the count on the x axis.
+# For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
@@ -58,7 +58,7 @@ SINGLE = {
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
 HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
-SEEN_PCT = 25.0  # assumed: if a hovering tip is located with this accuracy, the chips sense the tip itself
+SEEN_PCT = 25.0  # assumed: if a hovering tip is located with at least this accuracy, the chips sense the tip
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
 TOUCHES_METRICS = ("single_touches_pct", "mean_left_over_pct")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
@@ -113,7 +113,7 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of methods with their training times on this machine; untimed methods have no times."""
+    """Join the errors of methods with their training times on this machine, if these were measured."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
@@ -149,7 +149,7 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _protocol(table: pd.DataFrame, headline: str) -> dict[str, dict[str, int]]:
-    """Count what networks were trained and tested on, by experiment: boards, skins, folds, seeds and rows per fold."""
+    """Count boards, skins, folds, seeds and rows per fold for training and testing, by experiment."""
     counts = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
     networks = select(table[table["question"].isin(names)], recipe=headline)
@@ -181,7 +181,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of experiments of kind `models`: over pairs, over repeats on one skin, or over boards."""
+    """Summarise every recipe of the experiments of kind `models` over skin pairs, repeats on one skin, or boards."""
     numbers: dict[str, dict[str, Any]] = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
     models = table[table["question"].isin(names)]
@@ -222,8 +222,8 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6a.
 
-    Three differences are computed: fewest pokes minus no pokes; the number of pokes at which the paper's plateau begins
-    minus no pokes; and most pokes minus the number at which the plateau begins.
+    Three differences are computed: fewest pokes minus no pokes, plateau minus no pokes, and most pokes minus plateau.
+    Here, plateau means the number of pokes at which the paper's plateau begins.
     """
     groups = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in groups or len(groups) < 2:
@@ -241,8 +241,8 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6b.
 
-    Three kinds of differences are computed: most training skins minus fewest; adapted networks minus other networks;
-    and the gain from adaptation with the fewest training skins minus the gain with the most.
+    Three kinds of differences are computed: most training skins minus fewest training skins, adapted networks minus
+    other networks, and the gain from adaptation with the fewest training skins minus the gain with the most.
     """
     groups = {
         (method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])
@@ -282,7 +282,7 @@ def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
-    """Score a constant prediction, the mean tested force; its MSE is the variance of the force, MSE_F / (1 - R^2)."""
+    """Score a constant prediction, the mean of the tested forces; its MSE is their variance, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
     tested = tested[tested["r2_f"] < 1]
     variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
@@ -296,7 +296,7 @@ def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> It
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Return the median times of a method's training runs; those of adapted networks include pretraining."""
+    """Return the median times of a method's training runs; the times of adapted networks include pretraining."""
     experiment = NETWORKS.get(row["method"])
     if experiment is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
@@ -330,8 +330,8 @@ def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
     """Summarise the scores of positions that were predicted from readings before the contact.
 
-    `before_touch`: scores by experiment and predictor, summarised over folds. `hover`: for each fold (a skin), scores
-    of the position of a hovering tip, and `seen`, whether the chips sense the tip itself.
+    `before_touch`: scores by experiment and predictor, summarised over folds. `hover`: for each fold (one skin), the
+    scores of the position of a hovering tip, and `seen`, which says whether the chips sense the tip itself.
     """
     before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
@@ -352,7 +352,7 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count training runs by experiment: all, those that collapsed, and collapsed runs that were kept."""
+    """Count training runs by experiment: all runs, collapsed runs, and collapsed runs that were kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
@@ -377,7 +377,7 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
 def runtime_numbers(
     trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
 ) -> dict[str, Any]:
-    """Return the cost of each stage, and the results of experiment runtime (`study`) with the times on this machine."""
+    """Return the cost of each stage, and the results of experiment runtime (`study`) with times on this machine."""
     numbers: dict[str, Any] = {
         "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
     }  # fmt: skip
@@ -430,7 +430,7 @@ def join(numbers: Row, provenance: Row) -> dict[str, Any]:
 def headline_scores(numbers: Row) -> dict[str, Any]:
     """Select a scene's headline scores, nested by experiment: means with units in their names.
 
-    They contain nothing that differs between repeats of a run, such as times, commit or machine.
+    The scores contain nothing that differs between repeats of a run, such as times, commit or machine.
     """
     recorded = {
         name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
@@ -464,7 +464,7 @@ def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
 
 
 def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
-    """Select the most accurate method with the fewest labels of the new board, and the most accurate with the most."""
+    """Select the most accurate method with the fewest labels of the new board, and that with the most labels."""
     selected = {}
     counts = [row["labels_n"] for row in rows]
     for labels_n in sorted({min(counts), max(counts)}):

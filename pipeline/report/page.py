@@ -33,17 +33,17 @@ SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that na
 SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
 SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
-# Tables that are unfolded when the page loads; all others are folded.
+# Tables that are unfolded when the page loads; all other tables are folded.
 OPEN = {"table1", "table2", "labels", "claims", "final_model"}
-WHOLE = ("verdicts", "checklist")  # sections of the whole list of claims or results
-BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
+WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
+BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist lists all
 EFFORTS = "Scores on new skins, by model and by what the model needs of the new skin"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# No line break is allowed between a number and its deviation, or between an interval and its unit.
+# Places where no line break is allowed: between a number and its deviation, and between an interval and its unit.
 UNBROKEN = re.compile(
     r"(?<=\d) ± (?=\d)|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?"
 )
@@ -51,21 +51,22 @@ SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 LONG = 40  # characters; a column with a longer cell is wide
-NO_VALUE = ("–", "")  # cells that are not shown if the rows of a table are stacked
-# Widths of a table in rem: a table that is wider than its place on the screen is shown with its rows stacked.
+NO_VALUE = ("–", "")  # cells that are hidden if the rows of a table are stacked
+# Widths in rem, which estimate the width of a table. If a table is wider than its place on the screen, its rows are
+# stacked, with the cells of each row below each other.
 STEPS_REM = (18, 22, 26, 30, 36, 42, 48, 54, 60, 65, 70, 76, 90, 110, 140)
-CHARACTER_REM, PADDING_REM = 0.52, 1.0  # widths of a character and of a cell's padding
-SHORT_LINE, LONG_LINE = 14, 20  # characters in a line of a short cell and of a long one, if it is wrapped
+CHARACTER_REM, PADDING_REM = 0.52, 1.0  # width of a character, and of the padding of a cell
+SHORT_LINE, LONG_LINE = 14, 20  # characters in a line of a wrapped cell, for short cells and for long cells
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
 LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; in these files, 1 px means 1 pt
 PX_PER_PT = 4 / 3
 WIDE_PT = 500.0  # a wider figure gets its own row
-LEGIBLE_PX = 8.0  # smallest legible letters; a figure scrolls before its letters become smaller
+LEGIBLE_PX = 8.0  # size of the smallest legible letters; a figure scrolls instead of shrinking further
 NARROW_PX = 340.0  # width of a phone's screen
 
 
 class Place(Strict):
-    """A table or figure of the paper: its name there, what it shows, and the tables and figures that show it here."""
+    """A table or figure of the paper: its name, what it shows, and our tables and figures that show the same."""
 
     id: str
     name: str
@@ -99,11 +100,11 @@ class Drawing:
     height_px: int
     least_px: int
     wide: bool
-    sentence: str = ""  # what it shows, or what to look for
+    sentence: str = ""  # what the figure shows, or what to look for
 
     @property
     def scrolls(self) -> bool:
-        """Whether the figure scrolls on a phone, because it is legible only if it is wider than the screen."""
+        """Whether the figure scrolls on a phone, because its letters are illegible at the width of the screen."""
         return self.least_px > NARROW_PX
 
 
@@ -111,7 +112,7 @@ class Drawing:
 class Table:
     """A table on the page; `looks` has the style of each column: `number` (aligned right), `text` or `text long`.
 
-    In a place narrower than `width_rem`, the rows of the table are stacked.
+    If the table's place on the screen is narrower than `width_rem`, the rows of the table are stacked.
     """
 
     id: str
@@ -126,7 +127,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes: its name, what it is, counts of captures, its answers and headline figure."""
+    """A scene on the page of all scenes: name, description, counts of captures, answers and headline figure."""
 
     scene: str
     about: str
@@ -137,7 +138,7 @@ class Entry:
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of a scene, which is the same for every repeat of a run; `figures`: SVG text by file name."""
+    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name."""
     source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
     drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
     drawings = describe(drawings, sentences(numbers))
@@ -173,7 +174,7 @@ def read_places() -> list[Place]:
 
 
 def ids_of(names: Iterable[str]) -> dict[str, str]:
-    """Return the id of each table and figure on a page; those that show one of the paper's have the paper's name."""
+    """Return the id of each table and figure on a page; the paper's name is the id of those that the paper also has."""
     papers: dict[str, str] = {}
     shown = list(names)
     for place in read_places():
@@ -201,7 +202,8 @@ def efforts_table(name: str, answered: Answers) -> Table | None:
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
 
-    numbers: numbers.json joined with provenance.json. costs: text of the other files in the folder, by file name.
+    numbers: numbers.json joined with provenance.json. costs: texts of the other files in the folder of the page, by
+    file name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
@@ -230,7 +232,7 @@ def index(
 ) -> str:
     """Render the page of all scenes, with recorded scenes first.
 
-    headlines: headline figures by scene. described: what a scene is, by scene.
+    headlines: headline figures by scene. described: descriptions by scene.
     """
     kinds = []
     for source, title in KINDS.items():
@@ -255,7 +257,7 @@ def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str], described: 
 
 
 def about_scene(text: str) -> str:
-    """Return what a scene is: the first sentence of the comment at the top of its YAML file.
+    """Return the description of a scene: the first sentence of the comment at the top of its YAML file.
 
     >>> about_scene("# Scene ini: two boards, pressed\\n# by a printer. One is new.\\nsource: recorded")
     'Two boards, pressed by a printer.'
@@ -295,7 +297,7 @@ def read_sections() -> list[Section]:
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
-    """List the sections with tables or figures to show; section `further` shows those that no other section names."""
+    """List the sections to show; section `further` has the tables and figures that no other section names."""
     sections, names = read_sections(), {"tables": dict.fromkeys(tables), "figures": dict.fromkeys(figures)}
     named = {name for section in sections for name in section.captions}
     further = {kind: {name: _title(name) for name in of_kind if name not in named} for kind, of_kind in names.items()}
@@ -322,7 +324,7 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
 
 
 def beside_paper(section: Section, checklist: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table | None:
-    """Tabulate the checklist rows of a section that contain a number of ours; rows with verdicts come first."""
+    """Tabulate the checklist rows of a section that contain a number of this scene; rows with verdicts come first."""
     rows = [row for row in _rows_of(section, checklist) if _has_number(row["ours"]) and row["note"] != ONE_SKIN]
     if not rows:
         return None
@@ -336,7 +338,7 @@ def _has_number(cell: str) -> bool:
 
 
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
-    """List the stages whose results a section shows, each with the file of its code."""
+    """List the stages whose results a section shows, each with the file that contains the code of the stage."""
     stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
     return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
 
@@ -363,15 +365,15 @@ def measure(file: str, svg: str, id: str) -> Drawing:
 
 
 def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
-    """Add to each figure its sentence, if there is one for its name."""
+    """Add the sentence about each figure to the figure, if there is a sentence for its name."""
     return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
 
 
 def lay_out(name: str, caption: str, table: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table:
     """Prepare a table for the page: how its columns look, its cells as text, its notes and its width.
 
-    A column `source` with one value is moved to the caption. Tables with verdicts have one column on how each verdict
-    came about, instead of several. `ids`: ids of the tables and figures on the page, to which cells link.
+    If column `source` has a single value, the value is moved to the caption. In tables with verdicts, the columns that
+    explain the verdict are joined. `ids` contains the ids of the tables and figures on the page, to which cells link.
     """
     cells = table.fillna("")
     if "source" in cells and cells["source"].nunique() == 1:
@@ -401,7 +403,7 @@ def link(result: str, shown_in: str, ids: Mapping[str, str]) -> str:
 
 
 def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
-    """Join the columns on how a verdict came about: criterion, p-value and notes."""
+    """Join the columns that explain a verdict: criterion, p-value and notes."""
     parts = {"criterion": "{}", "p (Holm)": "p = {} (Holm)", "note": "{}"}
     why = [
         "; ".join(text.format(row[name]) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
@@ -415,7 +417,7 @@ def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _width_rem(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> int:
-    """Estimate the smallest width, in rem, at which a table is easy to read as a table."""
+    """Estimate the smallest width, in rem, at which a table is easy to read without stacking its rows."""
     width_rem = 0.0
     for i, title in enumerate(columns):
         cells = [row[i] for row in rows]
@@ -440,7 +442,7 @@ def _fill(
     source: str,
     ids: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Prepare a section for the template: heading, sentence, and those tables and figures that exist in this report."""
+    """Prepare a section for the template: heading, sentence, and the tables and figures that this report has."""
     captions = section.tables | section.folded
     return {
         "key": section.key,

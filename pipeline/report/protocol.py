@@ -29,7 +29,7 @@ MEANING = "Numbers of the paper are from its sections 3 to 6. Numbers of this sc
 
 @dataclass(frozen=True)
 class Protocol:
-    """An experiment of the paper: where the page shows it (key of a section), and what the paper and this scene ran."""
+    """An experiment of the paper: the section of the page that shows it, and what the paper and this scene ran."""
 
     section: str
     experiment: str
@@ -95,7 +95,7 @@ def _boards(numbers: Results) -> Iterator[Protocol]:
 
 
 def _each_skin(numbers: Results) -> str:
-    """Write how many indentations, or else readings, each skin has on average."""
+    """Write the mean number of indentations per skin, or of readings if the number of indentations is unknown."""
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"counts": {}})
     counts, skins_n = described["counts"], numbers["protocol"]["lobo"]["skins_n"]
     for name in ("indentations", "readings"):

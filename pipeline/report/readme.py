@@ -1,6 +1,6 @@
 """Write the generated blocks of README.md and docs, the figure of README.md, and what the live page shows.
 
-All of it is made from the results in `reports/`.
+Everything is made from the results in `reports/`.
 """
 
 import re
@@ -36,12 +36,12 @@ COSTS_MEANING = (
 )
 BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
-FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README.md shows HEADLINE
-# The scene in which the shipped universal model is tested, and its name there.
+FULL_SIZE, HEADLINE = "paper", "quick"  # simulated scenes on the pages; README.md shows only HEADLINE
+# The scene that tests the shipped universal model, and the name of the model in this scene.
 SHIPPED_SCENE, SHIPPED_NAME = "lab", "universal, simulated alone"
-MEASURED = "reskin/universal/measured.json"  # what the live page shows of this model
-# What README.md shows of the paper's table 2, and of presses at random places of recorded boards (scene lab).
-# Each metric with its title and number of decimals.
+MEASURED = "reskin/universal/measured.json"  # results of this model that the live page shows
+# What README.md shows of the paper's table 2, and of presses at random places of recorded boards (scene lab). Each
+# metric has a title and a number of decimals.
 SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F, N²", 2)}
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
@@ -64,7 +64,7 @@ RECORDED_MEANING = (
     "{presses_n} presses at unknown places, and to labels: presses with known places and forces, spread over the skin. "
     "{halves}\n\n{touch}"
 )
-FIGURE = "docs/img/headline.svg"  # what README.md shows of this model and of one trained with recordings
+FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
@@ -112,7 +112,8 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
 def measured_of(numbers: Numbers) -> dict[str, Any]:
     """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
 
-    The places are those of presses at random places, tested on the other colour of a checkerboard of places.
+    Scores of places are for presses at random places. Labels and tests are on different colours of a checkerboard of
+    places.
     """
 
     def by_board(row: Numbers) -> dict[str, list[float]]:
@@ -163,8 +164,8 @@ def blocks_of(
 ) -> dict[str, str]:
     """Make the generated blocks of the pages; return them by name.
 
-    The last of `results` is the headline scene: README shows its scores, and the table of skins compares its simulated
-    skins with recorded ones.
+    The last scene in `results` is the headline scene. README.md shows its scores, and the table of skins compares its
+    simulated skins with recorded skins.
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
@@ -174,7 +175,7 @@ def blocks_of(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
-        if numbers not in moving  # their presses are those of another scene
+        if numbers not in moving  # its presses are those of another scene
     }
     return {
         "headline": _simulated(list(reversed(results))),
@@ -207,7 +208,7 @@ def _simulated(scenes: Sequence[Numbers]) -> str:
 
 
 def _recorded(numbers: Numbers) -> str:
-    """Tabulate place and force of the universal model on recorded boards that training has not seen, by labels."""
+    """Tabulate place and force scores of the universal model, by labels, on recorded boards never seen in training."""
     rows = {
         (row["method"], row["labels"]): row
         for row in numbers["random_presses"]["rows"]
@@ -229,7 +230,7 @@ def _recorded(numbers: Numbers) -> str:
 
 
 def _readable(row: Numbers | None, metric: str) -> Numbers | None:
-    """Return a score of a row; instead of mean squared errors of forces, their roots for each board and the mean."""
+    """Return a score of a row; mean squared errors of forces become rms errors of each board, and their mean."""
     if row is None or metric not in row:
         return None
     stat = row[metric]
@@ -303,7 +304,7 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
 
 
 def _time(times: Numbers) -> str:
-    """Write the time and disk space that fresh clones needed, as medians over clones."""
+    """Write the time and the disk space that fresh clones needed, as medians over the clones."""
     runs = times["runs"]
     environment_min, stages_min = (
         median(run[part]["wall_s"] for run in runs) / 60 for part in ("environment", "stages")

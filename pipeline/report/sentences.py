@@ -1,4 +1,4 @@
-"""One sentence below each figure: what it shows, with numbers from the results, or what to look for."""
+"""Sentences below figures: what a figure shows, with numbers from the results, or what to look for."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -9,13 +9,13 @@ from pipeline.report.formatting import SHORT
 from pipeline.report.paper import TABLE_2
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
-# No line break is allowed between a number and its unit.
+# Places where no line break is allowed: between a number and its unit.
 UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
 MAPS = (
     "Look for places with large errors, for example at the edge of the skin or between the chips. All maps have the "
     "same scale of colours."
 )
-# What to look for, by figure, where the sentence contains no result.
+# What to look for, by figure, for sentences without results.
 LOOK = {
     LABELS: "In each row, the marks from 0 labels to the most labels show how much labels of the new board help.",
     "variation_time.svg": "The distance of a line from 0 is the drift of the field since the first visit; its "

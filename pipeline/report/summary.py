@@ -10,13 +10,13 @@ SHORT_TITLES = {
 }  # fmt: skip
 MEANING = "R² of F: 1 if all forces are exact, 0 if a constant force is as good. The page has the intervals."
 RECORDED = "Recorded"
-LABELLED = ("accuracy_pct", "r2_f")  # metrics shown of methods that use labels
-CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of the methods that are, and are not, shown
+LABELLED = ("accuracy_pct", "r2_f")  # metrics that are shown for methods that use labels
+CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of names: shown methods, and methods that are not shown
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 
 
 def summarise(numbers: Numbers) -> list[str]:
-    """Return the main scores of a scene on held-out boards as lines of text; none if the scene holds out no board."""
+    """Return lines with the main scores of a scene on held-out boards; no lines if the scene holds out no board."""
     data = str(numbers["provenance"]["source"]).capitalize()
     if numbers.get("labels"):
         title = f"{data} boards not seen in training, by number of labelled indentations:"
@@ -46,7 +46,7 @@ def _rows_of_table_2(numbers: Numbers) -> list[list[str]]:
 
 
 def _rows_of_labels(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return scores with the fewest and the most labels: those of the universal models, then of the first method."""
+    """Return scores with the fewest and the most labels, of the universal models and then of the first method."""
     scores = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     shown = [method for method in methods if method[0].startswith(CALIBRATED) and not method[0].startswith(REFERENCE)]

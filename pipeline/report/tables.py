@@ -163,7 +163,7 @@ POLICIES = {
     "initial": "once, at the start", "regular": "every {regular_n} contacts", "each": "before every contact",
     "free": "whenever nothing touches",
 }  # fmt: skip
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # the row that we add to table 1
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # row that we add to table 1
 OURS = "ours, measured"
 NOT_GIVEN = "–"
 
@@ -244,7 +244,7 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List classical methods and networks on the same folds, the most accurate first."""
+    """List classical methods and networks on the same folds, starting with the most accurate."""
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "training rows": str(row["rows_n"]), "source": source}
         | scored(row)
@@ -254,7 +254,7 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
-    """List scores by number of labelled indentations of the new skin; a constant force, if given, comes last."""
+    """List scores by number of labelled indentations of the new skin; a constant predicted force, if given, is last."""
     registered = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
     uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
     lines = [
@@ -294,7 +294,7 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidate settings of each stage; the chosen ones did best in leave-one-board-out on separate boards."""
+    """List candidate settings of each stage; the chosen ones were best in leave-one-board-out on separate boards."""
     lines = [
         {
             "stage": stage,
@@ -311,7 +311,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in the paper's order; only ours has control and constant force."""
+    """Tabulate our table 2 beside the paper's, in the paper's order; only ours has a control and a constant force."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
@@ -350,7 +350,7 @@ def _single(numbers: Numbers, source: str) -> pd.DataFrame:
 
 
 def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List how well the position of a hovering tip is predicted, by skin, beside the scores of contacts."""
+    """List, by skin, the scores of a hovering tip's predicted position beside the scores of contacts."""
     skins, lines = numbers.get("single_skins", {}), []
     for skin, hover in numbers["hover"].items():
         contact = skins.get(skin, _means(numbers["single_temporal"]))
@@ -400,7 +400,7 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
-    """Count the training runs of each experiment, those that collapsed, and the collapsed networks that were kept."""
+    """Count, for each experiment, all training runs, collapsed training runs, and collapsed networks that were kept."""
     columns = {
         "training runs": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip
@@ -458,7 +458,7 @@ def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
 
 
 def _counts(protocol_counts: Mapping[str, Any]) -> dict[str, int]:
-    """Return the counts of a protocol in one level: those of entry `left_out` get a prefix."""
+    """Return the counts of a protocol as a flat mapping; the counts in entry `left_out` get a prefix."""
     counts = {name: count for name, count in protocol_counts.items() if name != "left_out"}
     return counts | {f"left out of training: {name}": count for name, count in protocol_counts["left_out"].items()}
 
@@ -466,7 +466,7 @@ def _counts(protocol_counts: Mapping[str, Any]) -> dict[str, int]:
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
     """Tabulate descriptions of skins, with one column per description, by title.
 
-    If some skins are simulated and some recorded, a column has the ratio simulated / recorded that is nearest to 1.
+    If some skins are simulated and some are recorded, another column has the ratio simulated / recorded nearest to 1.
     """
     both_sources = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
@@ -508,7 +508,7 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
 def labels_summary(rows: Rows) -> pd.DataFrame:
     """Tabulate scores on held-out boards with the fewest and the most labels.
 
-    The methods are those that are calibrated to the skin, then the first method.
+    Methods that are calibrated to the skin come first, followed by the first method of `rows`.
     """
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}

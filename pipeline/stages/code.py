@@ -1,8 +1,8 @@
 """Stage code: write the digests of all modules that each stage imports to data/code/<stage>.
 
 Every other stage depends on its own file in that folder, so that DVC reruns the stages that import an edited module.
-Comments and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments, which contain
-captions, are part of the digests only of stages that show results.
+Comments and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments contain captions;
+they are included only in the files of stages that show results.
 """
 
 import gc

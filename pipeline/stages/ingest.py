@@ -15,7 +15,7 @@ from reskin.data.splits import Split, draw_folds, render_folds
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 
-CACHE = ".reskin/readings"  # cache of ingest_many, needed because DVC deletes a stage's outputs before the stage runs
+CACHE = ".reskin/readings"  # cache of ingest_many, because DVC deletes a stage's outputs before the stage runs
 NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
@@ -44,8 +44,8 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
     """Read all captures of a recorded scene in one stage.
 
-    For scenes with many captures, one DVC stage per capture would take longer than reading the captures.
-    Readings of a capture come from a cache if its bytes, the code and the settings are unchanged (docs/growth.md).
+    In scenes with many captures, the overhead of one DVC stage per capture would take longer than reading the captures.
+    Readings of a capture are taken from a cache if its bytes, the code and the settings are unchanged (docs/growth.md).
     """
     cache = home() / CACHE / settings.scene
     policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]
@@ -60,7 +60,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
                 fresh = cache / f"{key}.parquet"
                 ingest(settings, raw / name, fresh)
                 cached[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
-            # A copy instead of a link, so that an edit of one file does not change the other.
+            # The file is copied rather than linked, so that an edit of the output does not change the cache.
             shutil.copyfile(cached[key], folder / f"{name}.parquet")
             used.add(cached[key])
     for file in set(cache.glob("*.parquet")) - used:
@@ -70,7 +70,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
 
 
 def _is_whole(cached: Path) -> bool:
-    """Check cached readings against the digest in their name; if they are damaged, remove them and warn."""
+    """Compare the digest of a cached file with the digest in its name; remove a damaged file and warn."""
     if io.sha256(cached) == cached.stem.partition("-")[2]:
         return True
     say(f"warning: cached readings are damaged and are read again ({cached}: content has changed since it was written)")

@@ -1,4 +1,4 @@
-"""Stages that present results: table2 (early), report (numbers, tables, figures, pages), publish (MLflow)."""
+"""Stages that present results: table2, report (numbers, tables, figures, pages) and publish (MLflow)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write table 2 of the paper and its figure as soon as the networks are trained; stage report writes them again."""
+    """Write our table 2 and its figure as soon as the networks are trained; stage report writes both again."""
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -91,7 +91,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
-        of_layout = plot_data.get("compare", {}).get("outline")  # if the scene has the layout of its boards
+        of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
         outline = None if of_layout is None else Outline(**of_layout)
         figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
         figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
@@ -196,7 +196,7 @@ def publish(settings: Settings, indentations: Path, models: Path, results: Path,
     if not publishing():
         return
     scene, name = planned_scene(settings), settings.scene
-    # Results of `dvc exp` are in another MLflow experiment than the results of the checkout.
+    # Results of `dvc exp` and results of the checkout are in different MLflow experiments.
     experiment = f"{name} (dvc exp)" if is_experiment() else name
     try:
         found = published_results(scene, name, indentations, models, results, reports)
@@ -223,7 +223,7 @@ def published_results(
 
 
 def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
-    """Write missing runs of a scene to MLflow; return a sentence that says how many, and where they can be seen."""
+    """Write the runs of a scene that MLflow lacks; return a sentence with their number and their address."""
     counts = write_runs(results, scene=experiment, root=root, register=register)
     return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
 

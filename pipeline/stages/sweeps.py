@@ -64,7 +64,7 @@ def sweep_pokes(
 
 
 def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
-    """Return the scores of the networks that adaptation starts from, as points with 0 pokes."""
+    """Return the scores of the networks before adaptation, as points with 0 pokes."""
     cards = [io.read_json(file) for file in sorted(pretrained.glob("*.json"))]
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
@@ -75,7 +75,7 @@ def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -
 
 
 def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
-    """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score (paper figure 6b)."""
+    """Train networks on every draw of skins, adapt them to each held-out skin, and score them (paper figure 6b)."""
     preload_training()
     data, section = read_data(settings, indentations, folds), settings.section(Adaptations, "adapt")
     adaptation = section.recipes[HEADLINE]
@@ -83,11 +83,12 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Networks are trained in stacks, and the cache reuses whole stacks. Folds with most training skins come first, so
-    # that the folds with all training skins form the same stacks as in stage train_multi.
+    # Networks are trained in stacks (several networks in one computation), and the cache reuses only whole stacks.
+    # Folds with most training skins come first, so that the folds with all training skins form the same stacks as in
+    # stage train_multi.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # One seed per draw of skins is enough: the random numbers of a network depend on the fold's name, which contains
-    # the draw.
+    # One seed per draw of skins is enough, because the random numbers of a network depend on the fold's name, which
+    # contains the draw.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()

@@ -37,7 +37,7 @@ NO_LABELS = np.zeros(0, np.int64)
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
-    On folds within one skin, predictions of the place from readings before the contact are scored too.
+    On folds within one skin, places that are predicted from readings before the contact are scored too.
     """
     preload_training()
     data = read_data(settings, indentations, folds)

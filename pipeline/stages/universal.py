@@ -36,7 +36,7 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
     trained_entries: list[few.TrainedEntry] = []
-    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # use networks of earlier steps
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each needs networks of earlier steps
         pairs = step(study, trained_entries)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
         trained_entries = [
@@ -89,8 +89,8 @@ def universal(
 ) -> None:
     """Score the universal model on every held-out board for every number of labels, on the test rows of `few_labels`.
 
-    The map alone and the map with networks are scored, both in two variants: made with the other boards of the rig, and
-    from simulated skins alone.
+    The map alone and the map with networks are scored in two variants. One is made with the other boards of the rig,
+    and one is made from simulated skins alone.
     """
     known = read_known_boards(settings, indentations, folds)
     variants = make_variants(known, section)

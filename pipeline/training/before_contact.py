@@ -1,9 +1,9 @@
 """Predict places from inputs without the contact's signal, on the folds within one skin, and score the predictions.
 
-The method is k nearest neighbours (k = 2). The input is only the no-load field, or only the number of the indentation
-in its pass. If such a prediction is accurate, networks may have learnt places from the order of the scan rather than
-from contacts. The hover control predicts the place of a hovering tip with models that were trained on contacts. Its
-accuracy is at chance level, unless the chips sense the tip itself.
+The method is k nearest neighbours (k = 2). The input is either the no-load field, or the number of the indentation in
+its pass. If such predictions are accurate, networks may have learnt places from the order of the scan rather than from
+contacts. The hover control uses models that were trained on contacts to predict the place of a hovering tip. The
+accuracy of the hover control is at chance level, unless the chips sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ from reskin.seeds import rng_for
 
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
-MAGNITUDES = ("hover_uT", "touch_uT")  # median |dB| of hovering rows, and of contacts at about 1 N
+MAGNITUDES = ("hover_uT", "touch_uT")  # names of the median |dB| of hovering rows, and of contacts at about 1 N
 TOUCH_N = (0.8, 1.2)  # range of forces of the contacts at about 1 N
 BY_TIME = "single_temporal"  # experiment that trains on some passes and tests on others
 
@@ -50,7 +50,7 @@ def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
 
 
 def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
-    """Return the number of each reading's indentation in its pass, from 0; indentations without a contact count too."""
+    """For each reading, count the earlier indentations in its pass, including those without a contact."""
     passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
     indentation = readings.indentation.astype(np.int64)
     first = np.full(len(passes), indentation.max())
@@ -60,7 +60,7 @@ def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
 
 @dataclass(frozen=True)
 class Hover:
-    """Readings of a tip that hovers over a known place without contact; `pass_i` is numbered as in `Rows`."""
+    """Readings while a tip hovers over a known place without contact; `pass_i` is numbered as in `Rows`."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     place_mm: Float32[np.ndarray, "f 2"]
@@ -72,10 +72,11 @@ class Hover:
 
 
 def gather_hover(captures: Sequence[Readings]) -> Hover:
-    """Stack the rows without force between the contacts of a pass; the place of each row is that of the next contact.
+    """Stack the rows without force between the contacts of a pass, each with the place of the next contact.
 
-    A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass
-    are omitted because they are the pass's no-load reading, and rows after the last contact because no contact follows.
+    A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass are
+    omitted, because they are the pass's no-load reading. Rows after the last contact are omitted, because no contact
+    follows.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
@@ -102,7 +103,7 @@ def score_before_contact(
     """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
 
     networks: trained networks by fold, which the hover control uses in addition to nearest neighbours. The table has
-    one row per fold and input, and one per fold and model of the hover control.
+    one row for each fold and input, and one row for each fold and model of the hover control.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
@@ -150,7 +151,7 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> Mapping[str, float]:
-    """Train nearest neighbours on inputs without the contact's signal, and score predicted places of test rows."""
+    """Train nearest neighbours on inputs without the contact's signal, and score the places predicted for test rows."""
     rng = rng_for(data.settings.seed, "before-touch")  # `fit` needs it; nearest neighbours do not use it
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
     scores = score(data.rows.target[test], fitted.predict(inputs[test]))

@@ -28,8 +28,8 @@ from reskin.universal.model import FILE, Universal, load_universal
 class Calibrated(Strict):
     """Section calibrated: the model, and numbers of labelled presses of the held-out board.
 
-    model: path in the checkout of a model (.safetensors, with its card). even: whether the places of all presses form
-    a grid around the board's centre on which each place is pressed equally often.
+    model: path of the model's .safetensors file in the checkout; its card is beside it. even: whether the presses are
+    at the places of a grid around the board's centre, with equally many presses at each place.
     """
 
     model: str
@@ -39,17 +39,17 @@ class Calibrated(Strict):
 
 @dataclass(frozen=True)
 class Frame:
-    """Converts labels of a scene to the coordinates of the model, and back; both directions are the same operation."""
+    """Conversion of a scene's labels to the coordinates of the model, and back; both are the same operation."""
 
     centre_mm: tuple[float, float]
-    mirrored: bool  # the labels' y has the opposite sign of the board's y
+    mirrored: bool  # whether y of the labels points opposite to y of the board
 
     def convert(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         return (place_mm - self.centre_mm) * (1, -1 if self.mirrored else 1) + self.centre_mm
 
 
 def read_model(file: Path, layout: BoardLayout | None, settings: Settings) -> Universal:
-    """Read the model; raise `ParamsError` if it was made for another layout than that of the scene."""
+    """Read the model; raise `ParamsError` if it was made for a layout other than the scene's."""
     if layout is None:
         raise ParamsError(f"{settings.where}: experiment calibrated needs key layout in section compare. Add it there.")
     model = load_universal(file=file)
@@ -65,7 +65,7 @@ def read_model(file: Path, layout: BoardLayout | None, settings: Settings) -> Un
 
 
 def replace_name(layout: BoardLayout, name: str) -> BoardLayout:
-    """Return the layout with another name."""
+    """Return a copy of the layout that has another name."""
     return layout.model_copy(update={"name": name})
 
 
@@ -82,8 +82,8 @@ def score_fold(
 ) -> list[dict[str, Any]]:
     """Calibrate the model to each skin of the held-out board; score it for every number of labels.
 
-    A skin's calibration uses its no-load field, the presses of the fold's pool without their labels, and the given
-    number of labelled presses of this pool.
+    The calibration to a skin uses its no-load field, all presses in the fold's pool without their labels, and the
+    labels of the given number of these presses.
     """
     points = []
     presses, tested = pool_rows(data, fold), data.rows.skin[fold.test]

@@ -1,13 +1,13 @@
-"""Choose settings from the model cards of a scene, whose models were trained with each board held out in turn.
+"""Choose settings from the model cards of a scene in which each board was held out in turn.
 
 The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
-number of steps, the budget, is not chosen, because each scene sets it. Every candidate is tried with the same budgets,
-and the errors are averaged over budgets, so that no setting wins by training longer. Settings with a collapsed training
-run are not chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start
-from, because the triplet term by itself only increases the error.
+budget, which is the number of training steps, is not chosen, because each scene sets it. Every candidate is tried with
+the same budgets, and its errors are averaged over the budgets, so that no candidate wins by training longer. Settings
+with a collapsed training run are not chosen. Settings of adaptation are chosen together with the triplet weight of the
+network that is adapted, because without adaptation the triplet term only increases the error.
 
-The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with that of
-the current code.
+The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
+fingerprint that the current code computes.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
-# Settings that are listed in the descriptions of candidates.
+# Settings that the description of a candidate lists.
 VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
@@ -40,9 +40,10 @@ Cards = Sequence[Card]
 
 
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
-    """Choose settings for every stage: `recipe_name`, `settings`, `by` (the criterion), `candidates` with scores.
+    """Choose settings for every stage; return `recipe_name`, `settings`, `by` (the criterion) and scored `candidates`.
 
-    The choice for `adapt` also has the error of the control: the same network, fine-tuned as long without pokes.
+    The choice for `adapt` also has the error of the control, the same network fine-tuned for equally long without
+    pokes.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
@@ -137,7 +138,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without budget; those of an adaptation include the settings of the pretrained network."""
+    """Return the settings without budget; for an adaptation, also those of the pretrained network."""
     return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
@@ -168,7 +169,7 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant digits; rounding errors are smaller, and changes of the physics are larger
+DIGITS = 4  # significant digits, which changes of the physics change, but rounding errors do not
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:

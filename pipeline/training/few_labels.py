@@ -29,9 +29,9 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 class FewLabels(SectionWithRows):
     """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
-    adapted: recipes that are also adapted with unlabelled indentations. adapting: settings of these adaptations.
-    labelling: settings of fine-tuning on labelled indentations. rows_max_n: maximum number of training rows of a
-    classical method.
+    adapted: recipes whose networks are also adapted with unlabelled indentations. adapting: settings of these
+    adaptations. labelling: settings of fine-tuning on labelled indentations. rows_max_n: maximum number of training
+    rows of a classical method.
     """
 
     labels_n: Labels
@@ -72,7 +72,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Entry:
-    """Identifies one result of the experiment by its method, the method's inputs, number of labels and fold."""
+    """Identifies one result of the experiment by the method, the method's inputs, the number of labels and the fold."""
 
     method: str
     inputs: str
@@ -96,9 +96,9 @@ def network_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[
 
 
 def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that adapt the recipes in `adapted` with all indentations of the fold's pool, without labels.
+    """List the jobs that adapt networks of recipes `adapted` with all indentations of the fold's pool, without labels.
 
-    Pool: the indentations of the held-out board that are reserved for calibration and not tested.
+    The pool is the set of indentations of the held-out board that are reserved for calibration and not tested.
     """
     pairs = []
     for entry, job, trained in trained_entries:
@@ -138,9 +138,9 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw the indentations of the fold's pool that are labelled; return their rows by number of labels.
+    """Draw labelled indentations from the fold's pool (see `adaptation_jobs`); return their rows by number of labels.
 
-    The indentations for a smaller number of labels are also used for every larger number. Pool: see `adaptation_jobs`.
+    A larger number of labels includes all indentations of every smaller number.
     """
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)

@@ -1,7 +1,7 @@
-"""The final model of a scene: one network, trained on the skins of all boards, for use on further boards.
+"""The final model of a scene: one network that is trained on the skins of all boards, for use on further boards.
 
-No reading is left to test it. Its card and the report give the scores of the networks that were trained in the same
-way without one of the boards, and tested on that board.
+No readings are left to test this network. Its card and the report therefore give the scores of networks that were
+trained in the same way on all boards except one, and tested on that board.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def train_final(folder: Path, data: SceneData, training: Training, held_out: Seq
     """Train a network of the headline recipe on all rows of the scene; write it with its card to `folder`.
 
     held_out: cards of the networks of the same recipe that were tested on held-out boards. If the forces of all
-    readings are unknown, the network's force is NaN.
+    readings are unknown, the network predicts NaN as the force.
     """
     rows = np.arange(len(data.rows))
     job = TrainingJob(

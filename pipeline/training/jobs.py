@@ -51,7 +51,7 @@ class SceneData:
 
 @dataclass(frozen=True)
 class AdaptationPokes:
-    """Unlabelled pokes, ordered in lines, that adapt one network to one skin; `experiment` and `what` name the job."""
+    """Unlabelled pokes in lines of places that adapt a network to a skin; `experiment` and `what` name the job."""
 
     experiment: str
     skin: str
@@ -129,7 +129,7 @@ def training_data(data: SceneData) -> TrainingData:
 def make_jobs(
     data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
 ) -> list[TrainingJob]:
-    """Make a job for every fold, recipe and seed, for `experiment` or, by default, for the experiment of each fold."""
+    """Make a job for every fold, recipe and seed; without `experiment`, a job belongs to the experiment of its fold."""
     return [
         TrainingJob(
             experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test
@@ -208,7 +208,7 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 
 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
-    """Return the results of jobs, from the cache or by training; record costs, and warn of runs that diverged."""
+    """Train the jobs whose results are not cached; return all results, record costs, and warn of diverged runs."""
     start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
@@ -232,9 +232,9 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> list[ModelCard]:
-    """Write models, cards and predictions to folder `models`, and times to a file that is not a stage output.
+    """Write models, cards and predictions to folder `models`; return the cards.
 
-    Returns the cards.
+    Times are written to a file that is not an output of the stage.
     """
     code = code_of(stage)
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
@@ -313,7 +313,7 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions for test rows, over all rows and per skin; also with one offset per board subtracted."""
+    """Score predictions over all test rows and per skin, as they are and after subtracting an offset per board."""
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 
@@ -325,12 +325,12 @@ def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, metho
 
 
 def collapse_record(result: TrainingResult) -> dict[str, Any]:
-    """Return whether training collapsed, and how many earlier attempts with other random draws collapsed."""
+    """Return whether the training run collapsed, and how many earlier attempts with other random draws collapsed."""
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
-    """Write start, duration and prediction time of each training run to a file that is no output of the stage."""
+    """Write start, duration and prediction time of each training run to a file that is not an output of the stage."""
     seconds = [
         {
             "name": job.name,

@@ -1,8 +1,8 @@
 """Make universal models for boards: `reskin model make`, and the shipped one: `python -m pipeline.training.shipping`.
 
-The latter writes reskin/universal/universal.safetensors and its card, in a few minutes. Networks have the training
-settings and the seed of scene lab, where the shipped model is tested as `universal, simulated alone`. Likelihood powers
-are calibrated on simulated skins.
+The second command takes a few minutes, and writes reskin/universal/universal.safetensors and its card. The networks
+have the training settings and the seed of scene lab, which tests the shipped model under the name
+`universal, simulated alone`. Likelihood powers are calibrated on simulated skins.
 """
 
 import time
@@ -70,7 +70,7 @@ MADE = {
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Choose likelihood powers for a misfit of 1 by numbers of presses and labels, from coverage on simulated skins."""
+    """Choose likelihood powers for a misfit of 1, by number of presses and labels, from coverage on simulated skins."""
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in CALIBRATION_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
@@ -87,9 +87,10 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
 def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Calibrate a model in place to a simulated skin; `counts` are the numbers of presses and labels from its pool.
+    """Calibrate a model, in place, to presses and labels from the pool of a simulated skin.
 
-    Returns the readings of the skin's test presses, in the chips' axes, and their places in the frame of labels.
+    counts: the numbers of presses and of labels. Returns the readings of the skin's test presses, in the chips' axes,
+    and the places of these presses in the coordinates of labels.
     """
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
     fields_uT, centre_mm = (skins.rest_uT[i][None], pool.db_uT, tested.db_uT), np.array(model.layout.centre_mm)
@@ -107,7 +108,7 @@ def calibrate(
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each power, in two equal columns as `best_powers` needs."""
+    """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` needs two."""
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
     covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
@@ -166,7 +167,7 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
 
 
 def read_layout_of(file: Path) -> BoardLayout:
-    """Read a layout: a file or name that `read_layout` accepts, or a scene with key `layout` in section `compare`."""
+    """Read a layout from a file or name that `read_layout` accepts, or from section `compare` of a scene's file."""
     content = read_yaml(file) if file.suffix in (".yaml", ".yml") else {}
     if not (isinstance(content, dict) and "source" in content):
         return read_layout(file)

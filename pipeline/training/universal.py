@@ -1,4 +1,9 @@
-"""The universal model on held-out boards: choose the powers of its likelihoods, calibrate it, and score it."""
+"""The universal model on held-out boards: choose the powers of its likelihoods, calibrate it, and score it.
+
+The model combines a map (a Gaussian model of the reading for each place and force) with networks. Places and forces are
+weighted by a power of their likelihood. In this module, the power affects only the standard deviations of estimates,
+and thus their intervals.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,11 +41,11 @@ from reskin.universal.model import (
 from reskin.universal.population import PLACES_N, Population, draw_population
 
 EXPERIMENT = "labels"  # experiment whose folds are scored
-METHODS = ("universal map, ", "universal, ")  # first words of method names: the map alone; map and networks
-WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of method names, by variant
-BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers, selected on other boards
-NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers for a misfit of 1
-ASSUMED_POWER = 0.5  # for places and forces of the map alone; 0.5 would be right if pairs of channels had equal errors
+METHODS = ("universal map, ", "universal, ")  # first words of a method's name: for the map alone; for map and networks
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of a method's name, by variant
+BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers for variant `rig`, chosen on the other boards
+NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers of variant `nominal` for a misfit of 1
+ASSUMED_POWER = 0.5  # for places and forces of the map alone; 0.5 would be exact if channels had equal errors in pairs
 FORCE_MIN_N = float(FORCES_N[0])  # smallest force of the map; smaller forces of labelled presses are raised to it
 
 
@@ -62,8 +67,8 @@ class Estimates(NamedTuple):
 class Benchmark:
     """The data, nominal model and likelihood powers that all folds share.
 
-    board_powers: powers of variant `rig`, by held-out board and number of labels. nominal_powers: powers of variant
-    `nominal` for a misfit of 1, by number of labels.
+    board_powers: likelihood powers of variant `rig`, by held-out board and number of labels. nominal_powers: likelihood
+    powers of variant `nominal` for a misfit of 1, by number of labels.
     """
 
     known: KnownBoards
@@ -74,9 +79,10 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class PoolCalibration:
-    """A model calibrated to a board without labels: to its no-load field and to the presses of its pool.
+    """A model that is calibrated to a board's no-load field and to the presses of its pool, without labels.
 
-    Pool: the presses that are reserved for calibration and not tested. The first of them may also serve as labels.
+    The pool is the set of presses that are reserved for calibration and not tested. Its first presses may also be used
+    with their labels.
     """
 
     presses: PressCalibration
@@ -94,14 +100,14 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Lower the nominal variant's powers for a misfit of 1 to those for the misfit of this pool."""
+        """Lower the nominal variant's powers, which are for a misfit of 1, according to the misfit of this pool."""
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
-        """Return this calibration with the pool reordered: the presses with indices `first` come first."""
+        """Return this calibration with a reordered pool, in which the presses with indices `first` come first."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
-        # Condition the networks again, because their sums over the pool depend on its order in the last bits.
+        # Condition the networks again, because the last bits of their sums over the pool depend on its order.
         presses = replace(self.presses, data=CalibrationData(self.presses.data.rest_uT, pool.db_uT, pool.db_uT))
         return replace(self, presses=presses, pool=pool, pool_mm=self.pool_mm[order])
 
@@ -126,9 +132,9 @@ def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: S
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Return `estimate` with other standard deviations.
+    """Return `estimate` with the rms errors that its places have if the true place is distributed as in `other`.
 
-    They are the rms errors of `estimate` if the true place is distributed as in `other`.
+    The rms errors replace the standard deviations of `estimate`.
     """
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
@@ -151,7 +157,7 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
 
 
 def fit_force_line(calibration: PoolCalibration, labels_n: int) -> ForceLine:
-    """Fit the calibration of forces by cross-validation over the labels; it is the identity for fewer than `FEW_N`."""
+    """Fit the calibration line of forces by cross-validation; return the prior line for fewer than `FEW_N` labels."""
     labels_n = min(labels_n, len(calibration.pool))
     if labels_n < FEW_N:
         return prior_line()
@@ -168,7 +174,7 @@ def score_fold(
     """Score both variants, each with and without networks, on the test rows of a fold, for every number of labels."""
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
-    if board not in known.presses:  # if a board has several skins, keys of `presses` name board and skin
+    if board not in known.presses:  # if a board has several skins, the keys of `presses` name both board and skin
         what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
         raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
@@ -209,7 +215,7 @@ def coverages(
 
 
 def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
-    """Score estimates with the metrics that all methods have, and coverage and half width of 90 % intervals."""
+    """Score estimates with the metrics of all methods, and with coverage and half width of the 90 % intervals."""
     label_mm = known.frame.label(estimate.place_mm)
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
     scores = score_test(known.data, test, predicted)
@@ -221,7 +227,7 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
 
 
 def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Return the rows of each press in a fold's pool; the order is that in which experiment `labels` adds labels."""
+    """Return the rows of each press in a fold's pool, in the order in which experiment `labels` adds labels."""
     indentation = data.rows.indentation[fold.pool]
     return [fold.pool[indentation == press] for press in labelling_order(data.rows, fold, data.settings.seed)]
 
@@ -234,14 +240,17 @@ def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = 24  # simulated skins for each of CALIBRATION_ERRORS, for choosing the nominal variant's powers
+CALIBRATION_SKINS_N = 24  # skins simulated with each of CALIBRATION_ERRORS, to choose the nominal variant's powers
 
 Coverages = Float[np.ndarray, "t 2"]  # rows: powers; columns: the map alone, the map with networks
 LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns field changes with errors of the law added
 
 
 def law_error(scale: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, `scale` times as large as in training."""
+    """Return a function that adds errors of the law, which are `scale` times as large as in training.
+
+    The law is the physical model of a skin.
+    """
     least, most = ERROR_OF_NOMINAL
 
     def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
@@ -250,10 +259,10 @@ def law_error(scale: float = 1.0) -> LawError:
     return add
 
 
-# Errors that the map does not know and that presses hardly reveal. MEMORY_MAX: part of another press's field change
-# that remains in the no-load reading; 5 to 8 % were measured on the recordings of scenes lab and eflesh.
-# DIFFERENCE_MAX: scale of the relative difference of equal presses, which has heavy tails; assumed. The median length
-# of the difference over 15 channels is 1.4 times the scale.
+# Sizes of errors that the map does not model and that presses hardly reveal. MEMORY_MAX: largest fraction of another
+# press's field change that remains in the no-load reading; 5 to 8 % were measured on the recordings of scenes lab and
+# eflesh. DIFFERENCE_MAX: largest scale of the relative difference between equal presses; assumed. The difference has
+# heavy tails; its median length over 15 channels is 1.4 times the scale.
 MEMORY_MAX, DIFFERENCE_MAX = 0.15, 0.3
 HEAVY_TAILS = 3  # degrees of freedom of Student's t
 
@@ -261,8 +270,8 @@ HEAVY_TAILS = 3  # degrees of freedom of Student's t
 def unmodelled_error(scale: float = 1.0) -> LawError:
     """Return a function that adds errors of the law, memory of another press, and differences between equal presses.
 
-    The errors of the law are `scale` times as large as in training. Memory and differences of a skin are uniformly
-    distributed from 0 to `MEMORY_MAX` and from 0 to `DIFFERENCE_MAX`.
+    The errors of the law are `scale` times as large as in training. For each skin, the size of the memory is drawn
+    uniformly from 0 to `MEMORY_MAX`, and the size of the differences from 0 to `DIFFERENCE_MAX`.
     """
     add_law_error = law_error(scale)
 
@@ -278,7 +287,7 @@ def unmodelled_error(scale: float = 1.0) -> LawError:
     return add
 
 
-# Errors on the simulated skins on which powers are chosen, by name. The names are also names of random streams.
+# Errors of the simulated skins on which powers are chosen, by name. The names are also the names of random streams.
 AS_TRAINED = "further"
 CALIBRATION_ERRORS = {AS_TRAINED: unmodelled_error(), "further, missed twice": unmodelled_error(2.0)}
 
@@ -298,10 +307,10 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
     """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
 
-    For a board, these powers are divided by the board's misfit (Birge's ratio) and by the variance inflation of its
-    labels. The simulated skins have errors of the law that are as large as in training, and errors that the map does
-    not know (`unmodelled_error`). If there are labels, skins with errors of the law that are twice as large are added,
-    because the residuals at the labels reveal the size of the errors.
+    For a board, the chosen powers are divided by the board's misfit (Birge's ratio) and by the variance inflation of
+    its labels. The simulated skins have errors of the law that are as large as in training, and errors that the map
+    does not model (`unmodelled_error`). If there are labels, whose residuals reveal the size of the errors, skins whose
+    errors of the law are twice as large are added.
     """
     by_labels_n: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in CALIBRATION_ERRORS.items():
@@ -320,7 +329,7 @@ def best_powers(candidates: Sequence[float], of_skins: Sequence[Coverages]) -> P
 
 
 def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
-    """Simulate skins drawn from a prior; the field changes include noise and errors of the law."""
+    """Simulate skins drawn from a prior, with noise and errors of the law in their field changes."""
     rng = rng_for(seed, "universal", prior.name, name)
     skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng, prior.forces)
     db_uT = error(skins, rng).reshape(skins.db_uT.shape)

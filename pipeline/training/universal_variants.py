@@ -1,7 +1,7 @@
 """Train universal models, or read them from files, before they are calibrated to a held-out board.
 
-There are two variants of the model: `rig` is made from simulated skins and the recorded boards that are not held out,
-`nominal` from simulated skins alone.
+There are two variants of the model. Variant `rig` is made from simulated skins and from the recorded boards that are
+not held out. Variant `nominal` is made from simulated skins alone.
 """
 
 from collections.abc import Mapping
@@ -40,8 +40,8 @@ FORMAT = "reskin-universal-1"
 class Frame:
     """Conversions from chip axes to board axes, and between label coordinates and the board's frame.
 
-    turn: for each chip, the rotation from its axes to the board's. middle_mm: the board's centre in label coordinates.
-    mirrored: whether y of the labels points opposite to y of the board.
+    turn: for each chip, the rotation from the chip's axes to the board's axes. middle_mm: the board's centre in label
+    coordinates. mirrored: whether y of the labels points opposite to y of the board.
     """
 
     turn: Float[np.ndarray, "k 3 3"]
@@ -64,7 +64,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class KnownBoards:
-    """All recorded boards of a scene, including the one that is later held out.
+    """All recorded boards of a scene, including each board that is later held out.
 
     presses: the presses on each board, in the board's frame.
     """
@@ -77,21 +77,21 @@ class KnownBoards:
 
 @dataclass(frozen=True)
 class Variant:
-    """A model before calibration to a board, and the prior from which its simulated skins were drawn."""
+    """A model before calibration to a board, and the prior distribution from which its simulated skins were drawn."""
 
     prior: SkinPrior
     model: PriorModel
 
 
 class Variants(NamedTuple):
-    """The nominal variant, and the variants `rig` by held-out board, each made from the other boards."""
+    """Variant `nominal`, and for each held-out board the variant `rig` that was made from the other boards."""
 
     nominal: Variant
     rig: Mapping[str, Variant]
 
 
 def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
-    """Fit a law to each known board; then tabulate a map and train networks for each variant."""
+    """Fit a physical model (law) to each known board; then tabulate a map and train networks for each variant."""
     from reskin.universal.training import train_networks  # imported late, because it imports PyTorch
 
     with make_executor(imports="reskin.universal.training") as executor:
@@ -118,7 +118,7 @@ def read_variants(known: KnownBoards, models: Path) -> Variants:
 
 
 def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
-    """Return the nominal prior, then for each board the prior made from all other boards."""
+    """Return the nominal prior first, and then, for each board, the prior made from all other boards."""
     boards, setup = known.presses, known.setup
     laws = dict(
         zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
@@ -128,7 +128,7 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior made from all boards except `board`: from their laws, the laws' errors, and their readings."""
+    """Return the prior made from the laws, the errors of the laws, and the readings of all boards except `board`."""
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
@@ -137,7 +137,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit a residual to the relative errors of the laws, each on the board that it was fitted to."""
+    """Fit a residual to the relative errors that each law has on the board to which the law was fitted."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -149,7 +149,7 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select a board's readings for training: `READINGS_N` of each press with a force, repeated if it has fewer."""
+    """Select `READINGS_N` training readings of each press with a force; a press with fewer readings repeats them."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     rows_by_press = own[

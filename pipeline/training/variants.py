@@ -1,4 +1,4 @@
-"""Predictions and scores of networks on a new skin, by variant: before adaptation, adapted, control, ..."""
+"""Predictions and scores of networks on a new skin, by variant, such as before adaptation, adapted, or control."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ BEFORE, AFTER, CONTROL = (
     "before",
     "after",
     "control",
-)  # control: fine-tuned for the same number of steps, without pokes of the skin
+)  # control: fine-tuned for the same number of steps as adapted networks, without pokes of the skin
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
 
 
@@ -76,7 +76,7 @@ def adapt_and_predict(
 
 
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
-    """Compute the mean of (predicted - true) force, in newtons and in percent of the mean true force."""
+    """Compute the mean of predicted minus true force, in newtons and in percent of the mean true force."""
     true_N = true[:, FORCE].astype(float)
     bias_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
     return {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}
@@ -106,10 +106,10 @@ def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str
 
 
 def compare_variants(predictions: Sequence[VariantPrediction], variant: str, reference: str) -> dict[str, Any]:
-    """Summarise over boards `variant` minus `reference`, two variants on the same skins.
+    """Summarise over boards the scores of `variant` minus those of `reference` on the same skins.
 
-    `by_board` has each board's value. `sd_seeds` is computed from differences between networks with equal seeds, which
-    start from the same weights.
+    `by_board` has each board's value. `sd_seeds` is computed from the differences between networks with equal seeds,
+    because these networks start from the same weights.
     """
     rows = _tidy(predictions, score)
     sides = [statistics.select(rows, method=name) for name in (variant, reference)]

@@ -1,4 +1,4 @@
-"""Stability: behaviour of physics, chips, wire formats and learning in stiff, extreme and faulty cases."""
+"""Stability: the behaviour of physics, chips, wire formats and learning in stiff, extreme and faulty cases."""
 
 from dataclasses import asdict
 from pathlib import Path

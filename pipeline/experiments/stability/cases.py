@@ -1,4 +1,4 @@
-"""The class `Case`, whose instances are the rows of the stability experiment's table, and functions that create cases.
+"""Class `Case`, whose instances are the rows of the stability experiment's table, and functions that create cases.
 
 The other modules of this package run cases with given inputs. The experiment passes the inputs of a scene; the tests
 pass random inputs.
@@ -13,7 +13,7 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """The result of one case: expected and observed behaviour and, if the case measures an error, error and limit."""
+    """The result of one case: expected and observed behaviour and, if an error is measured, the error and its limit."""
 
     area: str
     case: str

@@ -17,7 +17,7 @@ from reskin.seeds import rng_for
 AREA = "chip"
 FRAMES_N = 800
 BROKEN_I = 3  # index of the faulty chip
-WRAP_COUNTS_N = 2**16  # an int16 wraps by this number of counts
+WRAP_COUNTS_N = 2**16  # overflow of an int16 changes its value by this number of counts
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
@@ -95,7 +95,7 @@ def _marked(case: str, marked: Bool[np.ndarray, "f k"], expected: Bool[np.ndarra
 
 
 def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
-    # A chip that was reset has the resolution of its power-on settings.
+    # After a reset, a chip has the resolution of its power-on settings.
     lsb_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])
     reset_uT, axes = intact_uT.copy(), _axes(broken_i)
     reset_uT[:, axes] = np.rint(intact_uT[:, axes] / lsb_uT) * lsb_uT
@@ -121,7 +121,7 @@ def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int)
 
 
 def _detect(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
-    """Check readings for faults as the ingest stage does; raise an error if there is any fault."""
+    """Check readings for faults like the ingest stage; raise an error if there is any fault."""
     frames_n, chips_n, expected_lsb_uT = len(b_uT), b_uT.shape[1] // 3, None
     if gain_sel is not None:
         xy_uT, _, z_uT = steps_uT(gain_sel).tolist()

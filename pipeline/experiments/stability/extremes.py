@@ -1,7 +1,8 @@
 """Cases of skins and indentations at the limits of what is allowed, compared with references.
 
-The references are: indentations in steps four times as fine and without tables of displacements; rings of pressure on
-a layer with the textbook compliance; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
+There are four references: indentations in steps four times as fine and without tables of displacements, rings of
+pressure on a layer with the textbook compliance, magpylib's closed form of a magnetised box, and the exact scaling of
+lengths.
 """
 
 from dataclasses import asdict, replace
@@ -23,11 +24,11 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, f
 AREA = "physics"
 # Nodes of both the simulation and its reference, so that errors of quadrature cancel.
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
-PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation; the tip's axis passes through no node
+PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation, where no node is on the tip's axis
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # depths / thickness
 FINER = 4  # number of steps of the reference / number of steps of the simulator
 STEPS_N = 40  # steps of the simulator over a depth of one thickness
-RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest wave number * outer radius of the rings
+RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest product wave number * outer radius
 SIZES = (0.1, 1.0, 10.0)  # tip radius / thickness
 PRESSED = 0.4  # depth / min(thickness, tip radius)
 GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips; cell size / gap
@@ -86,8 +87,8 @@ def ring_force_N(
     """Return the force of a sphere pressed into a layer, approximated by rings of uniform pressure up to `reach_m`.
 
     Under each ring, either the surface touches the sphere or the pressure is zero. The deflection by a ring is the
-    Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number * thickness,
-    the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
+    Hankel integral of the ring's pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number *
+    thickness, the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
     """
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
@@ -116,7 +117,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles and of a box."""
+    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles with dB of a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))

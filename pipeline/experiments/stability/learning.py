@@ -24,7 +24,8 @@ MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])
 STEPS_N = BLOCK_STEPS_N  # number of steps after which the training loop checks the loss for the first time
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
-# Tolerance for weights, whose size is about 0.1. The order of a float32 sum changes it by 6e-8; 50 steps amplify this.
+# Tolerance for weights, whose size is about 0.1. Another order of summation changes a float32 sum by 6e-8, and 50 steps
+# amplify the change.
 ROUNDING = 1e-4
 NEGLIGIBLE_RATE = 1e-12  # learning rate at which the weights hardly change
 SCALE_POWERS = (-20, -10, 10, 20)  # labels are multiplied by 2^power (1e-6 to 1e6), which causes no rounding errors

@@ -28,7 +28,7 @@ PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # depth / thickness of the indentations
 FLAGGED_DEPTH = 0.6  # depth / thickness; published solutions do not cover larger depths, which are therefore flagged
 POKES_N = 2000
-BYTES_MAX_N = 1000  # memory limit per poke: 1 GB for 1e6 pokes; the result alone takes 120 bytes per poke
+BYTES_MAX_N = 1000  # memory limit in bytes per poke, or 1 GB for 1e6 pokes; the result alone takes 120 bytes per poke
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # displacements at the stops of a straight drag
 STICKY = 1e6  # friction coefficient at which the tip never slips
 STIFF = signals.stiff(1e8)  # its slowest relaxation time is 1e8 times its fastest
@@ -191,7 +191,8 @@ def single_precision(board: Board, fine: Skin) -> Case:
     moved = mechanics.follow_dipoles(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (array.astype(np.float32) for array in (*rest, *moved, board.chips_m))
-    # Fields are subtracted node by node, as in the simulator. The difference of two large sums would lose more digits.
+    # Fields are subtracted node by node, as in the simulator, because the difference of two large sums would lose more
+    # digits.
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
@@ -201,7 +202,7 @@ def single_precision(board: Board, fine: Skin) -> Case:
 
 
 def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
-    """Run a case of skins drawn from one seed: two with the same name, and one with another name."""
+    """Run a case of three skins drawn from one seed: two have the same name, and one has another name."""
     bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
     same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
@@ -211,12 +212,12 @@ def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
 
 
 def memory(board: Board, skin: Skin) -> Case:
-    """Run a case of the memory per poke, computed from the peak memory for `POKES_N` and for 4 * `POKES_N` pokes."""
+    """Run a case of the memory per poke, from the peak memories for `POKES_N` and for 4 * `POKES_N` pokes."""
     rng = rng_for(0, "stability", "memory")
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not be counted below
+    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not count
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     per_poke_n = float(round((many_n - few_n) / (3 * POKES_N)))  # a run differs from another by some bytes in total
     observed = (

@@ -1,7 +1,7 @@
 """Extreme cases of a skin that slides on its base.
 
-The cases are: drags with almost no friction and with very high friction, a tip that is lifted after a drag,
-indentations at the free edge of the skin, and force control.
+The cases are drags with almost no friction and with very high friction, a tip that is lifted after a drag, indentations
+at the free edge of the skin, and force control.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, f
 from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
-DEPTH = 0.35  # depth / thickness; the deepest drag of any scene, which has the largest shear
+DEPTH = 0.35  # depth / thickness, of the deepest drag of any scene, which has the largest shear
 PLACE_M = np.array([5.0, -3.0]) * milli  # relative to the skin's centre; a drag at this place also rotates the skin
 WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli  # displacements along x at the stops of a drag
 HELD_M = 0.1 * milli  # displacement of the tip before it is lifted
@@ -32,7 +32,7 @@ PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # dep
 
 
 def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run all cases of sliding, on a skin and a board that equal their designs.
+    """Run all cases of sliding, on a skin and a board without manufacturing spreads.
 
     Returns an empty list if no springs hold the skin on its base (`skin.hold` is None).
     """
@@ -61,7 +61,7 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # Without slip, the displacements of layer and springs, which are in series, add up to the path of the tip.
+    # Layer and springs are in series. Without slip, their displacements therefore add up to the path of the tip.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
@@ -82,7 +82,8 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
 def lift(board: Board, skin: Skin) -> Case:
     """Run a case of a drag at the skin's centre, after which the tip is lifted.
 
-    While the tip is lifted, the tangential force must decrease with the normal force, which limits the friction.
+    While the tip is lifted, the normal force decreases. It limits the friction, so the tangential force must decrease
+    too.
     """
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
@@ -138,7 +139,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
 
 
 def force_control(skin: Skin) -> list[Case]:
-    """Run cases of force control: a force must lead to the same depth on loading and unloading."""
+    """Run cases of force control: a force must lead to the same depth during loading and unloading."""
     assert skin.hold is not None
     sizes = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])

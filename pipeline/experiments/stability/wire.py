@@ -18,7 +18,7 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # index of the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # the memory use for a stream of this many blocks is compared with that for four times as many
+BLOCKS_N = 3  # memory use is compared between streams of this many blocks and of four times as many
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Damage:
     portions: Sequence[bytes]
     lost_n: int = 0
     false_n: int = 0
-    not_finite_n: int | None = 0  # required number of frames with NaN or Inf; None for any number
+    not_finite_n: int | None = 0  # required number of frames with NaN or Inf; None allows any number
 
 
 def wire_cases(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
@@ -70,7 +70,7 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
 
 
 def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
-    """Return a stream that begins inside its first frame, at the fraction `where` of the frame."""
+    """Return a stream without the first fraction `where` of its first frame."""
     data = encode(frames, wire)
     first_end = _clean(data, wire, frames).end_byte.tolist()[0]
     case, should = "CR LF inside every temperature, joined in the middle", "in step again: that frame lost, no other"
@@ -97,7 +97,8 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # The float32 of 25 degC does not contain the bytes CR LF. If it did, a frame of another length could end there.
+    # The float32 of 25 degC does not contain the bytes CR LF. If it did, a frame of another length could end at these
+    # bytes.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
         "a stream without a byte": (b"", "binary", chips_n, "refused"),

@@ -1,4 +1,4 @@
-"""Verification of the simulator: each part is compared with a reference that shares no code with the simulator."""
+"""Verification of the simulator: each part is compared with a reference that shares no code with it."""
 
 from dataclasses import asdict
 from pathlib import Path

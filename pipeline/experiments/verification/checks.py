@@ -1,4 +1,4 @@
-"""The class `Check`, whose instances are the rows of the verification experiment's table, and error measures.
+"""Class `Check`, whose instances are the rows of the verification experiment's table, and error measures.
 
 The other modules of this package run checks with given inputs. The experiment passes the inputs of a scene; the tests
 pass random inputs.

@@ -30,13 +30,13 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # a layer of this thickness acts as a half-space under a tip of a few millimetres
-A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.780)
+HALF_SPACE_M = 100.0  # a layer this thick acts as a half-space under a tip of a few millimetres
+A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fitted 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
 FRICTION = 0.8  # coefficient of friction
-BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number * thickness
+BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number k * thickness h
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
@@ -92,8 +92,9 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
     """Return W(z), the profile of the vertical displacement in a layer on a sliding base, under a pressure wave.
 
-    The wave has the amplitude 2 G k (G: shear modulus, k: wave number); z is in units of 1 / k. W satisfies four
-    boundary conditions: W'' + W = 0 on both faces, W = 0 on the base, and 3 W' - W''' = 2 on the surface.
+    The pressure wave has amplitude 2 G k, where G is the shear modulus and k the wave number. The height z is in units
+    of 1 / k. W satisfies four boundary conditions: W'' + W = 0 on both faces, W = 0 on the base, and 3 W' - W''' = 2 on
+    the surface.
     """
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
@@ -164,7 +165,8 @@ def rings(depth_m: float, press: IndentedLayer) -> Check:
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
     """Divide the simulator's contact area into rings; return the radii of the ring edges and the pressure on each ring.
 
-    The pressures are in units of 2 G (G: shear modulus). They are found by collocation at the middle of each ring.
+    The pressures are in units of 2 G, where G is the shear modulus. They are found by collocation at the middle of each
+    ring.
     """
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
@@ -329,9 +331,10 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that, on a slipping base and far from the tip, r^2 of all material points grows by the same amount.
+    """Check that, far from the tip on a slipping base, r^2 of all material points grows by the same amount.
 
-    The amount may depend neither on height nor on distance, because the layer is incompressible.
+    Here, r is the distance from the tip's axis. The growth may depend neither on height nor on r, because the layer is
+    incompressible.
     """
     h_m = press.thickness_m
     r_m, z_m = (grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
@@ -377,16 +380,16 @@ COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
 REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
-# Errors of this size are not visible in readings: they are a third of a chip's noise, and increase the rms by only 5 %.
+# Errors of this size are not visible in readings. They are a third of a chip's noise, and increase the rms by only 5 %.
 UNSEEN_uT = 1.0
-PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # no node is on the tip's axis at these places
+PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # at these places, no node is on the tip's axis
 Places = Float[np.ndarray, "p 2"]
 
 
 def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
-    """Check dB of indentations on a scene's first skin, and symmetries of dB on a skin that equals its design."""
+    """Check dB of indentations on a scene's first skin, and symmetries of dB on a skin without spreads."""
     first_board, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
@@ -461,7 +464,7 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Check three symmetries of dB on a skin that equals its design.
+    """Check three symmetries of dB on a skin without manufacturing spreads.
 
     If board, skin and indentations are rotated or mirrored together, dB must be rotated or mirrored in the same way. If
     they are shifted together, dB must not change.

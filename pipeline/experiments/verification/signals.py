@@ -29,7 +29,7 @@ from reskin.seeds import rng_for
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # range of distances from the centre of a box, in side lengths of the box
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
-MU_0_DIGITS = 1e-8  # relative tolerance; values of mu_0 from different CODATA years differ by 1e-10 to 1e-9
+MU_0_DIGITS = 1e-8  # relative tolerance; mu_0 differs by 1e-10 to 1e-9 between CODATA years
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter turn about z
 
 
@@ -126,7 +126,7 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # The dipoles are not centred at the origin; otherwise a wrong sign of the separation could go unnoticed.
+    # If the dipoles were centred at the origin, a wrong sign of the separation could go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
@@ -158,9 +158,9 @@ def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[n
     return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)
 
 
-PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count by GAIN_SEL, for RES 0
-PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # for GAIN_SEL 0 to 7
-# Ranges of the standard deviation of noise in three recorded data sets: of the x and y axes, and of the z axis.
+PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count (x, y, z) by GAIN_SEL; RES 0
+PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # gains for GAIN_SEL 0 to 7
+# Ranges of the noise's standard deviation in three recorded data sets, for the x and y axes, and for the z axis.
 RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))
 STILL_FRAMES_N = 20_000  # readings of a board at rest
 
@@ -178,7 +178,7 @@ def quiet(gain_sel: int) -> ChipDesign:
 def read_bare(
     b_T: Float[np.ndarray, "f 3"], design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f 3"], Overruns]:
-    """Read the fields `b_T` with one chip that is not rotated and has a gain of one and no offset."""
+    """Read the fields `b_T` with one chip that is not rotated, and that has a gain of one and no offset."""
     eye = np.eye(3)[None]
     return read_field(b_T[:, None], Board("bare", np.zeros((1, 3)), eye, eye, np.zeros((1, 3))), design=design, rng=rng)
 
@@ -240,7 +240,7 @@ def temperature(seed: int) -> Check:
 
 FRAMES_N = 300
 CRLF_degC = 34.513275  # temperature whose float32 bytes contain CR LF
-CRLF_SHARE = 0.05  # fraction of temperatures with this value
+CRLF_SHARE = 0.05  # fraction of temperatures that have this value
 
 
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
@@ -315,11 +315,11 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
     return float(np.abs(decoded_values - values).max()) if decoded_values.shape == values.shape else np.inf
 
 
-# Number of indentations, time from one to the next, and times of lowering and of holding the tip.
+# Number of indentations, time from one indentation to the next, and times of lowering and of holding the tip.
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7
 NAME = "relaxation of the force"
 STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
-RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest relaxation time / fastest relaxation time, which is 1 ms
+RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest / fastest relaxation time; the fastest is 1 ms
 STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time step / fastest relaxation time
 ROUNDING = 1e-14  # relative rounding error of a few dozen operations on doubles
 
@@ -372,8 +372,8 @@ def hereditary(
 ) -> Float[np.ndarray, " t"]:
     """Return the relaxed force at each time, from the hereditary integral of Lee & Radok with 50 digits.
 
-    The integral of relaxation(t - s) d elastic(s) is summed over all linear pieces of `elastic`. Unlike `aging.relax`,
-    this function does not propagate a state from one piece to the next.
+    The integral of relaxation(t - s) d elastic(s), over all earlier times s, is summed over the linear pieces of the
+    elastic force. Unlike `aging.relax`, this function does not propagate a state from one piece to the next.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (
