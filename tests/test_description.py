@@ -57,7 +57,7 @@ def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
     found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
-    # large tolerance, because there are only 4 x 6 such changes
+    # large tolerance, because there are only 4 x 6 changes over this number of contacts
     assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)
     assert "rest_changes_in_1000_uT" not in found
     assert describe(without_walk)["rest_changes_in_100_uT"] == 0

@@ -35,7 +35,7 @@ def code_words(page: str) -> set[str]:
 
 
 def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
-    """Yield the keys of nested settings; the keys of the first `names_depth` levels are names and are omitted."""
+    """Yield the keys of nested settings. Keys of the first `names_depth` levels are names and are omitted."""
     for key, value in settings.items() if isinstance(settings, dict) else ():
         if not names_depth:
             yield key

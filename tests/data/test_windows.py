@@ -103,7 +103,7 @@ def test_every_window_has_the_change_of_each_policy():
 
 def test_first_no_load_reading_may_be_that_of_an_unselected_row():
     first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
-    # relative to the no-load field of reading 0, which is not selected because its force is too low
+    # the initial no-load field is that of reading 0, which is not selected because its force is too low
     assert (first.rows.db_uT == 100).all()
 
 

@@ -58,7 +58,7 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # The first touch may be either poke, because a busy machine may miss the first one.
+    # The first detected touch may be either poke, because a busy machine may miss the first poke.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
@@ -233,7 +233,7 @@ def test_port_held_by_another_program_is_not_open():
         skin = LiveSkin(name)
         skin.reader.start(must_exist=False)
         try:
-            while not skin.reader.problem:  # (if there is no problem, the time limit of the suite ends the loop)
+            while not skin.reader.problem:  # if no problem is reported, the time limit of the suite ends the loop
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:

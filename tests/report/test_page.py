@@ -122,7 +122,7 @@ def test_tables_name_their_columns(read):
 
 
 def test_stacked_rows_keep_their_labels_and_roles(read):
-    """In a narrow place, the rows of a table are stacked: each cell is labelled, and roles restore the table."""
+    """On narrow screens, rows are stacked. Each cell then has a label, and roles keep the structure of the table."""
     widths = {above[-1].rpartition(" ")[2] for _, above in read.all("table")}
     stacked = set(re.findall(r"\n[.](w\d+) tbody tr {", render()))
     assert widths <= stacked == {f"w{rem}" for rem in STEPS_REM}
@@ -152,7 +152,7 @@ def test_each_table_and_figure_of_the_paper_is_linked_from_the_top():
     ids = {attributes["id"]: tag for tag, attributes, _ in read.elements if "id" in attributes}
     assert all(ids[place.id] == ("details" if place.shown[0] in tables else "figure") for place in places)
     assert all(link.startswith("#") for link in re.findall('href="([^"]+)"', bar))
-    # The page of a scene without one of them says so, and has no link to it.
+    # The page of a scene without one of these tables and figures says so, and has no link to it.
     assert 'href="#figure-4a"' not in render()
     assert "not in this scene" in render()
 

@@ -103,7 +103,7 @@ def calibrated() -> list[tuple]:
 @pytest.mark.parametrize("labels_n", [0, 1, LABELS_N])
 def test_force_intervals_cover_simulated_skins(calibrated, labels_n):
     inside = [np.abs(error) < NORMAL_90 * sd for n, error, sd in calibrated if n == labels_n]
-    assert 0.8 < np.concatenate(inside).mean() <= 1  # it would be 90 % if errors were as large as assumed
+    assert 0.8 < np.concatenate(inside).mean() <= 1  # the coverage would be 90 % if errors were as large as assumed
 
 
 def test_labels_improve_forces(calibrated):
@@ -174,4 +174,4 @@ def test_one_known_weight_corrects_far_forces_by_the_line_and_near_forces_by_the
     cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.array([off**2, off * (np.log(before_N[1]) - LOG_CENTRE_N)])
     gain = cov / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2 + model.line.scatter_var)
     moved = np.log(after_N[1] / before_N[1]) / np.log(weight_N / before_N[0])
-    assert moved == pytest.approx(gain[1], rel=0.05)  # 12 mm away: the weight is used once
+    assert moved == pytest.approx(gain[1], rel=0.05)  # at a press 12 mm away, only the line uses the known weight

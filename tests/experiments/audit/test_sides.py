@@ -30,7 +30,7 @@ UNSEEN = ("lobo", "sensors", "transfer")
 
 
 def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Return presses of two skins per board; skins have a common response and an individual one, a third as large."""
+    """Return presses of two skins per board. All skins share a response; each has its own, a third as large."""
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):

@@ -16,8 +16,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# Labels of one pass: two rows at the corner (one with the label of the last place), then presses, one too weak for the
-# gauge.
+# Labels of one pass: two rows at the corner (one has the label of the last place), then presses. One press is too weak
+# for the gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
