@@ -115,6 +115,6 @@ def test_mean_is_between_minimum_and_maximum(values):
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 
 
-def test_without_rest_drops_fields_at_rest():
+def test_fields_at_rest_are_dropped():
     description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
     assert without_rest(description) == {"rate_hz": 9.0}

@@ -189,7 +189,7 @@ def test_path_of_material_follows_the_flow():
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 
 
-def test_error_is_that_of_the_worst_skin():
+def test_error_is_the_largest_error_of_any_skin():
     trials = [trial(), trial(name="s1")]
     truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
     factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]

@@ -55,7 +55,7 @@ def test_pull_at_the_edge_of_a_square():
 
 
 @given(places_m, displacements_m)
-def test_place_moves_by_the_given_displacement(place_m, taken_m):
+def test_skin_at_the_place_moves_by_the_given_displacement(place_m, taken_m):
     move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)

@@ -97,7 +97,7 @@ def test_missing_experiment_is_not_run():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_number_is_met_within_the_papers_sd_or_ten_percent(mean, sd, ours, path):
+def test_number_is_met_within_the_sd_of_the_paper_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
     alone = judge_value(stat(ours), mean, ours=f"a.{path}")
@@ -123,7 +123,7 @@ def test_sign_of_a_bias_is_explained(bias_N, meaning):
     assert bias["met"] == ("yes" if bias_N > 0 else "no")
 
 
-def test_protocol_is_beside_the_papers():
+def test_our_protocol_is_beside_that_of_the_paper():
     numbers = all_experiments()
     assert line(numbers, "single-accuracy_pct")["note"].startswith(
         f"{SHORT_OF}7,020 training readings (paper: {paper.SINGLE_TRAIN_N:,})"

@@ -92,7 +92,7 @@ def test_seeds_of_a_fold_are_averaged_first():
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
 
 
-def test_sd_over_seeds_is_within_boards():
+def test_sd_over_seeds_is_computed_within_each_board():
     rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
     found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}

@@ -140,7 +140,7 @@ def test_presses_with_unknown_force_do_not_calibrate_forces():
 
 
 @pytest.mark.parametrize("labels_n", [1, 5, 12])
-def test_held_out_labels_are_unknown_to_their_model(labels_n):
+def test_held_out_labels_do_not_affect_the_model(labels_n):
     model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     place_i = rng_for(6, "force line").integers(4, 18, (labels_n, 2))

@@ -172,7 +172,7 @@ def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n,
 
 @settings(max_examples=12, deadline=None)
 @given(late_n=st.integers(0, 5), failed=st.sets(st.integers(10, 20), max_size=1))
-def test_late_fields_are_paired_with_their_presses(
+def test_late_fields_are_paired_with_their_labels(
     tmp_path_factory: pytest.TempPathFactory, late_n: int, failed: set[int]
 ) -> None:
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)
