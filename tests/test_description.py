@@ -110,7 +110,7 @@ def test_growth_with_force_uses_all_captures_of_a_skin():
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
-def test_mean_is_between_minimum_and_maximum(values):
+def test_mean_over_skins_is_between_minimum_and_maximum(values):
     one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 

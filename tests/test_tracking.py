@@ -252,7 +252,7 @@ def current(root: Path) -> set[str]:
     return {run.info.run_id for run in runs(root, "tags.current = 'true'")}
 
 
-def test_restored_state_becomes_current_without_new_runs(tmp_path):
+def test_restored_results_become_current_without_new_runs(tmp_path):
     publish_state(tmp_path, old=True)
     first = current(tmp_path)
     publish_state(tmp_path, old=False)

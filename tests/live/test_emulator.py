@@ -317,7 +317,7 @@ def robot_script():
 
 class TestRobot:
     @pytest.mark.parametrize("batch_n", [1, 7])
-    def test_rows_of_its_log_give_one_labelled_touch_for_each_place_and_pass(
+    def test_log_of_the_robot_gives_one_labelled_touch_per_place_and_pass(
         self, robot_script, tmp_path, monkeypatch, batch_n
     ):
         clock = SimpleNamespace(s=0.0, time=lambda: clock.s)

@@ -108,7 +108,7 @@ def test_number_is_met_within_the_sd_of_the_paper_or_ten_percent(mean, sd, ours,
 
 
 @pytest.mark.parametrize(("printed", "verdict"), [(80.0, AGREES), (70.0, DIFFERS), ((85.0, 3.0), DIFFERS)])
-def test_number_is_judged_by_whether_our_interval_includes_the_papers(printed, verdict):
+def test_number_is_judged_by_whether_our_interval_includes_it(printed, verdict):
     assert judge_value(over_boards(75.0, 84.0), printed).verdict == verdict
     few = {"mean": 80.0, "n": 2, "values": [75.0, 85.0]}
     assert judge_value(few, printed).verdict == FEW_BOARDS

@@ -163,7 +163,7 @@ def test_held_out_labels_do_not_affect_the_model(labels_n):
     assert model.line.mean[0] != before.mean[0]
 
 
-def test_one_known_weight_corrects_far_forces_by_the_line_and_near_forces_by_the_map():
+def test_known_weight_corrects_near_forces_by_the_map_and_far_forces_by_the_line():
     model, weight_N = load_universal(), 4.0
     rest_uT = to_chips(model.tables.rest_uT[None])
     weight_uT, far_uT = (rest_uT + to_chips(model.tables.mean_uT[i : i + 1, i, 5]) for i in (11, 2))
