@@ -84,8 +84,8 @@ ten minutes; no finished stage or training run is computed again; and all output
 
 If you suspect that a disk is damaged, or if a message asks you to, run `reskin check-cache`, then `dvc repro`. DVC
 restores outputs from its cache without reading them. `reskin check-cache` reads every object in the cache, sets damaged
-objects aside and removes their copies. Arrays (safetensors) and tables (Parquet) contain checksums, so reading a damaged
-file is an error.
+objects aside and removes their copies. Arrays (safetensors) and tables (Parquet) contain checksums, so reading a
+damaged file is an error.
 
 {green_n} of {faults_n} green, {not_run_n} not run. Code (`git rev-parse HEAD:pipeline`) {code};
 {cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.
