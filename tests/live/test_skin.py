@@ -73,7 +73,7 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        # excludes readings with alarm "no data" (NaN), which a busy machine may cause
+        # readings with alarm "no data" (NaN), which a busy machine may cause, are excluded
         readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())
         before, before_n = next(readings), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # the caller is slow
@@ -141,7 +141,7 @@ def test_no_load_reading_waits_until_the_skin_is_not_touched():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    # four standard errors of a mean of 100 readings with 3 uT noise
+    # tolerance: four standard errors of a mean of 100 readings with 3 uT of noise
     np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not play_to_skin(moving)[0].zeroed

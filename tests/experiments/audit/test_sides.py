@@ -116,7 +116,7 @@ def test_papers_random_readings_are_a_known_leak():
     checks = run_audit(Sides("single_random", "repeat0", rows[::2], NONE, rows[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
-    # each indentation has 3 readings: 2 are on one side of the split, 1 on the other
+    # each indentation has 3 readings, of which 2 are on one side of the split and 1 is on the other side
     assert leak.found.startswith("60 of 60 test indentations are also in training")
     assert passes(checks)
 
