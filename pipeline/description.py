@@ -16,6 +16,7 @@ from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
 NEAR = 0.2  # a reading belongs to a force in `FORCES_N` if its own force differs by at most this fraction
+LARGEST = "force_max_N"
 ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
 STEP_READINGS_N = 2000  # number of readings from which the chips' resolution is determined
@@ -47,10 +48,14 @@ def without_rest(described: Mapping[str, float]) -> dict[str, float]:
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Summarise every quantity over skins: mean, standard deviation, minimum and maximum.
 
-    described: pairs of a skin's name and the description of one capture. The captures of a skin are averaged first.
+    described: pairs of a skin's name and the description of one capture. The captures of a skin are averaged first,
+    except that the largest force is that of all captures.
     """
     rows = pd.DataFrame([numbers for _, numbers in described])
-    skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
+    by_skin = rows.groupby([skin for skin, _ in described], sort=False)
+    skins = by_skin.mean()
+    if LARGEST in skins:
+        skins[LARGEST] = by_skin[LARGEST].max()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
     if {weak, strong} <= set(skins):  # per skin, because a capture may contain only one of the two forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
@@ -114,7 +119,7 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
     known_N = force_N[np.isfinite(force_N)]
     if len(known_N) < ENOUGH_N:
         return {}
-    return {"force_median_N": float(np.median(known_N)), "force_max_N": float(known_N.max())}
+    return {"force_median_N": float(np.median(known_N)), LARGEST: float(known_N.max())}
 
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:

@@ -14,6 +14,7 @@ labels         x_mm, y_mm and force_N of each of these presses, one press after 
 """
 
 import json
+import platform
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -148,7 +149,13 @@ def write_model_files(
         (folder / file.name).write_bytes(file.read_bytes())
     about = {
         "artifact_path": FOLDER,
-        "flavors": {"python_function": {"loader_module": LOADER, "data": weights.name}},
+        "flavors": {
+            "python_function": {
+                "loader_module": LOADER,
+                "data": weights.name,
+                "python_version": platform.python_version(),
+            }
+        },
         "run_id": run_id,
         "utc_time_created": created,
         "signature": {

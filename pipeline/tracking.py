@@ -41,7 +41,7 @@ PARENT = "mlflow.parentRunId"
 CHAMPION = "champion"  # alias of the version of a registered model to use
 UNIVERSAL = "reskin-universal"  # registered name of the universal model
 UNIVERSAL_EXPERIMENT = "universal model"
-LAYOUT = 3  # version of the content of MLflow runs; runs of older versions are written again
+LAYOUT = 4  # version of the content of MLflow runs; runs of older versions are written again
 DIGITS_N = 6  # significant digits of metrics, as in numbers.json; MLflow's page shows all digits
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
 TIMEOUT_S = 2.0  # time in which an HTTP server must answer
@@ -395,7 +395,7 @@ class Publisher:
     ) -> None:
         """Write a trained network with its settings, loss curve and datasets, and metrics `rows`, to a run; end it."""
         curve = zip(_curve_steps(card), card["curve"], strict=True)
-        rows = [*rows, *(("train_loss", value, step) for step, value in curve)]
+        rows = [*rows, *(("loss", value, step) for step, value in curve)]
         about = self.write_artifacts(run_id, weights, self.example_uT(card["input"]["channels_n"]), span)
         self.log(run_id, rows, span, params=_settings_of(card), tags=about)
         self.client.log_inputs(run_id, datasets=_datasets(card))
@@ -456,19 +456,25 @@ class Publisher:
     def write_universal(self, weights: Path, tested: Path) -> None:
         """Write and register the universal model, with its scores on the recorded boards of scene lab.
 
-        The step of its metrics is the number of labelled presses that it was calibrated to.
+        The step of its metrics is the number of labelled presses that it was calibrated to, besides unlabelled ones.
+        MLflow's tables show the last step; metrics that end in `_0_labels` are the scores without labels.
         """
         from pipeline.pyfunc import simulated_example
+        from pipeline.report.figures import TESTED
 
         card = io.read_json(weights.with_suffix(".json"))
-        labels = io.read_json(tested)["labels"] if tested.exists() else []
-        of_this = [row for row in labels if row["method"] == card["name"]]
+        scores = io.read_json(tested).get("random_presses", {}).get("rows", []) if tested.exists() else []
+        of_this = [row for row in scores if (row["method"], row["tested"]) == (card["name"], TESTED)]
+        presses_n = max((row["presses_n"] for row in of_this), default=0)
+        by_labels = {int(row["labels"]): row for row in of_this
+                     if row["presses_n"] == presses_n and row["labels"].isdecimal()}  # fmt: skip
         rows = [
-            (name, row["as_labelled"][name]["mean"], row["labels_n"])
-            for row in sorted(of_this, key=lambda row: row["labels_n"])
+            (name, row[name]["mean"], labels_n)
+            for labels_n, row in sorted(by_labels.items())
             for name in METRICS
-            if name in row["as_labelled"]
+            if name in row
         ]
+        rows += [(f"{name}_0_labels", value, 0) for name, value, labels_n in rows if labels_n == 0]
         seconds = float(sum(card["made_in_s"].values()))
         span = Span(time.time() - seconds, seconds)
         key = _digest([io.sha256(weights), io.sha256(weights.with_suffix(".json")), rows, LAYOUT])
@@ -479,7 +485,14 @@ class Publisher:
             params = {name: card[name] for name in texts if name in card} | card["training"]
             self.log(run_id, [*rows, (TRAIN_S, seconds, 0)], span, params=params, tags=about)
             self.end(run_id, span)
-        self.register(UNIVERSAL, run_id, f"Model for any skin on the paper's board. Not for {card['not_for']}.")
+        tested_on = (
+            f"Scores on recorded boards of scene lab, calibrated to {presses_n} unlabelled presses and "
+            f"{max(by_labels)} labels; those without labels end in _0_labels."
+            if by_labels
+            else "Not tested here."
+        )
+        use = f"Model for any skin on the paper's board. Not for {card['not_for']}."
+        self.register(UNIVERSAL, run_id, f"{use} {tested_on}")
 
     def register(self, name: str, run_id: str, description: str) -> None:
         """Register the model of a run as a version of `name`, and let alias `champion` refer to this version."""
@@ -490,7 +503,8 @@ class Publisher:
         versions = self.client.search_model_versions(f"name = '{name}'")
         version = next((existing.version for existing in versions if existing.run_id == run_id), None)
         if version is None:
-            version = self.client.create_model_version(name, f"runs:/{run_id}/{FOLDER}", run_id).version
+            source = f"runs:/{run_id}/{FOLDER}"
+            version = self.client.create_model_version(name, source, run_id, description=description).version
         if str(model.aliases.get(CHAMPION)) != str(version):
             self.client.set_registered_model_alias(name, CHAMPION, str(version))
 

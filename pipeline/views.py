@@ -53,7 +53,7 @@ def _column(kind: str, name: str) -> str:
 TRAININGS = View(
     "scores",
     "Scores of each training run",
-    "tags.kind = 'training'",
+    "tags.kind != 'stage'",  # trainings, the final model, and the universal model
     (_column("params", "method"), _column("tags", "board")),
 )
 STAGES = View("stages", "Mean scores of each stage", "tags.kind = 'stage' and metrics.accuracy_pct >= 0", ())

@@ -9,9 +9,9 @@
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
-`simulate_recording`                   a recording of a simulated board, like that of `record`
+`simulate_recording`                   record a simulated board, as `record` records a real one
 `ContactRegressor`                     the paper's network, with scikit-learn's fit and predict
-`UniversalRegressor`                   the same for the universal model: `fit` calibrates it to a skin
+`UniversalRegressor`                   the universal model with the same methods; `fit` calibrates it to a skin
 `SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
 =====================================  ==========================================================
 
@@ -21,7 +21,7 @@
     >>> b_uT.shape
     (1, 15)
 
-The modules behind these names are imported at the first use of a name, so that `import reskin` is quick.
+Each of these names is imported when it is first used, so that `import reskin` is quick.
 """
 
 from importlib import import_module
@@ -78,7 +78,8 @@ def __getattr__(name: str) -> Any:
     if name in _ESTIMATORS:
         if find_spec("sklearn") is None:
             raise missing_package("scikit-learn", f"reskin.{name}", extra="learn")
-        # A name in a string, so that the training code does not count as an import of every stage (`reskin.code`).
+        # The module is named in a string, so that `reskin.code` does not count the training code as an import of every
+        # stage.
         return getattr(import_module("reskin.estimators"), name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -2,7 +2,7 @@
 
 The functions take names and plain values and return NumPy arrays. The names of arguments and results end in their
 units: mm, N, s, uT. The channels of a field are Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports
-its dependencies when it is called, so that `import reskin` is quick.
+its dependencies only when it is called, so that `import reskin` is quick.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 AnyModel = Union[Path, str, "Model", "Universal", Sequence[Union[Path, str, "Model", "Universal"]]]
-Changes = Mapping[str, Any]  # setting name -> value, for settings that differ from the nominal ones
+Changes = Mapping[str, Any]  # name of a setting -> value, for settings that differ from the nominal settings
 NOMINAL_BOARD = "rigid"
 
 
@@ -46,7 +46,7 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     folder : path
         A folder of ingested readings (Parquet), such as `data/indentations/quick` after `dvc repro`.
     force_min_N : float
-        Readings with a normal force below this value are left out.
+        Minimum normal force; readings with a smaller force are left out.
 
     Returns
     -------
@@ -57,7 +57,7 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     Raises
     ------
     ParamsError
-        If the folder holds no Parquet file.
+        If the folder contains no Parquet file.
 
     Examples
     --------
@@ -168,7 +168,7 @@ def simulate_pokes(
 ) -> Pokes:
     """Simulate the chip readings and the normal force for indentations of a skin without wear.
 
-    Ageing and friction are not simulated.
+    Ageing of the skin and friction are not simulated.
 
     Parameters
     ----------
@@ -235,9 +235,10 @@ def simulate_recording(
     passes_n: int = 1,
     seed: int = 0,
 ) -> Path:
-    """Simulate a labelled recording of a board, and write it to a folder like `reskin record`.
+    """Simulate a labelled recording of a board, and write the same files as `reskin record` to a new folder.
 
-    A robot presses the skin at the 65 places of the paper's grid. The header says that the capture is simulated.
+    A simulated robot presses the skin at the 65 places of the paper's grid. The capture's header has source
+    "simulated".
 
     Parameters
     ----------
@@ -246,9 +247,10 @@ def simulate_recording(
     skin, board, seed : str, str, int
         The same names and seed give the same skin (`draw_skin`), board (`draw_board`) and noise.
     depths_mm : sequence of float
-        Depths of the indentations: all places are pressed at the first depth, then at the next one.
+        Depths of the indentations. All places are pressed at the first depth, then all places at the second depth, and
+        so on.
     passes_n : int
-        Number of repetitions.
+        How often the sequence of all places and depths is repeated.
 
     Returns
     -------
@@ -258,7 +260,7 @@ def simulate_recording(
     Raises
     ------
     ReskinError
-        If the folder exists, a name is not allowed, or a setting is out of range.
+        If the folder exists already, a name is not allowed, or a setting is out of range.
 
     Examples
     --------
@@ -286,7 +288,7 @@ def simulate_recording(
 class Model:
     """A trained network, as `load_model` returns it.
 
-    First call `zero` with readings that were taken without contact, then `predict`.
+    Call `zero` with readings that were taken without contact before you call `predict`.
 
     Attributes
     ----------
@@ -329,7 +331,7 @@ class Model:
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields measured in contact. For fields without contact, the prediction is meaningless.
+            Fields measured in contact. Predictions for fields without contact are meaningless.
 
         Returns
         -------
@@ -350,7 +352,7 @@ class Model:
         return predicted if np.ndim(b_uT) == 2 else predicted[0]
 
     def export_onnx(self, file: Path | str) -> None:
-        """Write the network as an ONNX file whose input is field changes in uT, and whose output is x_mm, y_mm and F_N.
+        """Write the network as an ONNX file. Its inputs are field changes in uT; its outputs are x_mm, y_mm and F_N.
 
         Requires the package onnx (`pip install '.[onnx]'`).
         """
@@ -403,11 +405,11 @@ def load_universal(
     external_uT: float = 0.0,
     new_day: bool = False,
 ) -> Universal:
-    """Load the universal model for the paper's board, or one for another board. It needs no data from your skin.
+    """Load the universal model for the paper's board or for another board. The model works without data from your skin.
 
-    Its methods calibrate the model to a skin: `zero` accepts readings without contact, `see` accepts presses at unknown
-    places, and `label` accepts presses at known places. `next_place` proposes where to press next, and `save` writes
-    the calibration to a file.
+    Three methods calibrate the model to a skin: `zero` with readings without contact, `see` with presses at unknown
+    places, and `label` with presses at known places. `next_place` proposes where to press next, and `save` writes the
+    calibration to a file.
 
     Parameters
     ----------
@@ -417,12 +419,13 @@ def load_universal(
         A model (.safetensors, with its JSON card) that `reskin model make` made for a board. Default: the model for
         the paper's board, which comes with the library.
     external_uT : float
-        For a board that a robot moves: standard deviation in uT of each component of the external field's change since
-        the no-load reading, about 30 for the earth's field. Default: 0, no external field.
+        Size of external fields, for a board that a robot moves. When the board turns, the external field at its chips
+        changes. This value is the standard deviation in uT of each component of this change, relative to the no-load
+        reading; it is about 30 for the earth's field. Default: 0, no external field.
     new_day : bool
-        Whether the skin may slide under presses differently than when the calibration was saved, for example a day
-        later. A few further presses then show whether it does (see `Universal.slide`). Default: False, which assumes
-        that it slides in the same way.
+        Whether the skin may now slide under presses differently than when the calibration was saved, for example on the
+        day before. A few further presses then show how it slides (see `Universal.slide`). Default: False, which assumes
+        that it still slides in the same way.
 
     Returns
     -------
@@ -431,8 +434,8 @@ def load_universal(
     Raises
     ------
     ReskinError
-        If a file is missing or is not a calibration or a model, the calibration is for another board, `external_uT` is
-        out of range, or `new_day` is set without a calibration.
+        If a file is missing or is neither a calibration nor a model, if the calibration is for another board, if
+        `external_uT` is out of range, or if `new_day` is set without a calibration.
 
     Examples
     --------
@@ -453,7 +456,7 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
     Parameters
     ----------
     path : path
-        One of these recordings; the function finds out which kind it is:
+        A recording of one of these kinds, which the function detects:
 
         - a capture's folder, as `reskin record` and `reskin add` write it
         - the log of an SD card
@@ -463,27 +466,29 @@ def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 4
     frames : bool
         Whether to load all frames of a labelled capture instead of only its labelled readings.
     rate_hz : float
-        Frames per second, only for a decoded file without a clock.
+        Frames per second. Used only for a decoded file without times of the board's clock.
 
     Returns
     -------
     DataFrame
         Column names end in units; `frame.attrs["units"]` maps each column to its unit ("1" for counts, "" for text).
-        `frame.attrs["counts"]` has the number of frames and rows that were read, and the number dropped by reason.
+        `frame.attrs["counts"]` contains the numbers of frames and rows that were read, and the numbers of those that
+        were dropped, one number for each reason.
 
-        If the recording has labels, there is one row per reading in contact, as in an ingested capture: the columns of
-        data/README.md (`board`, `x_mm`, `Fz_N`, ...), with one column per channel for the field (`bx0_uT`, `by0_uT`,
-        ...), the no-load reading (`noload_bx0_uT`, ...) and their difference (`dbx0_uT`, ...).
+        If the recording has labels, there is one row per reading in contact, as in an ingested capture. The columns are
+        those of data/README.md (`board`, `x_mm`, `Fz_N`, ...). Each channel has three columns: the field (`bx0_uT`),
+        the no-load reading (`noload_bx0_uT`) and their difference (`dbx0_uT`).
 
-        Otherwise, or with `frames`, there is one row per frame: time `t_s`, field `bx0_uT`, ..., and temperature
-        `temperature0_degC`, ...; for a capture's folder also its names (`capture`, `board`, `skin`, `source`).
+        Without labels, or if `frames` is True, there is one row per frame: the time (`t_s`), the field (`bx0_uT`,
+        `by0_uT` and so on) and the temperature of each chip (`temperature0_degC` and so on). For a capture's folder,
+        there are also the columns `capture`, `board`, `skin` and `source`.
 
-        Faulty readings are dropped as in `params.yaml: faults`.
+        Faulty readings are dropped according to section `faults` of `params.yaml`.
 
     Raises
     ------
     ReskinError
-        If the path does not exist, it is none of these recordings, the recording is damaged, or pandas is missing.
+        If the path does not exist, the recording is damaged or of none of these kinds, or pandas is missing.
 
     Examples
     --------
@@ -505,33 +510,34 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     """Read contacts live from one or more boards; use the result in a `with` statement.
 
     The `with` statement opens the port, detects the wire format and the number of chips, and measures the no-load
-    reading: nothing may touch the skin in the first second. A background thread reads the port, so that no bytes are
-    lost when your loop is slow.
+    reading. Therefore, nothing may touch the skin in the first second. A background thread reads the port, so that no
+    bytes are lost when your loop is slow.
 
     Parameters
     ----------
     port : str or list of str
-        A serial port or `socket://host:port`; a list for several boards at once.
+        A serial port or `socket://host:port`, or a list of these for several boards.
     model : optional
-        One or more trained networks (files or `Model` objects), or one universal model: a `Universal` object, which
-        is not modified, or the files of a model, of a calibration, or of both. Default: the shipped universal model.
-        For a board that a robot moves, pass `load_universal(external_uT=...)`.
+        One or more trained networks, or one universal model. Networks are files or `Model` objects. A universal model
+        is a `Universal` object, which is not modified, or the file of a model, of a calibration, or both files.
+        Default: the universal model that comes with the library. For a board that a robot moves, pass
+        `load_universal(external_uT=...)`.
     baud : int
         Baud rate; USB ports ignore it.
 
     Returns
     -------
     LiveSkin or LiveSkins
-        Iteration yields the latest `Contact`: time, place, force, their standard deviations, field, alarms.
-        If your loop is slow, older contacts are skipped; `every()` yields a contact for each reading instead. With a
-        list of ports, iteration yields tuples of contacts, in the order of the ports; an unplugged board does not delay
-        the others.
+        Iteration yields the latest `Contact`: time, place, force, their standard deviations, field, alarms. If your
+        loop is slow, older contacts are skipped. To get a contact for each reading, iterate over `every()` instead.
+        With a list of ports, iteration yields tuples of contacts, in the order of the ports. An unplugged board does
+        not delay the other boards.
 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is listed twice. In the `with` statement: if a port cannot be opened or
-        sends no frames, or if the board's number of chips does not match the model.
+        If a model cannot be read or a port is listed twice. The `with` statement raises this error if a port cannot be
+        opened or sends no frames, or if the board's number of chips does not match the model.
 
     Examples
     --------
@@ -549,7 +555,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
 
 
 def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
-    """Load the models that are given as files; return all networks in the given order, or one universal model."""
+    """Load models that are given as files, and return the networks in the given order or the universal model."""
     from reskin.predicting import read_models
     from reskin.universal.model import Universal
 
@@ -596,7 +602,7 @@ def touch(
     depth_mm, Fx_N, Fy_N, Fz_N : float, optional
         Indentation depth, and force on the skin (Fz positive in compression). Default: NaN, for unknown values.
     pass_i : int
-        If the program visits all places several times: index of the current repetition, from 0.
+        Number of the current pass, from 0, if the program visits all places several times.
 
     Examples
     --------
@@ -626,8 +632,8 @@ def record(
     Parameters
     ----------
     labels : iterable or callable
-        Yields `lifted()` or `touch(...)` each time the robot has stopped. A callable is called for each label, until
-        it returns None.
+        An iterable yields `lifted()` or `touch(...)` each time the robot has stopped. A callable returns one of them at
+        each call, and None at the end.
     port : str, optional
         The board's port. Default: the port of the only connected board.
     out : path, optional
@@ -635,10 +641,10 @@ def record(
     seconds : float
         Maximum duration of the recording.
     dwell_s : float
-        Time for which each label is valid; the next label is requested after this time.
+        Time in s for which each label is valid. The next label is requested after this time.
     board, skin, scan : str, optional
-        Written to the capture's header: names of the board and the skin, and the order in which places are touched
-        (random, snake or a description).
+        Names of the board and of the skin, and the order in which places are touched (random, snake or a description).
+        They are written to the capture's header.
 
     Returns
     -------
@@ -650,12 +656,12 @@ def record(
     ReskinError
         If no board is detected, or it sends no frames.
     Exception
-        Any exception that `labels` raises; the data recorded until then are kept.
+        Any exception that `labels` raises. The data that were recorded before are kept.
 
     Examples
     --------
     >>> def presses():
-    ...     for x_mm, y_mm in places:  # in random order, because each touch affects the next one
+    ...     for x_mm, y_mm in places:  # in random order, because each touch affects the next touch
     ...         robot.lift_and_go_to(x_mm, y_mm)
     ...         yield reskin.lifted()
     ...         robot.press()

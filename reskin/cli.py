@@ -20,7 +20,7 @@ from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
 
-CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
+CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`, which help and error texts name outside a checkout
     "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes", "score",
     "summary", "verify-reports",
 )  # fmt: skip
@@ -82,7 +82,7 @@ LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `re
 def main() -> None:
     """Run the `reskin` command; print a `ReskinError` without a traceback."""
     try:
-        # Exit status 128 + SIGTERM; `sys.exit` raises SystemExit, so that `finally` and `with` blocks clean up.
+        # Exit with status 128 + SIGTERM. `sys.exit` raises SystemExit, so that `finally` and `with` blocks clean up.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         with explaining("reskin"):
             add_checkout_commands()
@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def with_default_simulation(arguments: Sequence[str]) -> list[str]:
-    """Insert `nominal` after an option --emulate that has no value; Typer has no options with optional values.
+    """Insert `nominal` after an option --emulate that has no value, because Typer has no options with optional values.
 
     >>> with_default_simulation(["live", "--emulate", "--http-port", "8000"])
     ['live', '--emulate', 'nominal', '--http-port', '8000']

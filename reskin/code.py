@@ -1,4 +1,4 @@
-"""Digests that detect changes of code: of single modules, without comments and docstrings, and of whole packages."""
+"""Digests that detect changes of code: of one module (ignoring comments and docstrings) or of whole packages."""
 
 import ast
 import hashlib
@@ -18,7 +18,7 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 def digest(name: str, *, data: bool = True) -> str:
     """Return a digest of a module's syntax without docstrings and, if `data`, of its data files.
 
-    Formatting, comments and the version of Python do not change the digest. The data files of a module have the same
+    Formatting, comments and the version of Python do not affect the digest. The data files of a module have the same
     name and are in the same folder: `page.yaml` belongs to `page.py`.
     """
     hasher = hashlib.sha256()
@@ -34,7 +34,7 @@ def files_of(name: str) -> list[Path]:
 
 
 def normalised(file: str, content: bytes) -> bytes:
-    """Return a Python file's syntax without comments and docstrings; return the content of other files unchanged."""
+    """Return the syntax of a Python file without comments and docstrings; return other files unchanged."""
     return json.dumps(_syntax(ast.parse(content))).encode() if file.endswith(".py") else content
 
 
@@ -74,7 +74,7 @@ def file_of(name: str) -> Path:
 def _syntax(node: ast.AST) -> list[Any]:
     """Convert a syntax tree to nested lists, without docstrings.
 
-    Empty fields are dropped, because Python versions differ in the empty fields that a node has.
+    Empty fields are dropped, because the empty fields of a node depend on the version of Python.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})

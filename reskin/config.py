@@ -26,7 +26,7 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a file as YAML 1.2, like DVC (in YAML 1.1, `1e-3` would be text)."""
+    """Read a file as YAML 1.2, as DVC does; in YAML 1.1, `1e-3` would be text."""
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -39,11 +39,11 @@ def read_yaml(path: Path) -> Any:
 def parse(model: type[Model], value: Any, where: str) -> Model:
     """Create a settings model from plain values; raise a `ParamsError` that names the wrong key and its rule."""
     try:
-        # Strict validation of Python values rejects a list where a tuple is expected. Strict validation of JSON accepts
-        # a list there, but still rejects the text "3" where a number is expected.
+        # If values are validated as Python values, pydantic's strict mode rejects a list where a tuple is expected. If
+        # they are validated as JSON, it accepts such a list, but still rejects the text "3" where a number is expected.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        # A misspelt key causes two errors, an unknown and a missing key: report the unknown key.
+        # A misspelt key causes two errors, one for an unknown key and one for a missing key. Report the unknown key.
         details = error.errors(include_url=False)
         first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
         missing = [item for item in details if item["type"] == "missing" and item["loc"][:-1] == first["loc"][:-1]]
@@ -58,7 +58,8 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
                 f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there."
             ) from None
         rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        if first["type"] == "value_error":  # from a validator: its message names the parameters and their values
+        # the error of a validator, whose message names the parameters and their values
+        if first["type"] == "value_error":
             place = f"{where}: {name}" if first["loc"] else where
             end = "" if rule.endswith("?") else "."
             raise ParamsError(f"{place}: {rule}{end} Correct it there.") from None

@@ -9,7 +9,7 @@ import numpy as np
 def one_line(instance: Any) -> str:
     """Return the name and fields of a dataclass, with shapes for arrays and types for other objects.
 
-    For use as `__repr__`, because the default `__repr__` prints every number of an array.
+    Use this function as `__repr__`, because the default `__repr__` prints every number of an array.
     """
     parts = (f"{field.name}={_show(getattr(instance, field.name))}" for field in fields(instance))
     return f"{type(instance).__name__}({', '.join(parts)})"

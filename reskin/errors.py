@@ -14,10 +14,11 @@ class ReskinError(ValueError):
     Parameters
     ----------
     where : object
-        Without further arguments, the complete message. With further arguments, only the location of the error: a file
-        with the line or byte, an option, or a setting.
+        The complete message, if it is the only argument. Otherwise, the location of the error: a file with the line or
+        byte, an option, or a setting.
     what, rule, got, remedy
-        The other parts of the message: the name of the wrong value, what it must be, what it is, and what to try.
+        The other parts of the message: the name of the wrong value, what the value must be, what it is, and what the
+        user can try.
 
     Examples
     --------
@@ -54,7 +55,7 @@ class LeakError(ReskinError):
 
 
 class MachineError(ReskinError):
-    """The machine failed: no disk space, memory or permission, or a worker process died. Finished work is kept."""
+    """The machine failed, for example for lack of disk space or memory. Work that was finished before is kept."""
 
 
 EXTRAS = {  # package -> extra of pyproject.toml that installs the package; `pipeline` installs all packages not listed
@@ -80,7 +81,9 @@ RETRY = "Run it again: finished work is kept."
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`; `where` starts the message.
+    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`.
+
+    The message of the new error begins with `where`.
 
     Other exceptions pass through unchanged.
 
@@ -129,7 +132,8 @@ def require(package: str, where: object) -> None:
 def missing_package(package: str, where: object, *, extra: str | None = None) -> ParamsError:
     """Create the error for a missing package, with the command that installs the package.
 
-    extra: the smallest extra that installs all that `where` needs; by default, the one in `EXTRAS`.
+    extra: the smallest extra that installs all packages that `where` needs; by default, the package's extra in
+    `EXTRAS`.
     """
     extra = extra or EXTRAS.get(package, "pipeline")
     return ParamsError(

@@ -1,7 +1,7 @@
 """Estimators with the interface of scikit-learn, and the paper's metrics as scorers. Requires `pip install '.[learn]'`.
 
 `ContactRegressor` is the paper's network; `UniversalRegressor` is the universal model, calibrated to one skin. Both
-have the same inputs and outputs, so that they can be compared by `cross_val_score`:
+have the same inputs X and outputs y, so that `cross_val_score` can compare them:
 
 - X [n ch]: changes of the field since the no-load reading in uT; the channels are Bx, By, Bz of chip 0, then of chip 1,
   and so on. These are the columns `dbx0_uT`, ... of `reskin.load_recording`.
@@ -29,12 +29,12 @@ from reskin.models.recipe import Recipe
 from reskin.models.runner import MAX_ATTEMPTS_N
 from reskin.models.trained import FORMAT, SUFFIX, Network
 
-# How scikit-learn validates y: one or several targets, which may be unknown (NaN).
+# Arguments of scikit-learn's validation of y, which has one or several targets; a target may be unknown (NaN).
 TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "allow-nan"}
 
 
 class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The paper's network, trained by the code of the pipeline; equal data and settings give the pipeline's weights.
+    """The paper's network. With equal data and settings, training gives the same weights as the pipeline.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     network_ : Network
         The trained network, with its scaler.
     loss_curve_ : list of float
-        Mean squared error for scaled targets, at 50 evenly spaced points (fewer for a training with fewer steps).
+        Mean squared error of the scaled targets at 50 evenly spaced steps, or at every step if there are fewer than 50.
     n_features_in_, feature_names_in_
         Number of channels, and their names if X was a DataFrame.
 
@@ -111,8 +111,8 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         y : array [n 3]
             x_mm, y_mm and the normal force in N; NaN if unknown. Other numbers of targets are accepted as well.
         skin : array [n], optional
-            Name of each row's skin, for the triplet loss (`triplet_weight` above 0), which compares places on the same
-            skin. Default: all rows are from one skin.
+            Name of each row's skin. It is needed for the triplet loss (`triplet_weight` above 0), which compares places
+            on the same skin. Default: all rows are from one skin.
 
         Raises
         ------
@@ -124,7 +124,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         Warns
         -----
         ConvergenceWarning
-            If the network predicts nearly the same values for all rows in each of `MAX_ATTEMPTS_N` training runs.
+            If `MAX_ATTEMPTS_N` training runs in a row give a network that predicts nearly the same values for all rows.
         """
         require("torch", "ContactRegressor")
         recipe, seed = self._recipe(), _as_seed(self.random_state)
@@ -191,7 +191,7 @@ def _as_seed(random_state: Any) -> int:
 
 
 def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
-    """Train as `reskin.models.runner.run_jobs` does; return the result, and the number of earlier collapsed runs."""
+    """Train as `reskin.models.runner.run_jobs` does; return the result, and how many earlier runs collapsed."""
     from reskin.models.train import train_stack  # imported late, because it imports torch
 
     for attempt_i in range(MAX_ATTEMPTS_N):
@@ -213,7 +213,7 @@ def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
 def _card(
     recipe: Recipe, seed: int, channels_n: int, result: TrainingResult, collapsed_before_n: int
 ) -> dict[str, Any]:
-    """Describe a trained network by those entries of a card on which predictions depend."""
+    """Return the entries of a trained network's card on which predictions depend."""
     return {
         "format": FORMAT,
         "recipe": recipe.model_dump(mode="json"),
@@ -234,10 +234,10 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     noload_uT : array [f ch] or [ch]
         Fields of the untouched skin; needed by `fit`.
     spread : {"anywhere", "even", "area"}
-        How the unlabelled presses are spread: at any places; evenly over the skin, as on a grid; or at random places
-        all over the area of presses (see `reskin.universal.model.Universal.see`).
+        How the unlabelled presses are distributed: at any places ("anywhere"), evenly over the skin as on a grid
+        ("even"), or at random places all over the area of presses ("area"). See `reskin.universal.model.Universal.see`.
     external_uT : float
-        Size of external fields on a moving board (see `reskin.load_universal`).
+        Size in uT of the external fields on a moving board (see `reskin.load_universal`).
     file : path, optional
         A model for another board. Default: the model for the paper's board.
 
@@ -294,8 +294,9 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         ParamsError
             If `noload_uT` is missing, or `spread` is none of the three values.
         SchemaError
-            If the number of channels is not that of the board, X has readings instead of changes, only one of x_mm and
-            y_mm is known, or a label or a field is out of range (see `reskin.universal.model.Universal.label`).
+            If the number of channels is not that of the board, if X contains raw fields instead of field changes, if
+            only one of x_mm and y_mm is known, or if a label or a field is out of range (see
+            `reskin.universal.model.Universal.label`).
 
         Warns
         -----
@@ -339,8 +340,9 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike, *, return_std: bool = False) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT.
 
-        With `return_std`, also return their standard deviations [n 3]. The one of the force is the force times
-        the standard deviation of its logarithm. It is NaN if the forces are not calibrated by at least one known force.
+        With `return_std`, also return the standard deviations [n 3]. The standard deviation of the force is the
+        predicted force times the standard deviation of its logarithm. It is NaN unless the model was calibrated with a
+        known force.
         """
         check_is_fitted(self)
         db_uT = validate_data(self, X, dtype=np.float64, reset=False)
@@ -352,14 +354,15 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def _metric(y: ArrayLike, predicted: ArrayLike, *, name: str) -> float:
-    """Return one of the project's metrics for the rows whose place is known; NaN if no row has the values it needs."""
+    """Return a metric of the rows whose place is known; NaN if no row has the true values that the metric needs."""
     true, estimated = np.asarray(y, float), np.asarray(predicted, float)
     placed = ~np.isnan(true[:, :2]).any(axis=1)
     return metrics.score(true[placed], estimated[placed]).get(name, np.nan) if placed.any() else np.nan
 
 
 # The metrics of the paper (see `reskin.metrics.score`) as scorers, for argument `scoring` of `cross_validate` and of
-# `GridSearchCV`. Larger is better, so errors are negative. Rows with an unknown place are not scored.
+# `GridSearchCV`. scikit-learn expects that larger scores are better, so errors are negated. Rows with an unknown place
+# are not scored.
 SCORERS = {
     "accuracy_pct": make_scorer(_metric, name="accuracy_pct"),  # percentage of rows within 1 mm in x and in y
     "neg_mse_xy_mm2": make_scorer(_metric, greater_is_better=False, name="mse_xy_mm2"),

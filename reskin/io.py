@@ -41,12 +41,12 @@ MACHINE_ERRNOS = {
     errno.EMFILE,
     errno.ENFILE,
     errno.ESTALE,
-}  # errors for which the file itself may be intact
+}  # errors after which the file itself may be intact
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `path`, for a new file or folder; rename it to `path` on success."""
+    """Yield a temporary path beside `path` for a new file or folder; rename it to `path` if the block succeeds."""
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -66,8 +66,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:
-    """Return whether an error concerns the file being written, and not another file that is read in the same block."""
-    if error.filename is None:  # the error is from an open stream; EIO may be an error of reading or of writing
+    """Return whether an error is about the file being written, and not about a file that the same block reads."""
+    # the error is about an open stream; errno EIO may mean an error of reading or of writing
+    if error.filename is None:
         return error.errno != errno.EIO
     # An error of `shutil.copyfile` contains both file names.
     names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)
@@ -76,7 +77,7 @@ def _is_written(error: OSError, temporary: Path) -> bool:
 
 @contextmanager
 def restoring(*files: Path) -> Iterator[None]:
-    """Restore the content that files had before the block, if the block fails or is interrupted."""
+    """If the `with` block fails or is interrupted, restore the content that the files had before it."""
     contents = {file: file.read_bytes() for file in files}
     try:
         yield
@@ -126,7 +127,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write a folder of text files from a mapping of file names to texts; delete the folder's earlier content."""
+    """Replace the content of a folder by text files, given as a mapping from file names to texts."""
     with replacing(folder) as temporary:
         temporary.mkdir()
         for name, text in texts.items():
@@ -134,7 +135,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def append(file: FileIO, data: bytes) -> None:
-    """Append data to an unbuffered file; if writing fails, truncate the file to its earlier length and raise."""
+    """Append data to an unbuffered file; if writing fails, restore the file's earlier length and raise the error."""
     start = file.tell()
     try:
         while data:
@@ -159,11 +160,12 @@ def read_json(path: Path) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Write named arrays and metadata as a safetensors file; the metadata also contain a digest of all content."""
+    """Write named arrays and metadata as a safetensors file; add a digest of the whole content to the metadata."""
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     metadata = {**metadata, DIGEST: _digest(dense, metadata)}
     content = safetensors.numpy.save(dense, metadata)
-    with replacing(path) as temporary, temporary.open("wb") as stream:  # safetensors' save_file would hide disk errors
+    # The file is not written by safetensors' save_file, because this function would hide disk errors.
+    with replacing(path) as temporary, temporary.open("wb") as stream:
         stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
 
@@ -173,8 +175,8 @@ def read_tensors(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Read arrays and metadata that `write_tensors` wrote: the arrays `names`, or all arrays if `names` is empty.
 
-    If all arrays are read, the content is compared with the file's digest. Files from older code have no digest; they
-    are accepted unless `digest_needed`. If only some arrays are read, the digest is not checked.
+    If all arrays are read, the content is compared with the file's digest. Files that older code wrote have no digest;
+    they are accepted unless `digest_needed` is True. If only some arrays are read, the digest is not checked.
     """
     _check_is_file(path)
     try:
@@ -250,7 +252,7 @@ def read_readings(path: Path) -> Readings:
 
 
 def read_ingest_counts(path: Path) -> dict[str, int]:
-    """Read the ingestion counts of one capture: bytes, frames and rows, and how many were dropped for which reason."""
+    """Read the counts of one capture's ingestion: bytes, frames and rows, and how many were dropped for each reason."""
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
@@ -265,7 +267,7 @@ def _check_is_file(path: Path) -> None:
 
 
 def _raise_machine_error(error: Exception) -> None:
-    """Raise the error again if its cause is the machine (disk, permissions, limits) and not the file's content."""
+    """Raise the error again if the machine caused it (disk, permissions, limits), and not the file's content."""
     if isinstance(error, OSError) and error.errno in MACHINE_ERRNOS:
         raise error
 

@@ -1,7 +1,7 @@
-"""Estimate contacts, places and forces in a log, and score the estimates if the log has labels.
+"""Estimate contacts, places and forces in a log, and score the estimates against labels.
 
-Section 6 of the paper shows such logs of a dog's shoe and of a glove. A log must start without contact. The mean field
-of this quiet start is the no-load reading.
+A log is a recording of the field over time. Section 6 of the paper shows logs of a dog's shoe and of a glove. A log
+must begin with some time without contact, the quiet start. The mean field of the quiet start is the no-load reading.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,15 +16,15 @@ from reskin.errors import CaptureError
 from reskin.metrics import score
 
 WINDOW_S = 0.1  # assumed: length of the windows whose mean fields are compared with the mean field of the start
-QUIET_MIN_S = 0.5  # assumed: shortest quiet start; the mean of a shorter one is not a reliable no-load reading
-# A window is quiet if, in every channel, its mean differs from the start's mean by at most this many standard errors.
-# With 15 channels, noise alone exceeds this in 1 of 1,000 windows.
+QUIET_MIN_S = 0.5  # assumed: shortest quiet start whose mean field is a reliable no-load reading
+# A window is quiet if, in every channel, its mean differs from the mean of the start by at most this many standard
+# errors. With 15 channels, noise alone causes a larger difference in 1 of 1,000 windows.
 WANDER_SDS = 4.0
 START_WINDOWS_N = 2  # number of windows at the start of the log from which mean and noise are estimated
 POINTS_MAX_N = 1500  # largest number of points per series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
-# Function that returns, for the noise in uT, a matrix that removes external fields from readings, or None.
+# A function of the noise in uT. It returns a matrix that removes external fields from readings, or None.
 FindSuppressor = Callable[[float], Float64[np.ndarray, "ch ch"] | None]
 
 
@@ -32,8 +32,8 @@ FindSuppressor = Callable[[float], Float64[np.ndarray, "ch ch"] | None]
 class LogEstimates:
     """Estimates for each of f readings of a log; places and forces are meaningful only in contact.
 
-    contact: whether a reading is in contact. quiet_n: number of readings before the first contact. noise_uT: rms of the
-    field change over all channels of the quiet start.
+    contact: whether a reading is in contact. quiet_n: number of readings in the quiet start. noise_uT: rms of the field
+    change over all readings and channels of the quiet start.
     """
 
     t_s: Float64[np.ndarray, " f"]
@@ -47,10 +47,10 @@ def estimate(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str,
     find_suppressor: FindSuppressor | None = None,
 ) -> LogEstimates:  # fmt: skip
-    """Find the quiet start of a log, subtract its mean field from all readings, and estimate place and force for each.
+    """Find the quiet start of a log, subtract its mean field from all readings, and estimate their places and forces.
 
-    `find_suppressor` is for the detection of contact. Raises CaptureError, with `where` in its message, if the log does
-    not start without contact.
+    `find_suppressor` is used for the detection of contact. Raises CaptureError, with `where` in its message, if the log
+    begins with a contact.
     """
     return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models, find_suppressor)
 
@@ -82,8 +82,8 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # The noise is estimated from differences of consecutive readings: a contact in the first two windows would
-        # increase the standard deviation of the readings themselves.
+        # The noise is estimated from differences of consecutive readings, because a contact in the first two windows
+        # would increase the standard deviation of the readings themselves.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
         moved = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
@@ -109,7 +109,7 @@ def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count contacts: runs of two or more consecutive readings in contact. A gap of one reading does not end a run."""
+    """Count the runs of two or more consecutive readings in contact. A gap of one reading does not end a run."""
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
@@ -130,7 +130,7 @@ def describe(log: LogEstimates) -> dict[str, Any]:
 
 
 def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score estimates of place and force, and count readings whose contact was missed or falsely detected.
+    """Score estimates of place and force, and count the readings in which a contact was missed or falsely detected.
 
     `true` contains x_mm, y_mm and F_N, and NaN for readings without contact. Each model is scored separately. The
     result contains the means of the scores over the models and, under `spread`, their standard deviations.
@@ -165,8 +165,8 @@ def truth_at(
 ) -> Float64[np.ndarray, "f 3"]:
     """Return the true values [x_mm, y_mm, F_N] for each reading.
 
-    They are those of the dwell (a stop of the robot at one place) during which the reading was taken; NaN between
-    dwells.
+    A dwell is a stop of the robot at one place. The true values of a reading are those of the dwell during which it was
+    taken. Readings between dwells have NaN.
     """
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
@@ -174,7 +174,7 @@ def truth_at(
 
 
 def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return the data of a figure: at most 1,500 evenly spaced readings; estimates without contact are None.
+    """Return the data of a figure: at most 1,500 evenly spaced readings, whose estimates are None without contact.
 
     `estimated` is the estimate of the first model. With several models, `low` and `high` are the smallest and the
     largest of their estimates.

@@ -1,6 +1,6 @@
 """Metrics of predictions: the three metrics of the paper, and R^2 of the force. Unknown true forces are NaN.
 
-Predictions for rows with an unknown true force are scored only for place.
+For rows with an unknown true force, only the place is scored.
 """
 
 from typing import Any
@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 ACCURACY_LIMIT_MM = 1.0  # section 4 of the paper: a place counts as accurate if |dx| and |dy| are at most 1 mm
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
-# Mean and variance of the true forces of the scored rows, needed to combine the R^2 of several groups of rows.
+# Mean and variance of the true forces of the scored rows. They are needed to compute the R^2 of several groups
+# together.
 TRUTH = ("force_mean_N", "force_var_N2")
 
 
@@ -32,7 +33,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # Because of rounding, the computed variance can be nonzero for equal forces, and zero for nearly equal forces.
+        # Both conditions are needed: because of rounding, the computed variance can be nonzero for equal forces, and
+        # zero for nearly equal forces.
         if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
@@ -53,19 +55,22 @@ def coverage_pct(
 def interval_score(
     true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
 ) -> float:
-    """Return the mean interval score of 90 % intervals: width plus 20 times the distance of true values outside.
+    """Return the mean interval score of 90 % intervals.
 
-    The score is smallest for intervals that are as narrow as their coverage allows (Gneiting & Raftery, JASA 2007).
+    The score of an interval is its width, plus 20 times the distance of the true value from the interval if it is
+    outside.
+
+    The expected score is smallest if the limits are the true 5 % and 95 % quantiles (Gneiting & Raftery, JASA 2007).
     """
     outside = np.maximum(low - true, 0) + np.maximum(true - high, 0)
     return float((high - low + 2 / 0.1 * outside).mean())
 
 
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Shift all predicted places by one constant offset that makes the mean error of x and of y zero.
+    """Shift all predicted places by the constant offset for which the mean errors of x and of y are zero.
 
-    The origin of each rig was set manually. Scores after this shift show how much of the error is due to the origin.
-    The offset is computed from the true places, so these scores are a diagnostic and not a result.
+    The origin of each rig's coordinates was set manually. Scores after this shift show how much of the error is due to
+    this origin. Because the offset is computed from the true places, these scores are a diagnostic and not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)

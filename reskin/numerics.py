@@ -1,10 +1,10 @@
-"""Set environment variables that make numerical libraries compute the same bits on every x86-64 processor with AVX2.
+"""Set environment variables so that numerical libraries give identical bits on every x86-64 processor with AVX2.
 
-PyTorch, NumPy, OpenBLAS and Numba select their code by the instruction sets of the processor, and OpenBLAS splits
-matrix products among threads. Both affect the order of summation, and training amplifies the rounding errors. With the
-values below, and with `reskin.models.reproducible` instead of MKL, results are bit-identical on all processors with
-AVX2 (tests/test_numerics.py). The libraries read the variables when they are loaded. Therefore, `pin` must run before
-NumPy is imported, and this module must not import NumPy.
+PyTorch, NumPy, OpenBLAS and Numba choose their code according to the instruction sets of the processor, and OpenBLAS
+splits matrix products among threads. Both affect the order of summation and thereby the rounding errors, which training
+amplifies. With the variables below, and with `reskin.models.reproducible` instead of MKL, results are bit-identical on
+all processors with AVX2 (tests/test_numerics.py). The libraries read the variables when they are loaded. Therefore,
+`pin` must run before NumPy is imported, and this module must not import NumPy.
 """
 
 import os
@@ -22,8 +22,8 @@ PINNED = {
     "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_CPU_NAME": "haswell",
 }
-# NumPy feature to disable -> CPU flag of the newest instructions that the feature uses. NumPy warns if a disabled
-# feature is not available on the processor, so only features whose flag is present are disabled.
+# Maps each NumPy feature to disable to the CPU flag of the newest instructions that it uses. NumPy warns if a disabled
+# feature is not available on the processor. Therefore, a feature is disabled only if the processor has its flag.
 BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR": "avx512_fp16"}
 VARIABLES = (*PINNED, "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_FEATURES")
 TOO_LATE = "NumPy was imported before pipeline"
@@ -43,7 +43,7 @@ def pin() -> None:
 
 
 def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables to set on a processor with these CPU flags: those that `environment` does not set.
+    """Return the variables that must be set on a processor with these CPU flags and are not set in `environment`.
 
     >>> pinned(frozenset({"neon"}), {})
     {}
@@ -60,7 +60,7 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
 
 
 def departures(environment: Mapping[str, str]) -> list[str]:
-    """List the variables whose values differ from those that `pin` sets; they may change the last bits of results.
+    """List the variables whose values differ from those that `pin` sets, which may change the last bits of results.
 
     The list also contains a note if NumPy was imported before `pin` ran.
 
@@ -76,7 +76,7 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 
 def signature() -> tuple[str, ...]:
-    """Return the settings of this process that affect the last bits of a trained network; cache keys contain them."""
+    """Return the settings of this process that affect the last bits of a trained network, for use in cache keys."""
     return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 

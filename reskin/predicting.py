@@ -1,6 +1,6 @@
 """Estimate contacts, places and forces in a log with a trained model, and write them as CSV.
 
-The user has to choose a model that fits the board of the log: only the number of channels is checked.
+The user has to choose a model that fits the board of the log, because only the number of channels is checked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,8 @@ from reskin.recordings.loading import read_any_log
 from reskin.universal.calibration import is_calibration
 from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
-FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the model's force range is "at the limit"
+# an estimated force is "at a limit" if it is within this factor of an end of the model's force range
+FORCE_LIMIT = 1.05
 
 
 def predict(
@@ -41,13 +42,13 @@ def predict(
     out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
     external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
-    new_day : whether the calibration is of an earlier day (see `load_universal`)
+    new_day : whether the calibration was saved on an earlier day (see `load_universal`)
 
     Returns
     -------
-    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
-    of readings in contact (with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range), whether
-    the skin is turned by 90 degrees, and the model's warnings.
+    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, the summary
+    also contains the number of readings in contact with a misfit above `MISFIT_MAX`, the number of those with a force
+    at a limit of the model's range, whether the skin is turned by 90 degrees, and the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT, new_day=new_day)
@@ -75,7 +76,7 @@ def predict(
 
 
 class _UniversalOfLog:
-    """Adapts the universal model to the interface of `Estimator`, and stores the misfit of each reading."""
+    """Gives the universal model the interface of `Estimator`, and stores the misfit of each reading."""
 
     def __init__(self, model: Universal) -> None:
         self._model = model
@@ -103,7 +104,7 @@ class _UniversalOfLog:
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
-    """Return warnings for the user, from those counts of `predict` that cast doubt on its estimates."""
+    """Return warnings for the user about the counts of `predict` that cast doubt on its estimates."""
     sentences, contact_n = list(counts.get("model_warnings", [])), counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
@@ -121,11 +122,11 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
 def read_models(
     files: Sequence[Path], external_uT: float = 0.0, *, new_day: bool = False
 ) -> Sequence[Network] | Universal:
-    """Read trained networks, or one universal model, one calibration of it, or both.
+    """Read the model in `files`: trained networks, or a universal model, a calibration of it, or both of these.
 
-    Without a universal model, a calibration is for the shipped one; without any file, the model is the shipped one.
-    `external_uT` is an option of the universal model (see `load_universal`); with networks, it must be 0. `new_day` is
-    an option for a calibration.
+    A calibration without a universal model belongs to the shipped universal model. If `files` is empty, the shipped
+    universal model is returned. `external_uT` is an option of universal models (see `load_universal`); for networks, it
+    must be 0. `new_day` is an option of calibrations.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]

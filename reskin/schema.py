@@ -25,9 +25,9 @@ AXES_PER_CHIP_N = 3
 class Readings:
     """The readings of one capture, one row per reading; unknown values are NaN.
 
-    The signs of forces are those of `FORCE_SIGNS`. `b_uT` is the measured field; `noload_uT` is the mean field without
-    contact before the row's indentation. `x_mm` and `y_mm` are NaN in rows without contact. `n_contacts` is the number
-    of earlier contacts of the skin.
+    Forces have the signs of `FORCE_SIGNS`. `b_uT` is the measured field. `noload_uT` is the mean field without contact
+    before the row's indentation. `x_mm` and `y_mm` are NaN in rows without contact. `n_contacts` is the number of
+    earlier contacts of the skin.
     """
 
     capture: str
@@ -61,7 +61,7 @@ LABELS = ("capture", "board", "skin", "source")
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a numeric column: the suffix of its name if it is a unit, or else "1" (no unit)."""
+    """Return the unit of a numeric column: the suffix of its name, or "1" (no unit) if the suffix is not a unit."""
     suffix = column.rpartition("_")[2]
     return suffix if suffix in ("mm", "N", "uT", "degC", "s") else "1"
 

@@ -66,7 +66,7 @@ def test_edit_of_the_library_reruns_its_stages():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 
-DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing", "formatting", "paper"))}
+DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing", "formatting", "layout", "paper"))}
 
 
 @pytest.mark.parametrize("stage", sorted({*all_stages()} - {"table2", "report", "publish"}))

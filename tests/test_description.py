@@ -118,3 +118,9 @@ def test_mean_over_skins_is_between_minimum_and_maximum(values):
 def test_fields_at_rest_are_dropped():
     description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
     assert without_rest(description) == {"rate_hz": 9.0}
+
+
+def test_largest_force_of_a_skin_is_that_of_all_its_captures():
+    summary = over_skins([("s0", {"force_max_N": 2.0}), ("s0", {"force_max_N": 6.0}), ("s1", {"force_max_N": 3.0})])
+    assert summary["force_max_N"]["most"] == 6
+    assert summary["force_max_N"]["mean"] == 4.5

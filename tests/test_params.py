@@ -34,7 +34,7 @@ def test_params_and_plan_are_valid():
         ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'.*Did you mean lobo"),
         ({"train_multi": TRAINING | {"recipe": "papr"}}, "train_multi.recipe must be .*Did you mean paper"),
         ({"experiments": []}, "experiments must"),
-        ({"source": "simulated"}, "a scene has a section simulate if and only if its source is simulated"),
+        ({"source": "simulated"}, "a simulated scene must have a section simulate"),
         ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
         ({"train_multi": TRAINING | {"recipe": "other"}}, r"train_multi\.recipe must be one of .*; got 'other'"),
         (

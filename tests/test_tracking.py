@@ -17,6 +17,7 @@ from pipeline import tracking
 from pipeline.tracking import Results, Span, Times, TrackingUnavailable, metrics_of, probe, publish
 from pipeline.views import SCORES, VIEWS
 from reskin import io
+from tests.stages.checkout import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +114,10 @@ def test_each_training_run_is_published_once(tmp_path):
     run = children[0]
     assert run.data.metrics == {
         "accuracy_pct": 50.0, "mse_xy_mm2": 2.0, "registered_accuracy_pct": 60.0, "registered_mse_xy_mm2": 1.0,
-        "train_loss": 1.0,
+        "loss": 1.0,
     }  # fmt: skip
     assert run.data.params["steps_n"] == "3"
-    curve = client.get_metric_history(run.info.run_id, "train_loss")
+    curve = client.get_metric_history(run.info.run_id, "loss")
     assert [(point.step, point.value) for point in curve] == [(16, 3.0), (32, 2.0), (48, 1.0)]
     files = {Path(one.path).name for one in client.list_artifacts(run.info.run_id, "model")}
     assert files == {"MLmodel", f"{run.info.run_name}.json", f"{run.info.run_name}.safetensors"}
@@ -197,7 +198,7 @@ def test_runs_last_as_long_as_their_training(tmp_path):
     stage = by_name["train_multi"].data.metrics
     assert (stage["accuracy_pct"], stage["train_s"]) == (51.0, 10.5)
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
-    curve = client.get_metric_history(by_name["b0"].info.run_id, "train_loss")
+    curve = client.get_metric_history(by_name["b0"].info.run_id, "loss")
     assert curve[-1].timestamp == 1_004_000  # the last step is at the end of the training
 
 
@@ -360,3 +361,23 @@ def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()
     assert write(tmp_path, b0="k0", b1="k1")["new_n"] == 2
+
+
+def test_universal_model_has_scores_with_and_without_labels(tmp_path):
+    lab = ROOT / "reports/lab/numbers.json"
+    (tmp_path / "reports/lab").mkdir(parents=True)
+    shutil.copy(lab, tmp_path / "reports/lab")
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
+    tracking.publish_universal(client, tmp_path)
+    experiment = client.get_experiment_by_name(tracking.UNIVERSAL_EXPERIMENT)
+    (run,) = client.search_runs([experiment.experiment_id])
+    expected = {
+        row["labels"]: row["accuracy_pct"]["mean"]
+        for row in io.read_json(lab)["random_presses"]["rows"]
+        if (row["tested"], row["presses_n"], row["method"])
+        == ("other colour of a checkerboard", 65, "universal, simulated alone")
+    }
+    assert run.data.metrics["accuracy_pct_0_labels"] == pytest.approx(expected["0"], rel=1e-5)
+    assert run.data.metrics["accuracy_pct"] == pytest.approx(expected["40"], rel=1e-5)
+    (version,) = client.search_model_versions("name = 'reskin-universal'")
+    assert "40 labels" in version.description

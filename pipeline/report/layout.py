@@ -45,6 +45,7 @@ def _put_in_column(figure: Any, panels: Sequence[Any], *, beside: bool) -> None:
     if beside:
         heights_in = [min(max(height, PANEL_IN[0]), PANEL_IN[1]) for height in heights_in]
         _stack(figure, panels, heights_in)
+        figure.set_figheight(figure.get_figheight() * len(panels))  # ample, so that no panel collapses; set below
     changed = beside or figure.get_figwidth() > WIDTH_IN
     figure.set_figwidth(min(figure.get_figwidth(), WIDTH_IN))
     for legend in figure.legends:

@@ -46,10 +46,10 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high]: 95 % interval over six held-out boards; ±: standard deviation over pairs of skins. Our boards are "
-    "simulated, the paper's were recorded. The simulation was tuned to row *Single-sensor*, so agreement there is not "
-    "evidence."
+    "simulated, the paper's were recorded. An earlier simulation was tuned to row *Single-sensor*, so this row is not "
+    "evidence. The paper does not state its forces, so MSE_F may not be comparable."
 )
-PRESSES_N, UNIVERSAL = 65, "universal, "
+HALVES, PRESSES_N, UNIVERSAL = "other half of the skin", 65, "universal, "
 TRAINED_ON = {
     "universal, boards of the rig": "simulation, other board of the rig",
     "universal, simulated alone": "simulation (the model that we ship)",
@@ -61,7 +61,8 @@ RECORDED_METRICS = {
 }  # fmt: skip
 RECORDED_MEANING = (
     "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. The model is calibrated to "
-    "{presses_n} presses at unknown places, and to labels: presses with known places and forces. {touch}"
+    "{presses_n} presses at unknown places, and to labels: presses with known places and forces, spread over the skin. "
+    "{halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # what README.md shows of this model and of one trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -222,7 +223,7 @@ def _recorded(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
     meaning = RECORDED_MEANING.format(
         scene=provenance["scene"], code=provenance["trained"], presses_n=PRESSES_N,
-        draws_n=numbers["random_presses"]["draws_n"], touch=_touches(numbers),
+        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
 
@@ -238,18 +239,34 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
     return {"mean": values.mean(), "values": values}
 
 
+def _halves(numbers: Numbers) -> str:
+    """State the accuracy on one half of the skin if all labels are on the other half."""
+    rows = [row for row in numbers["random_presses"]["rows"]
+            if (row["tested"], row["presses_n"], row["labels"]) == (HALVES, PRESSES_N, "40")]  # fmt: skip
+    scores = [f"{row['accuracy_pct']['mean']:.0f} %" for row in rows if row["method"].startswith(UNIVERSAL)]
+    return (
+        f"If all 40 labels are on one half of the skin, the other half scores {' and '.join(scores)}." if scores else ""
+    )
+
+
 def _touches(numbers: Numbers) -> str:
-    """State the range of forces, and how many touches the live page misses or reports without cause."""
+    """State the range of forces, and how many touches are missed or reported without cause, by age of the baseline."""
     detection = numbers.get("recorded_limits", {}).get("detection", {})
-    rows = [row for row in detection.get("rows", ())
-            if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")]  # fmt: skip
-    if not rows:
+    by_baseline: dict[str, list[Numbers]] = {}
+    for row in detection.get("rows", ()):
+        if row["rule"] == "as in reskin live":
+            by_baseline.setdefault(row["baseline"], []).append(row)
+    if not by_baseline:
         return ""
-    missed, false = max(100 - row["detected_pct"] for row in rows), max(row["false_alarm_pct"] for row in rows)
+    missed = max(100 - row["detected_pct"] for rows in by_baseline.values() for row in rows)
+    false = [
+        f"{baseline}, {max(row['false_alarm_pct'] for row in rows):.0f} %" for baseline, rows in by_baseline.items()
+    ]
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     return (
-        f"Forces of the presses: {ranges}. On each board, the live page misses at most {missed:.2g} % of these "
-        f"touches, and reports a touch in at most {false:.2g} % of the readings without one."
+        f"Forces of the presses: {ranges}. At the threshold of the live page, at most {missed:.2g} % of these touches "
+        f"are missed. How many readings without touch are reported as one depends on when the no-load reading was "
+        f"taken: {'; '.join(false)}. So take a new one often (key z)."
     )
 
 

@@ -1,7 +1,8 @@
 """Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. What happens
-to faulty readings is decided in `recordings.fault_policy` for recordings, and in `live.health` for live boards.
+Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. Two other
+modules decide what happens to faulty readings: `recordings.fault_policy` for recordings, and `live.health` for live
+boards.
 """
 
 from typing import NamedTuple
@@ -12,49 +13,54 @@ from jaxtyping import Bool, Float, Float64, Int
 from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from reskin.board.wire import Frames
 
-# Values that the ReSkin firmware sends for a chip whose I2C read failed; found in INI's public recording AFG_flex_50.
+# Values that the ReSkin firmware sends for a chip whose I2C read failed, found in INI's public recording AFG_flex_50.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
 FAILED_TOLERANCE = 0.01  # text formats round to two decimals
 
-# The LSB of a chip with power-on settings; found in INI's public recordings AFG_test_new_board15 and piezo.
+# The LSB of a chip with its power-on settings, found in INI's public recordings AFG_test_new_board15 and piezo.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
 LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
 
-# The values of a channel are multiples of the chip's LSB: they are on a grid. Gaps are the differences between
-# neighbouring distinct values. A grid is detected if at least the fraction STEP_SHARE_MIN of the gaps, and at least
-# STEPS_MIN_N gaps, equal one step. In the first 200 frames of 14 real recordings, 5 % or more of the gaps equal one
-# step. Without a grid, only one or two gaps are close to the smallest gap, by chance.
+# The values of a channel are multiples of the chip's LSB, so they lie on a grid whose step is the LSB. Sort the
+# distinct values of a channel; the differences between neighbours are called gaps. A grid is detected if enough gaps
+# equal one step: at least the fraction STEP_SHARE_MIN of all gaps, and at least STEPS_MIN_N gaps. In the first 200
+# frames of 14 real recordings, 5 % or more of the gaps equal one step. If the values are not on a grid, only one or two
+# gaps are close to the smallest gap, by chance.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
 # Maximum relative standard deviation of the gaps that count as one step (gaps below 1.5 times the smallest gap). This
 # deviation is 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
 STEP_SPREAD_MAX = 0.06
-SURE_STEPS_MIN_N = 20  # even with few values and no noise, this many equal gaps do not occur by chance
+SURE_STEPS_MIN_N = 20  # this many equal gaps do not occur by chance, even if there are few values and no noise
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
 SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
 
 # Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
-# its next conversion (1.84 ms), or if its LSB is coarse. In 14 real recordings, at most 3 successive frames are equal.
+# its next conversion is finished (after 1.84 ms), or if the chip's LSB is coarse. In 14 real recordings, at most 3
+# successive frames are equal.
 STUCK_FRAMES_MIN_N = 20
-# A chip whose reading stays the same is stuck only if another chip changes in at least this fraction of these frames.
-# The value is below 1 because, in data without noise, readings change only while the board is pressed or released.
+# A chip with a constant reading counts as stuck only if another chip changes in at least this fraction of the same
+# frames. The fraction is below 1 because, in data without noise, readings change only while the skin is pressed or
+# released.
 OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
-CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock is a jump
-# assumed: equal frames are a fault if, in a window of 40 frames (0.1 s at 400 Hz), over 40 % equal the previous frame
+CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock counts as a jump
+# assumed: repeated frames are a fault if more than 40 % of the frames in a window of 40 frames (0.1 s at 400 Hz) equal
+# the previous frame
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
 MISSING_STEPS = 1.6  # frames are missing if a step of the board's clock exceeds the median step by this factor
 SILENCE_S = 1.0
 # A silence must also exceed the median time between frames by this factor, so that a low frame rate is not a silence.
 SILENCE_STEPS = 50.0
-GARBAGE_FRAMES_N = 10  # if the stray bytes are longer than this many frames, the baud rate is probably wrong
-LONG_LINE = 1.5  # a line of text that exceeds the median length by this factor contains stray bytes
+GARBAGE_FRAMES_N = 10  # if there are more stray bytes than this many frames have, the baud rate is probably wrong
+LONG_LINE = 1.5  # a line of text that is longer than the median length by this factor contains stray bytes
 
-SCALE_FRAMES_N = 400  # enough to find the LSB of every working chip in real recordings; 200 may be too few
+# in real recordings, this is enough to find the LSB of every working chip; 200 frames may be too few
+SCALE_FRAMES_N = 400
 GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
 
 
@@ -68,7 +74,7 @@ def failed_reads(
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose three field components are exactly 0, as in memory that was never filled.
+    """Mark the readings of a chip whose three field components are exactly 0, as in memory that was never written.
 
     Some rows of the public eFlashTeam7 recordings have zeros on all chips. In the earth's field, a chip cannot read 0
     on three axes at once.
@@ -82,7 +88,7 @@ def find_lsb(
     """Estimate the LSB of each chip in uT (first column: x and y, second: z) from its values; NaN if undetectable.
 
     A few hundred frames are enough. The LSB is undetectable if the settings of the chip change within these frames, if
-    fewer than `steps_min_n` gaps between neighbouring values are one step, or if the step is below `step_min_uT`.
+    fewer than `steps_min_n` gaps between neighbouring values equal one step, or if this step is below `step_min_uT`.
     """
     chips = np.moveaxis(_by_chip(b_uT), 1, 0)
     steps_uT = np.array(
@@ -94,7 +100,7 @@ def find_lsb(
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
     """Mark the chips whose LSB is not the expected one (along x and y, and along z).
 
-    Without an expected LSB, mark the chips whose LSB differs from the median of all chips, or equals the LSB of a chip
+    Without an expected LSB, mark the chips whose LSB differs from the median LSB of all chips or equals that of a chip
     after a reset. A chip whose LSB cannot be detected is not marked.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
@@ -103,7 +109,7 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
 def unusual_lsb(
     lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
 ) -> Bool[np.ndarray, " k"]:
-    """Mark chips as `reset_chips` does, given the LSB that `find_lsb` returned."""
+    """Mark the same chips as `reset_chips`, from the LSB that `find_lsb` returned."""
     if expected_lsb_uT is not None:
         return _differs(lsb_uT, expected_lsb_uT)
     after_reset = ~_differs(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -119,14 +125,16 @@ def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 class StuckChips:
     """Find stuck chips in a recording that arrives in portions of any length.
 
-    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th in a run of equal readings, and if other chips
-    changed in at least the fraction `OTHERS_MOVE_MIN` of this run. If no chip of the board changes, no chip is stuck.
+    A reading is stuck if two conditions hold: at least `STUCK_FRAMES_MIN_N` successive readings of the chip, up to this
+    one, are equal, and other chips changed in at least the fraction `OTHERS_MOVE_MIN` of these frames. If no chip of
+    the board changes, no chip is stuck.
     """
 
     def __init__(self, chips_n: int) -> None:
         self._last_uT = np.full((1, chips_n, 3), np.nan)
         self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip last changed
-        self._moved_n = np.zeros(chips_n, np.int64)  # number of these frames in which another chip changed
+        # number of frames since each chip last changed in which another chip changed
+        self._moved_n = np.zeros(chips_n, np.int64)
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
         """Process the next readings; mark those that are stuck."""
@@ -146,10 +154,10 @@ class StuckChips:
 
 
 class ConstantChannels:
-    """Find channels that never change in a recording while other channels of the same chip do.
+    """Find channels that never change in a recording, although other channels of the same chip change.
 
-    The recording may arrive in portions of any length. A chip with three constant channels is stuck; it is not reported
-    here.
+    The recording may arrive in portions of any length. A chip with three constant channels is not reported here,
+    because it is stuck (see `StuckChips`).
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -192,7 +200,7 @@ def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 
 
 def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the chips whose field steps from one frame to the next by more than 2^15 LSB, as when an int16 overflows.
+    """Mark the chips whose field changes from one frame to the next by more than 2^15 LSB, as when an int16 overflows.
 
     Chips with an unknown LSB are not marked.
     """
@@ -201,7 +209,7 @@ def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k
 
 
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that equal the previous one, if more than the fraction `REPEATED_SHARE` of the frames around them do.
+    """Mark frames that repeat the previous frame, if more than `REPEATED_SHARE` of the frames around them do so too.
 
     A few repeated frames are normal if the firmware reads the chips faster than they measure.
     """
@@ -220,7 +228,7 @@ def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the missing frames before each frame, according to the board's clock; all 0 without a clock."""
+    """Count the missing frames before each frame by the board's clock; without a clock, all counts are 0."""
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -237,8 +245,8 @@ def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
 def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
     """Count the stray bytes before each frame.
 
-    For text frames, whose length varies, `frame_bytes_n` is None. Only lines longer than `LONG_LINE` times the median
-    length then contain stray bytes.
+    The length of text frames varies, so `frame_bytes_n` is None for them. Then only lines longer than `LONG_LINE` times
+    the median length count as having stray bytes.
     """
     length_n = np.diff(end_byte, prepend=first_byte)
     if frame_bytes_n is not None:
@@ -248,7 +256,7 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Return the common step between the values of all given axes; NaN if they have no common step."""
+    """Return the step of the grid on which the values of all given axes lie; NaN if there is no such grid."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
@@ -273,7 +281,7 @@ def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
 
 
 class ReadingFaults(NamedTuple):
-    """Masks of the faults that are visible in a single reading, [frame chip]."""
+    """Masks [frame chip] of the faults that can be detected from a single reading."""
 
     failed_read: Bool[np.ndarray, "f k"]
     zeros: Bool[np.ndarray, "f k"]
@@ -300,9 +308,9 @@ def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float
 class ScaleWindow(NamedTuple):
     """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
-    `first_frame` is the number of the first of these frames, counted from 1; `t_s` are the times of all of them.
+    `first_frame` is the number of the first of these frames, counted from 1. `t_s` contains the times of all of them.
     `unusual` marks chips whose LSB is not the expected one or differs from the LSB of the other chips. `changed` marks
-    chips whose LSB differs from the LSB that was first found for the same chip.
+    chips whose LSB differs from the first LSB that was found for the same chip.
     """
 
     first_frame: int
@@ -314,7 +322,7 @@ class ScaleWindow(NamedTuple):
 
 
 class Faults(NamedTuple):
-    """The faults in one portion of frames: masks and counts, per frame or per frame and chip."""
+    """The faults in one portion of frames, as masks and counts per frame, or per frame and chip."""
 
     readings: ReadingFaults
     stuck: Bool[np.ndarray, "f k"]
@@ -323,8 +331,9 @@ class Faults(NamedTuple):
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
     missing_frames_n: Int[np.ndarray, " f"]  # number of frames missing before each frame, by the board's clock
-    torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, or 0 if they are garbage
-    garbage_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame if very many (wrong baud rate?), or 0
+    torn_bytes_n: Int[np.ndarray, " f"]  # number of stray bytes before each frame, or 0 if they are counted as garbage
+    # number of stray bytes before each frame if there are very many (wrong baud rate?), or else 0
+    garbage_bytes_n: Int[np.ndarray, " f"]
     scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
 
 
@@ -353,7 +362,7 @@ class FaultDetector:
         self._frame_bytes_n = frame_bytes_n
         self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
-        self._windowed_n = 0  # frames in complete windows
+        self._windowed_n = 0  # number of frames in complete windows so far
         self._lsb_uT = np.full((chips_n, 2), np.nan)  # LSB of each chip; NaN until known
         self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
         self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame
@@ -370,7 +379,8 @@ class FaultDetector:
         stuck[read] = self._stuck.feed(b_uT[read])
         stuck[~sound] = False
         if sound.any():
-            # Before the first frame, insert a different field, so that the frame does not count as repeated.
+            # The first frame has no predecessor, so compare it with a different field, so that it does not count as
+            # repeated.
             last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]

@@ -1,4 +1,4 @@
-"""Find boards among the serial ports: listen to each port, and detect wire format, number of chips, rate and scale."""
+"""Find boards among the serial ports, and detect each board's wire format, number of chips, rate and scale."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -21,12 +21,12 @@ LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the L
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
 BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
-LSB_TOLERANCE = 0.05  # relative; the LSBs of two gains differ by 20 % or more
+LSB_TOLERANCE = 0.05  # relative tolerance; the LSBs of two gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
 class DetectedBoard(NamedTuple):
-    """A port and the board on it; without a board, `problem` says why."""
+    """A port and the board on it; if no board was detected, `problem` says why."""
 
     port: str
     problem: str | None
@@ -34,7 +34,7 @@ class DetectedBoard(NamedTuple):
     chips_n: int = 0
     rate_hz: float = np.nan
     lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and along z: medians over chips
-    rate: RateMeasurement | None = None  # None without a board
+    rate: RateMeasurement | None = None  # None if there is no board
     frame_bytes_n: float = np.nan  # mean length of a frame
 
     @property
@@ -61,7 +61,7 @@ class DetectedBoard(NamedTuple):
         return "steps not known yet: do the readings change?"
 
     def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
-        """Describe the measured rate, what would explain it, and the computed limits, in several lines."""
+        """Describe the measured rate, its likely explanation, and the computed limits, in several lines."""
         if self.problem is not None or self.rate is None:
             return str(self)
         rate = self.rate
@@ -133,8 +133,8 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
     decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
-    # Text frames have the temperature of a chip first or last. Temperatures vary less than fields, so choose the format
-    # in which they vary least.
+    # In text frames, the temperature of a chip is first in one format and last in the other. Temperatures vary less
+    # than fields, so choose the format in which the decoded temperatures vary least.
     frames, account, wire, chips_n = min(
         decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64))
     )

@@ -14,7 +14,7 @@ from serial.tools import list_ports
 
 from reskin.errors import CaptureError
 
-READ_TIMEOUT_s = 0.1  # also the maximum delay until a stop request, a silence or the end of the duration is noticed
+READ_TIMEOUT_s = 0.1  # also the longest time until a stop request, a silence or the end of the recording is noticed
 READ_BYTES_MAX_N = 65536
 SOCKET = "socket://"
 
@@ -24,8 +24,8 @@ Device = SerialBase  # an open port
 def open_port(port: str, baud: int) -> Device:
     """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
 
-    This function opens the ports of boards and of force gauges. Bytes that were waiting in the port are discarded. A
-    socket becomes non-blocking; use `read_waiting` to read from serial ports and sockets.
+    This function opens the ports of boards and of force gauges. Bytes that were waiting in the port are discarded. Read
+    from the port with `read_waiting`, because a socket is set to non-blocking mode.
     """
     check_name(port)
     try:
@@ -51,7 +51,7 @@ def check_name(port: str) -> None:
     if port.startswith(SOCKET):
         if not re.fullmatch(r".+:\d{1,5}([/?].*)?", port.removeprefix(SOCKET)):
             reason = f"its port number is missing. Write {SOCKET}HOST:PORT."
-    elif "://" in port:  # pyserial has more schemes, some of which load code
+    elif "://" in port:  # pyserial accepts more schemes, some of which load code
         reason = f"the only supported URL is {SOCKET}HOST:PORT."
     elif os.path.isdir(port):  # unlike `Path.is_dir`, never raises for names such as COM3
         reason = f"it is a folder. {found_ports()}"
@@ -77,6 +77,6 @@ def port_names() -> list[str]:
 
 
 def found_ports() -> str:
-    """Return a sentence with the ports of this machine, for error messages."""
+    """Return a sentence that lists the ports of this machine, for error messages."""
     names = port_names()
     return f"Ports found: {', '.join(names)}." if names else "No serial port was found: is the board plugged in?"

@@ -1,6 +1,7 @@
 """Measure a board's frame rate and its repeated readings, and explain what limits the rate.
 
-`RateMeter` measures. `find_limits` computes the rates that conversion time, I2C bus, baud rate and USB allow.
+`RateMeter` measures the rate. `find_limits` computes the maximum rates that conversion time, I2C bus, baud rate and USB
+allow.
 `explain` compares the measured rate with these limits in one sentence. Agreement with a limit does not prove that this
 limit is the cause, so the sentence says "would explain".
 """
@@ -16,14 +17,15 @@ from reskin.board.faults import SILENCE_S, clock_jumps, find_reading_faults, mis
 from reskin.board.wire import Frames
 from reskin.physics.chip import CONVERSION_S, DIG_FILT_MAX, OSR_MAX, conversion_s
 
-# Repeated readings are reported above this share. In 30 public recordings of real boards, it is up to 0.024;
-# the values of a chip with a coarse LSB are sometimes equal by chance.
+# Repeated readings are reported if their share is above this value. In 30 public recordings of real boards, the share
+# is at most 0.024, because successive values of a chip with a coarse LSB are sometimes equal by chance.
 REPEATED_MAX = 0.05
 ALL_REPEATED = 0.99  # above this share, the board sends the same reading again and again
-FRAMES_MIN_N = 20  # with fewer frames, no rate is given
-CLOCK_FRAMES_N = 400  # number of frames from which the usual step of the board's clock is determined
-# A board's clock is a float32 in s. After hours, its resolution is too coarse for single steps.
-CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of resolution to step
+FRAMES_MIN_N = 20  # with fewer frames, the rate is unknown
+CLOCK_FRAMES_N = 400  # the usual step of the board's clock is determined from this many frames
+# A board sends the time of its clock as a float32 in s. After some hours, the resolution of a float32 is too coarse for
+# the time between two frames.
+CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of this resolution to the time between two frames
 
 # Bits on the I2C bus for one chip: 9 per byte, including the acknowledge bit, and one for each start, repeated start
 # and stop. Each command takes 4 bytes: address, command, address again, and status. Command RM (read the measurement)
@@ -36,7 +38,8 @@ UART_BITS_PER_BYTE_N = 10  # start bit, 8 data bits, stop bit
 USB_BYTES_PER_S = 19 * 64 * 1000  # full speed: at most 19 bulk packets of 64 bytes in 1 ms (USB 2.0, table 5-9)
 
 ERROR = 0.03  # assumed: relative error of a measured rate
-NEAR = 0.8  # assumed: a limit explains rates above this fraction of it, because the board's program also takes time
+# assumed: a limit also explains rates down to this fraction of the limit, because the board's program takes time too
+NEAR = 0.8
 
 Method = Literal["arrivals", "clock"]
 
@@ -50,10 +53,10 @@ class RateMeasurement:
     frames_n : number of frames
     arrived_hz : frames per second that arrived; NaN if unknown
     sent_hz : frames per second that the board sent
-    method : source of `sent_hz`: the board's clock, or the arrivals if the wire format has no usable clock
+    method : how `sent_hz` was measured: by the board's clock, or by arrivals if there is no usable clock
     repeated_frames : share of frames whose fields equal those of the previous frame
-    repeated_readings : share of a chip's readings that equal its previous one; median over chips, so that a single
-        stuck chip has no effect
+    repeated_readings : share of a chip's readings that equal the chip's previous reading. This is the median over
+        chips, so that a single stuck chip has no effect.
     """
 
     frames_n: int
@@ -109,16 +112,16 @@ class RepeatCounter:
         return float(same_n[(len(same_n) - 1) // 2] / self.frames_n) if self.frames_n else 0.0
 
     def restart(self) -> None:
-        """Set all counts to zero, and keep the last frame."""
+        """Set all counts to zero, but keep the last frame for comparison with the next one."""
         self.frames_n = self._same_frames_n = 0
         self._same_readings_n[:] = 0
 
 
 class RateMeter:
-    """Measure the rate of frames that arrive in portions of any length; the memory used does not grow.
+    """Measure the rate of frames that arrive in portions of any length, with constant memory.
 
-    `start_s` is the time of arrival of the first bytes. Frames that arrived then may have been waiting in the port,
-    so they do not count for the rate, and neither does a silence of a second or more.
+    `start_s` is the time of arrival of the first bytes. Frames that arrived at this time may have been waiting in the
+    port, so they are not counted for the rate. A silence of a second or more is not counted either.
     """
 
     def __init__(self, chips_n: int, start_s: float) -> None:
@@ -126,8 +129,9 @@ class RateMeter:
         self._repeats = RepeatCounter(chips_n)
         self._frames_n = self._arrived_n = 0
         self._elapsed_s = 0.0
-        self._clock_s: list[Float64[np.ndarray, " f"]] = []  # times of the board's clock that are not counted yet
-        self._clocked_n = 0  # number of these times
+        # times of the board's clock for frames that are not counted yet
+        self._clock_s: list[Float64[np.ndarray, " f"]] = []
+        self._clocked_n = 0  # number of times in `_clock_s`
         self._sent_n = 0.0
         self._sent_s = 0.0
 
@@ -164,7 +168,7 @@ class RateMeter:
         clock_s = np.concatenate(self._clock_s) if self._clock_s else np.zeros(0)
         self._clock_s, self._clocked_n = [clock_s[-1:]], 0
         step_s = np.diff(clock_s)
-        # A frame with the same time as the previous frame was sent once but arrived twice.
+        # If a frame has the same time as the previous frame, this frame was sent once but arrived twice.
         step_s = step_s[~clock_jumps(step_s) & (step_s > 0)]
         if not len(step_s) or np.spacing(np.float32(clock_s[-1])) > CLOCK_STEP_RESOLUTION_MAX * np.median(step_s):
             return

@@ -1,4 +1,4 @@
-"""Read a port in a thread; after the board was unplugged, reopen the port once the board is plugged in again."""
+"""Read a port in a thread; if the board is unplugged, reopen the port as soon as it is plugged in again."""
 
 import threading
 import time
@@ -36,7 +36,8 @@ class Reader:
         self.taken_s = 0.0  # when `take` was last called, in unix seconds
         self.writer: ChunkWriter | None = None
         self.writer_problem = ""
-        # Unix time minus monotonic time, determined once, because the system's clock may be adjusted during reading.
+        # Unix time minus monotonic time. It is determined only once, because the system's clock may be adjusted during
+        # reading.
         self._clock_s = time.time() - time.monotonic()
         self._chunks: deque[Chunk] = deque()
         self._arrived = threading.Condition()
@@ -71,7 +72,7 @@ class Reader:
         return chunks
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """From now on, write chunks to `writer`, or to no recording if it is None; close the previous recording."""
+        """Close the current recording, if any, and write all later chunks to `writer` (None: to no recording)."""
         with self._arrived:
             previous, self.writer, self.writer_problem = self.writer, writer, ""
         if previous is not None:
@@ -101,7 +102,8 @@ class Reader:
 
     def _queue_chunk(self, chunk: bytes) -> None:
         with self._arrived:
-            # The time is read within the lock, so that a chunk that `take` did not return has a time after `taken_s`.
+            # The time is read while the lock is held. Therefore, a chunk that `take` has not returned has a time after
+            # `taken_s`.
             now_s = self.unix_s()
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)

@@ -1,7 +1,7 @@
-"""Split a byte stream into frames, without I/O; every byte belongs to a frame or is counted as lost.
+"""Split a byte stream into frames, without I/O; every byte is part of a frame or is counted as lost.
 
-No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). The result depends
-only on the bytes, not on how the stream was divided into reads.
+No format marks the start of a frame, and the bytes CR LF at its end may also occur in a float (34.513275 degC contains
+them). The result depends only on the bytes, and not on the portions in which they were read.
 """
 
 import re
@@ -23,13 +23,13 @@ ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipp
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
 # An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. These limits are used only if the positions of CR
-# LF allow more than one division into frames. Values outside the limits do not drop a frame: the values of a failed
-# read are outside too, see `faults`.
+# LF allow several ways to divide the bytes into frames. A frame with values outside the limits is not dropped, because
+# the values of a failed read are outside too (see `faults`).
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
-VALUE_MIN = 1e-3  # in uT or degC; smaller values, except 0, are below the chip's LSB
+VALUE_MIN = 1e-3  # in uT or degC; a smaller value, except 0, is below the LSB of any chip
 
-SEARCH_FRAMES_N = 64  # a search uses the bytes of this many frames at once
+SEARCH_FRAMES_N = 64  # number of frames whose bytes a search uses at once
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class _Scan:
 
 
 class FrameStream:
-    """Incremental decoder: returns frames as soon as they are certain, and stores the bytes that are undecided.
+    """Incremental decoder, which returns each frame as soon as it is certain, and stores the bytes that are undecided.
 
-    `_find_runs` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two decimals
-    for k chips. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is
-    decoded as a frame with a wrong number.
+    `_find_runs` defines which bytes are a binary frame. A text frame of k chips is a line of exactly 4 k numbers with
+    two decimals. The first byte of a stream is assumed to be the start of a frame. If the first line was cut inside its
+    first number, this number is therefore decoded wrongly.
     """
 
     def __init__(self, wire: Wire, chips_n: int) -> None:
@@ -64,7 +64,7 @@ class FrameStream:
         return self._advance(data, final=False)
 
     def close(self) -> Frames:
-        """End the stream; return the frames that waited for more bytes, and count the remaining bytes as lost."""
+        """End the stream; return the frames that were not yet certain, and count the remaining bytes as lost."""
         self._closed = True
         return self._advance(b"", final=True)
 
@@ -111,7 +111,7 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
 def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
     """List the formats (wire format, number of chips) that decode most of the first 16 KiB of `data` into frames.
 
-    If this is possible with several numbers of chips, only the formats with the smallest number are listed.
+    If formats with different numbers of chips do so, only those with the smallest number of chips are listed.
     """
     data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
@@ -145,12 +145,13 @@ def _scan_binary(
 def _find_runs(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[list[Run], int, bool]:
-    """Find the runs of consecutive frames; also return how many bytes are settled, and whether a frame follows them.
+    """Find the runs of consecutive frames; return them, the number of settled bytes, and whether a frame follows these.
 
-    A frame is accepted directly if it begins where the previous frame ended (or the stream began) and ends with CR LF,
-    unless CR LF is also in its payload *and* its values are implausible. In this case, and after stray bytes, the next
-    frame is searched: it has CR LF before it and at its end. If several positions fit, the one with the most plausible
-    chips in this frame and the next is chosen; among equally plausible positions, the first.
+    A frame is accepted directly if it begins where the previous frame ended (or at the start of the stream) and ends
+    with CR LF. There is one exception: a frame that also has CR LF in its payload *and* has implausible values is not
+    accepted directly. In this case, and after stray bytes, `_search` looks for the next position with CR LF both before
+    the frame and at its end. If several positions fit, it chooses the one with the most plausible chips in the frame
+    there and in the frame after it. Among equally plausible positions, it chooses the first.
     """
     runs: list[Run] = []
     position = 0
@@ -188,7 +189,7 @@ def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void
 
 
 def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Return the result of `_sure_frames_n` for a block of whole frames."""
+    """Count like `_sure_frames_n`, in one block of whole frames."""
     rows = block.reshape(-1, record.itemsize)
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
@@ -205,20 +206,20 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
 def _search(
     window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[int, bool]:
-    """Return the number of bytes to skip, and whether a frame begins after them; if not, more bytes are needed.
+    """Return the number of bytes to skip, and whether a frame begins there; if not, more bytes are needed.
 
     The two bytes before the first possible start of a frame are not skipped, because they may be the CR LF of a frame
     when the window is searched again with more bytes.
     """
     length_n, window_n = record.itemsize, len(window)
-    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
+    ended = np.zeros(window_n + 2 * length_n + 1, bool)  # whether a frame may have ended before each byte
     ended[0] = at_boundary
     ended[2 : window_n + 1] = _terminators(window)[: max(window_n - 1, 0)]
     fits = ended[:-length_n] & ended[length_n:]
     first = int(fits.argmax())
     if not fits[first]:
         return (window_n if final else max(window_n - length_n - 1, 0)), False
-    if not final and window_n < first + 3 * length_n:  # other candidates may follow
+    if not final and window_n < first + 3 * length_n:  # other candidate positions may follow
         return max(first - 2, 0), False
     starts = first + np.flatnonzero(fits[first : first + length_n])
     here_n, next_n = (
@@ -227,7 +228,8 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # The bytes after a CR LF in a payload may look like a frame. The real frame after them is then more plausible.
+    # If a payload contains CR LF, the bytes after it may look like a frame. The real frame that follows is then more
+    # plausible.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 
@@ -251,12 +253,13 @@ def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:
-    """Decode whole lines; a line that is longer than any frame is skipped without waiting for its end."""
+    """Decode whole lines; skip a line that is longer than any frame without waiting for its end."""
     line_end = np.flatnonzero(octets == LF) + 1
     settled_n = int(line_end[-1]) if len(line_end) else 0
     parts: list[Frames] = []
     count: Counter[str] = Counter()
-    # Unless a frame begins at the first byte, skip the first line: the end of an overlong line may look like a frame.
+    # Unless a frame begins at the first byte, skip the first line, because the end of an overlong line may look like a
+    # frame.
     for first in range(0 if at_boundary else 1, len(line_end), BLOCK_LINES_N):
         base = int(line_end[first - 1]) if first else 0
         ends = line_end[first : first + BLOCK_LINES_N] - base

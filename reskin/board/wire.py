@@ -1,7 +1,7 @@
 """Encode and decode whole frames: binary bursts and lines of text.
 
-These are the formats of the ReSkin and AnySkin firmwares, which have no header, checksum or counter. Module `stream`
-finds frames in a byte stream, and `faults` checks their values.
+The formats are those of the ReSkin and AnySkin firmware; their frames have no header, checksum or counter. Module
+`stream` finds frames in a byte stream, and `faults` checks their values.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,7 +17,7 @@ TEXT_WIRES = ("text-xyzt", "text-txyz")
 NUMBERS_PER_CHIP_N = 4  # a temperature and three components of the field
 INTEGER_DIGITS_MAX_N = 10  # Arduino's print() writes "ovf" above 4294967040
 NUMBER_BYTES_MAX_N = len("-4294967040.00\t")
-BLOCK_FRAMES_N = 4096  # a block of this length and the values computed from it fit into the processor's cache
+BLOCK_FRAMES_N = 4096  # a block of this many frames and the values computed from it fit into the processor's cache
 
 Run = tuple[int, int]  # first byte, number of consecutive frames
 
@@ -67,7 +67,7 @@ def line_bytes_max_n(chips_n: int) -> int:
 
 
 def encode(frames: Frames, wire: Wire) -> bytes:
-    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` includes the device's time."""
+    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` has the board's time."""
     frames_n, chips_n = frames.temperature_degC.shape
     b_uT = frames.b_uT.reshape(frames_n, chips_n, 3)
     if wire in TEXT_WIRES:
@@ -97,7 +97,7 @@ def _encode_lines(
 def decode_runs(
     octets: UInt8[np.ndarray, " bytes"], runs: Sequence[Run], wire: Wire, chips_n: int
 ) -> tuple[Frames, Bool[np.ndarray, " f"]]:
-    """Decode the binary frames at `runs` of `octets`; the mask marks frames whose values are all finite."""
+    """Decode the binary frames in `runs` of `octets`; the mask marks the frames whose values are all finite."""
     record = record_type(wire, chips_n)
     frames = _allocate(sum(frames_n for _, frames_n in runs), chips_n)
     finite = np.ones(len(frames), bool)
@@ -107,7 +107,8 @@ def decode_runs(
     for first_byte, frames_n in _blocks(runs, record.itemsize):
         rows, stop_byte = slice(row_i, row_i + frames_n), first_byte + frames_n * record.itemsize
         records = octets[first_byte:stop_byte].view(record)
-        # Copy once, because reading unaligned floats is slow. In mode "clip", `take` writes to `out` without a buffer.
+        # Reading unaligned floats is slow, so copy the values once. With mode "clip", `take` writes to `out` without a
+        # buffer.
         values = np.ascontiguousarray(records["txyz"]).reshape(frames_n, -1)
         values.take(b_i, axis=1, out=frames.b_uT[rows], mode="clip")
         values.take(temperature_i, axis=1, out=frames.temperature_degC[rows], mode="clip")
@@ -126,7 +127,8 @@ def decode_lines(
 ) -> tuple[Frames, Bool[np.ndarray, " lines"]]:
     """Decode the lines that end at `line_end` (LF included); the mask marks the lines that are frames.
 
-    Tabs may be missing. Every number has exactly two decimals, so that `-56.7825.00` can be split into two numbers.
+    Tabs between numbers may be missing. Because every number has exactly two decimals, `-56.7825.00` can still be split
+    into two numbers.
     """
     start = np.concatenate([[0], line_end[:-1]])
     dot = np.flatnonzero(octets == DOT)
@@ -149,8 +151,8 @@ def _numbers(
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
     """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
-    # Unsigned bytes wrap around, so characters that are not digits give numbers above 9. Two zeros are appended,
-    # because a decimal point may be the last byte.
+    # Subtract the code of "0" from each byte. Unsigned bytes wrap around, so characters that are not digits give values
+    # above 9. Two zeros are appended, so that two digits can be read even if a decimal point is the last byte.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
     previous_stop = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends

@@ -7,11 +7,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three values were tuned on all passes of the recording of scene `eflesh`, so this recording cannot test them.
-# `follow_free` compares a reading with this many latest states: usually five contacts and five contact-free states.
+# These three values were tuned on all passes of the recording of scene `eflesh`, so they cannot be tested on it.
+# Number of latest states with which `follow_free` compares a reading; usually, five are contacts and five are not.
 STATES_N = 10
-SIMILAR_MIN_N = 4  # a state is free of contact if it is similar to this many of the latest states, including itself
-# Two readings are similar if their distance is below this multiple of the median distance between the no-load readings
+# a state is free of contact if it is similar to at least this many of the latest states, including itself
+SIMILAR_MIN_N = 4
+# Two readings are similar if their distance is below this factor times the median distance between the no-load readings
 # of successive indentations.
 SIMILAR_FACTOR = 2.0
 
@@ -22,7 +23,7 @@ def subtract(b_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "
 
 
 def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the runs of equal labels from 0, and return the run number of each row.
+    """Number the runs of equal labels from 0; return for each row the number of its run.
 
     `label` is, for example, the indentation or pass of each row of a capture, in order of time.
     """
@@ -72,12 +73,12 @@ def free(
 
 
 def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Float[np.ndarray, " ch"]]:
-    """Yield the current baseline after each reading, inferred from the readings alone.
+    """Yield the current baseline after each reading; the baseline is inferred from the readings alone.
 
     The first reading must be free of contact. Consecutive similar readings, such as those of a press that is held, form
-    one state of any duration. Different presses give different readings, but readings without contact are similar.
-    Therefore, a state is classified as free of contact if it is similar to at least `SIMILAR_MIN_N` of the latest
-    states. During a long contact, such as a sliding finger, the baseline does not change.
+    one state, however long it lasts. Different presses give different readings, but all readings without contact are
+    similar. Therefore, a state is classified as free of contact if it is similar to at least `SIMILAR_MIN_N` of the
+    latest states. During a long contact, such as a sliding finger, the baseline does not change.
     """
     states: deque[np.ndarray] = deque(maxlen=STATES_N)
     baseline_uT: np.ndarray | None = None
@@ -93,7 +94,7 @@ def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Fl
 
 
 def alike_within_uT(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> float:
-    """Return the distance in uT below which two readings are similar; the threshold of `follow_free`.
+    """Return the distance in uT below which `follow_free` treats two readings as similar.
 
     This is `SIMILAR_FACTOR` times the median distance between the no-load readings of successive indentations.
     """

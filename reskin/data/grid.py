@@ -1,4 +1,4 @@
-"""The paper's poking protocol: all 65 points of a grid are poked at one depth, then all at the next depth, and so on.
+"""The paper's poking protocol: poke all 65 points of a grid at one depth, then all at the next depth, and so on.
 
 Places are in the coordinates of the labels: x and y from 0 to 16 mm, with the centre of the skin at (8, 8) mm.
 """
@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-# "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; the paper's "16cm" is a typo for 16 mm.
+# The paper: "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)". Its "16cm" is a typo for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
-BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns that have no excluded points
+BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns in which no point is excluded
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
 SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
 

@@ -1,8 +1,8 @@
 """Pokes along straight lines; the only label of a poke is its rank along the line.
 
 This is the method of section 5 of the paper: "indent in a straight line and incrementally index these points". Here,
-the index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row
-numbers, line numbers and indices.
+the indices along a line are derived from the places on a robot's grid. The places are then discarded, so `Lines`
+contains only row numbers, line numbers and indices.
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,16 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: places whose coordinates are equal after rounding to this step are the same place
+PLACE_STEP_MM = 0.1  # assumed: two places are the same if their coordinates are equal after rounding to this step
 PLACES_MIN_N = 2  # a line with a single place has no order
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Rows assigned to lines, without place and force; sorted by line, then index along the line, then row number.
+    """Rows that are assigned to lines, without places and forces, sorted by line, index along the line, and row number.
 
-    A row number may occur in two lines, because a grid point is on a line along x and on a line along y.
+    A row may be part of two lines, because a grid point is on a line along x and on a line along y.
     """
 
     row: Int64[np.ndarray, " p"]  # row number in `Rows` or in a capture
@@ -38,11 +38,11 @@ class Lines:
 
 
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
-    """Assign the chosen row numbers to the grid lines of each skin, along x and along y, with an index along the line.
+    """Assign the chosen rows to the grid lines of each skin along x and along y, with their index along the line.
 
-    The only labels that are used are the skin and the commanded place. The index along a line in x is the rank of the
-    row's x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line without a row at one of
-    these coordinates therefore has a gap in its indices. Lines with a single place have no order and are left out.
+    Of the labels, only the skin and the commanded place are used. The index along a line in x is the rank of the row's
+    x among all distinct values of x in the chosen rows of the skin (for lines in y, likewise). If a line has no row at
+    one of these values, its indices have a gap. Lines with a single place have no order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -59,9 +59,9 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
     """Assign the readings of a capture of manual pokes to lines: one line per pass.
 
-    The index along the line is the number of the indentation within the pass, from 0; an indentation that is missing
-    leaves a gap. `Lines.row` is the number of the reading in the capture. Lines with a single indentation have no order
-    and are left out.
+    The index along the line is the number of the indentation within the pass, from 0. If an indentation is missing, the
+    indices have a gap. `Lines.row` is the number of the reading in the capture. Lines with a single indentation have no
+    order and are left out.
     """
     order_i = indentation.astype(np.int64)
     for line in np.unique(pass_i):
@@ -72,8 +72,8 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
 def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
     """Stack the readings of captures of manual pokes, and assign them to lines.
 
-    Returns the rows, whose places and forces are unknown (NaN), and the lines of each skin, by the skin's name. The row
-    numbers in the lines refer to the returned rows.
+    Returns the rows, whose places and forces are unknown (NaN), and a mapping from each skin's name to its lines. The
+    row numbers in the lines refer to the returned rows.
     """
     parts: list[Rows] = []
     lines: dict[str, Lines] = {}
@@ -99,7 +99,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Increase the row numbers in `lines` by `rows_n`, for rows that are stacked below `rows_n` other rows."""
+    """Increase the row numbers in `lines` by `rows_n`, because `rows_n` other rows were stacked above their rows."""
     return replace(lines, row=lines.row + rows_n)
 
 
@@ -108,9 +108,9 @@ def take_pokes(
 ) -> Int64[np.ndarray, " d"]:
     """Draw `indentations_n` indentations of one skin, evenly over the places; return their row numbers, sorted.
 
-    `pool` contains the row numbers to draw from. The only label that is used is the place of an indentation's first
-    row. In the first round, one indentation is drawn for each place; in the second round, another one, and so on. The
-    last round may cover only some places, chosen at random. With the same state of `rng`, a call that draws fewer
+    `pool` contains the row numbers to draw from. Of the labels, only the place of an indentation's first row is used.
+    In the first round, one indentation is drawn for each place; in the second round, another one, and so on. The last
+    round may cover only some places, chosen at random. With the same state of `rng`, a call that draws fewer
     indentations returns a subset.
     """
     _check_pool(rows, pool, indentations_n)
@@ -123,7 +123,7 @@ def take_pokes(
 
 
 def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Return for each element the number of earlier elements with the same place.
+    """Return for each element the number of earlier elements that have the same place.
 
     >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
@@ -141,7 +141,7 @@ def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Create `Lines` from the key of each row's line: drop lines with a single place, number the others, and sort."""
+    """Create `Lines` from the key of each row's line; drop lines with a single place, and number the others."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
     has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # one element per line

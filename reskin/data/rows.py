@@ -1,4 +1,4 @@
-"""Rows of a dataset: selected readings of several captures, stacked."""
+"""The rows of a dataset, which are selected readings of several captures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
 UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not change these
-SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if a recording has shear forces (paper section 4)
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # targets for recordings with shear forces (paper section 4)
 
 
 class Selection(Strict):
-    """Criteria for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
+    """Criterion for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
 
     force_min_N: float
 
@@ -32,8 +32,8 @@ class Rows:
     `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
     and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
     number of the pass, counted over all captures of a skin. `indentation` is the number of the indentation, counted
-    over all captures of the scene; all readings of an indentation have the same number. `dropped` counts the readings
-    that are left out because they are not in contact, by reason.
+    over all captures of the scene; all readings of an indentation have the same number. `dropped` contains the numbers
+    of readings that were left out because they are not in contact, by reason.
     """
 
     capture: np.ndarray
@@ -52,7 +52,7 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Create rows whose readings and targets are 0, one row per indentation, for doctests of folds.
+        """Create rows for doctests of folds: one row per indentation, whose reading and targets are 0.
 
         Without `pass_i`, all rows are in pass 0.
         """

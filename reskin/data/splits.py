@@ -1,7 +1,7 @@
-"""Draw folds, which hold out boards, skins, readings, indentations or passes; convert them to and from `folds.json`.
+"""Draw folds that hold out boards, skins, readings, indentations or passes; convert folds to and from `folds.json`.
 
-scikit-learn draws the random splits. In folds that hold out skins, no skin and no board may be both trained on and held
-out; this module checks that.
+scikit-learn draws the random splits. In folds that hold out skins, no skin and no board may have both training rows and
+held-out rows. This module checks this condition.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,11 +21,11 @@ from reskin.seeds import rng_for, seed_for
 
 # What each experiment on a single skin holds out at random.
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}
-SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was trained on
+SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that train and test on the same skin
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
-DRAW = "-draw"  # precedes the number of the draw in the name of a fold
+DRAW = "-draw"  # text before the number of the draw in the name of a fold
 SEED_LIMIT = 2**32  # scikit-learn accepts only smaller seeds
 
 Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and test
@@ -34,7 +34,7 @@ Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and tes
 class Split(Strict):
     """Settings for drawing folds.
 
-    A setting is required if the scene runs the experiment that uses it, and must be None otherwise.
+    Each setting belongs to an experiment. It is required if the scene runs this experiment, and must be None otherwise.
     """
 
     random_test_fraction: Fraction | None = None
@@ -43,8 +43,8 @@ class Split(Strict):
     transfer_skins_n: Count | None = None
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # number of first passes of each held-out skin that adaptation may use
-    labels_pool_n: Count | None = None  # number of indentations of each held-out skin that may be labelled
+    pool_passes_n: Count | None = None  # adaptation may use this many passes, the first ones, of each held-out skin
+    labels_pool_n: Count | None = None  # this many indentations of each held-out skin may be labelled
     labels_draws_n: Count | None = None
 
     @field_validator("sensors_skins_n")
@@ -59,8 +59,8 @@ class Split(Strict):
 class Fold:
     """Row numbers (in `Rows`) of the training rows, the test rows, and the pool.
 
-    The pool contains the pokes on the held-out skins that adaptation may use. No method is tested on the pool, so that
-    all methods are tested on the same rows.
+    The pool contains those pokes on held-out skins that adaptation may use. All methods are tested on the same rows, so
+    no method is tested on the pool.
     """
 
     experiment: str
@@ -76,7 +76,7 @@ class Fold:
 
     @property
     def draw_i(self) -> int:
-        """Number of the random draw of the pool, from 0; only for folds of experiment `labels`."""
+        """Number of the fold's random draw of the pool, from 0; only for folds of experiment `labels`."""
         return int(self.name.rpartition(DRAW)[2])
 
 
@@ -101,7 +101,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     b2 [0 1 2] [3] [4]
 
     Experiment `sensors` holds out every board in turn, and trains on 1, 2, ... skins of the other boards. Within a
-    draw, a larger training set contains the smaller ones:
+    draw, each training set contains all smaller training sets:
 
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
@@ -129,12 +129,12 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw.
+    """Train on k skins, test on a held-out board that has none of these skins; make one fold per board, k and draw.
 
-    This is figure 6b of the paper. Every board is held out in turn and has separate random draws. Within a draw, the
-    training skins for a smaller k are a subset of those for a larger k. If k is the number of all skins of the other
-    boards, there is a single fold for the board. It equals the fold of experiment `lobo` and has the same name, so that
-    training runs of `lobo` are reused.
+    This is the experiment of figure 6b of the paper. Every board is held out in turn and has separate random draws.
+    Within a draw, the training skins for a smaller k are a subset of those for a larger k. If k is the number of all
+    skins of the other boards, there is nothing to draw, so the board has a single fold for this k. This fold equals the
+    fold of experiment `lobo` and has the same name, so that the training runs of `lobo` are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -158,8 +158,8 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Hold out a board as in experiment `lobo`, and draw a pool of its indentations; one fold per board and draw.
 
-    The pool contains the indentations that may be labelled. All of them are excluded from the test rows, even if only
-    some are labelled, so that the test rows are the same for all numbers of labels.
+    The pool contains the indentations that may be labelled. The whole pool is excluded from the test rows, even if only
+    a part of it is labelled, so that the test rows are the same for all numbers of labels.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
@@ -184,19 +184,20 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled; with n labels, the first n are used."""
+    """Draw the order in which the indentations of a fold's pool are labelled; with n labels, use the first n."""
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Train on one skin, test on all skins of other boards; one fold per training skin.
 
-    A board that has a training skin in any fold is not tested on, so that all folds have the same test rows. With
-    `split.pool_passes_n`, the passes of the pool are excluded from the test rows here too, so that all experiments are
-    tested on the same rows.
+    If a board has a training skin in any fold, none of its skins is tested on, so that all folds have the same test
+    rows. With `split.pool_passes_n`, the passes of the pool are excluded from the test rows in this experiment too, so
+    that all experiments are tested on the same passes.
 
-    The paper trains on 3 skins, one at a time, and tests on 9 others. Here, with 6 boards of 3 skins each, the training
-    skins are the first skins of the first three boards, and the test skins are all skins of the other three.
+    The paper trains on 3 skins, one at a time, and tests on 9 other skins. With 6 boards of 3 skins each, the training
+    skins here are the first skins of the first three boards, and the test skins are the 9 skins of the other three
+    boards.
     """
     assert split.transfer_skins_n is not None
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
@@ -235,10 +236,10 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
 
 
 def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
-    """Hold out random readings, indentations or passes of the first skin, at least one; one fold per repetition.
+    """Hold out random readings, indentations or passes (at least one) of the first skin; make one fold per repetition.
 
-    The paper holds out readings (section 4). Readings of the same indentation are then in both the training and the
-    test rows, so the accuracy is overestimated.
+    The paper holds out readings (section 4). This overestimates the accuracy, because readings of the same indentation
+    are then in the training rows and in the test rows.
     """
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
@@ -276,10 +277,11 @@ def draw_sides(
 ) -> list[Sides]:
     """Split rows at random into training and test rows, `repeats_n` times.
 
-    Rows with the same `group` are never separated, and at least one group is in the test rows. In error messages,
-    `what` describes the groups and `where` the experiment; `state` is the random seed.
+    Rows with the same `group` are never separated, and at least one group is in the test rows. `state` is the random
+    seed. In error messages, `what` describes the groups, and `where` the experiment.
     """
-    from sklearn.model_selection import GroupShuffleSplit  # imported late: takes a second, and few stages need it
+    # imported late, because it takes a second and few stages need it
+    from sklearn.model_selection import GroupShuffleSplit
 
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
@@ -288,7 +290,7 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return how many of `all_n` groups to test on; raise `ParamsError` if none would be left to train or test on."""
+    """Return the number of test groups among `all_n` groups; raise `ParamsError` if it is 0 or `all_n`."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene."
@@ -299,7 +301,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
 
 
 def _check_disjoint(rows: Rows, fold: Fold) -> None:
-    """Raise if a board or a skin of the training rows is also in the test rows or in the pool."""
+    """Raise if a board or a skin of the training rows also occurs in the test rows or in the pool."""
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
@@ -325,7 +327,7 @@ SIDES = ("train", "test", "pool")
 
 
 def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
-    """Convert folds to JSON values; row numbers become half-open ranges, and boards and skins are listed too."""
+    """Convert folds to JSON values: row numbers as half-open ranges, and the names of boards and skins."""
     content: list[dict[str, Any]] = []
     for fold in folds:
         sides = {side: getattr(fold, side) for side in SIDES}

@@ -1,6 +1,7 @@
-"""Cut captures into windows of time, and apply several baseline policies (experiment `drift`, paper section 4).
+"""Cut captures into windows of time, and apply baseline policies, for experiment `drift` (paper section 4).
 
-A unit is an indentation or a pass. A window is a range of successive units. A part is the rows of one window of one
+A unit is an indentation or a pass. A window is a range of successive units. A baseline policy chooses the no-load
+reading to subtract from each row (see `reskin.data.baseline`). A part consists of the rows of one window of one
 capture, with the baselines of one policy.
 """
 
@@ -38,7 +39,7 @@ class Part:
     window_i: int
     readings: Readings
     rows: Rows
-    noload_off_uT: float  # rms over rows and channels of (baseline - no-load reading before the contact)
+    noload_off_uT: float  # rms, over rows and channels, of the baseline minus the no-load reading before the contact
     first_row_i: int  # number of the part's first row in the stack
 
     @property
@@ -50,8 +51,8 @@ class Part:
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
     """Return the training window (the first `train_n` units) and the test windows (`test_n` units each).
 
-    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, ... `units_n` is the length of each capture in
-    units; all windows are within the shortest capture.
+    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, and so on. `units_n` contains the length of each
+    capture in units. All windows are within the shortest capture.
 
     >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
@@ -75,7 +76,7 @@ def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
 
 
 def check_one_per_skin(captures: Sequence[Readings]) -> None:
-    """Raise if several captures have the same skin, because their order in time is unknown."""
+    """Raise if several captures have the same skin, because their order in time would be unknown."""
     names: dict[str, list[str]] = {}
     for readings in captures:
         names.setdefault(readings.skin, []).append(readings.capture)
@@ -95,8 +96,8 @@ def make_parts(
 ) -> list[Part]:
     """Make one part per capture, policy and window.
 
-    `captures` are pairs of a capture and the unit number of each of its rows. A policy is applied to the whole capture,
-    including the rows that are not in a window or not in `selection`.
+    Each element of `captures` is a pair: a capture, and the unit number of each of its rows. A policy is applied to the
+    whole capture, including rows that are in no window or are not selected by `selection`.
     """
     parts: list[Part] = []
     next_i = 0

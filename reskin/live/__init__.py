@@ -1,1 +1,1 @@
-"""Running boards: contacts, alarms, the page of `reskin live`, recording, and emulated boards."""
+"""Work with running boards: contacts, alarms, the page of `reskin live`, recording, and emulated boards."""

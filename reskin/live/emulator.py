@@ -1,4 +1,4 @@
-"""An emulated board: sends the bytes of a capture or a simulation to a pseudo-terminal or TCP socket.
+"""An emulated board, which sends the bytes of a capture or a simulation to a pseudo-terminal or TCP socket.
 
 Faults, such as a stuck chip or an unplugged cable, can be injected.
 """
@@ -41,11 +41,12 @@ SEED = 2021  # default seed of a simulation, if the scene's YAML file has none
 TOUCH_PROTOCOL = "log"  # touches with pauses between them, similar to manual use
 
 ROBOT_PASSES_N = 2  # passes of an emulated robot over the 65 places of the grid
-# Times of an emulated robot for each press: above the skin, moving down or up, and pressing. Before the first press, it
-# waits ROBOT_QUIET_S, because the first frames are lost if the port is opened late.
+# For each press, an emulated robot stays above the skin for LIFTED_S, moves down or up for MOVING_S each, and presses
+# for PRESSING_S. Before the first press, it waits for ROBOT_QUIET_S, because the first frames are lost if the port is
+# opened late.
 LIFTED_S, MOVING_S, PRESSING_S, ROBOT_QUIET_S = 0.12, 0.02, 0.1, 4.0
 ROBOT_RATE_HZ = 100.0
-AT_REST = 0.999  # an emulated robot is at rest while the force is at least this fraction of the force of the press
+AT_REST = 0.999  # an emulated robot is at rest while the force is at least this fraction of the press's largest force
 
 START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
@@ -55,7 +56,7 @@ WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolutio
 MAGNET_uT = 400.0
 HOT_degC = 150.0
 CLOCK_JUMP_S = 3600.0
-SLOW_FRAMES_N = 3  # fault `slow-chips`: each chip has a new reading in every third frame, not all in the same frame
+SLOW_FRAMES_N = 3  # fault `slow-chips`: each chip has a new reading in every third frame only, and the chips take turns
 VALUE_FAULTS = (
     "failed-read", "zeros", "chip-reset", "stuck", "slow-chips", "saturated", "int16-wrap", "magnet", "too-hot", "crlf",
     "clock-jump",
@@ -63,8 +64,9 @@ VALUE_FAULTS = (
 BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
 
-TICK_S = 0.1  # longest time until `play` reacts to its event `stop`
-# If sending is blocked for longer than this, all later frames are delayed. After a shorter block, `play` catches up.
+TICK_S = 0.1  # longest time until `play` reacts to event `stop`
+# If sending is blocked for longer than this time, all later frames are delayed. If it is blocked for a shorter time,
+# `play` catches up.
 LATE_MAX_S = 0.1
 BATCH_MAX_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
@@ -73,14 +75,14 @@ TCP_PORT_MAX = 65535
 
 @dataclass(frozen=True)
 class Script:
-    """A byte stream to send: decoded frames, the bytes of each frame (a piece), and the due time of each piece."""
+    """A byte stream to send: decoded frames, the bytes of each frame (a piece), and the time when each piece is due."""
 
     source: Source
     wire: Wire
     frames: Frames
     pieces: list[bytes]
     t_s: Float64[np.ndarray, " f"]  # due time of each piece, from the start of the script
-    # Index of a piece -> time for which the board is unplugged before this piece is sent.
+    # Maps the index of a piece to the time for which the board is unplugged before this piece is sent.
     unplugged_s: dict[int, float] = field(default_factory=dict)
     # True x_mm, y_mm and F_N of each frame; NaN without contact. None if the true contacts are unknown.
     true_contacts: Float64[np.ndarray, "f 3"] | None = None
@@ -91,7 +93,7 @@ class Script:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first frame to the repetition of the first frame, when the script is sent in a loop."""
+        """Time after which the first frame is sent again when the script is sent in a loop."""
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
@@ -101,8 +103,10 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
     Parameters
     ----------
     source : folder of a capture, `nominal` (the nominal skin), or the YAML file of a scene with a section `simulate`
-    board : name of a nominal board: each name gives another board, with another skin; default: the first one
-    robot : whether a robot presses the nominal skin on the grid, instead of touches at random places
+    board : name of a simulated board, for `nominal`; each name gives another board with another skin. Default: the
+        first board.
+    robot : whether a robot presses the nominal skin at the places of the grid; otherwise, the skin is touched at random
+        places
     """
     folder = Path(source)
     if (board is not None or robot) and source != NOMINAL_SOURCE:
@@ -127,7 +131,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
 
 
 def read_capture(folder: Path) -> Script:
-    """Create a script from a recorded byte stream, or from an SD card log; the log's readings are encoded as frames."""
+    """Create a script from a recorded byte stream, or from an SD card log, whose readings are encoded as frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
@@ -148,10 +152,10 @@ def read_capture(folder: Path) -> Script:
 
 
 class RobotPresses(Walk):
-    """Presses of an emulated robot: passes over the grid in random order, in one recording as of protocol `walk`."""
+    """Presses of an emulated robot: passes over the grid in random order, as one recording like protocol `walk`."""
 
     def plan(self, rng: np.random.Generator, skin_mm: tuple[float, float]) -> Plan:
-        """Draw the order of the places and the depth of each press; each frame is a stop, as in a walk."""
+        """Draw the order of the places and the depth of each press; each frame is one stop, as in protocol `walk`."""
         lifted_n, moving_n, pressing_n = (round(s * self.rate_hz) for s in (LIFTED_S, MOVING_S, PRESSING_S))
         ramp = np.arange(1, moving_n + 1) / (moving_n + 1)
         share = np.concatenate([ramp, np.ones(pressing_n), ramp[::-1]])
@@ -169,11 +173,11 @@ class RobotPresses(Walk):
 def simulate(
     section: Mapping[str, Any], seed: int, where: str, *, board: str | None = None, robot: bool = False
 ) -> Script:
-    """Create a script by simulating a skin of a scene's section `simulate`.
+    """Create a script by simulating a skin as section `simulate` of a scene describes.
 
-    The protocol is `log` if the section has it, or else the scan over a grid of places. `board` is the name of the
-    board; by default, it is the first one. With `robot`, the touches of protocol `log` are replaced by presses of a
-    robot.
+    Protocol `log` is simulated if the section has it; otherwise, the scan over a grid of places. `board` is the name of
+    the board (default: the first board of the scene). With `robot`, the touches of protocol `log` are replaced by
+    presses of a robot.
     """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
@@ -189,7 +193,7 @@ def simulate(
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
     script = replace(script, true_contacts=true_contacts_of(capture))
-    if robot:  # frames are sent one by one, so that each row of the robot's log has the time of its frame
+    if robot:  # frames are due one by one, so that each row of the robot's log has the time of its frame
         even_s = np.arange(len(script)) / ROBOT_RATE_HZ
         script = replace(script, t_s=even_s, presses_per_pass_n=len(points_mm()))
     return script
@@ -198,8 +202,8 @@ def simulate(
 def true_contacts_of(capture: SimulatedCapture) -> Float64[np.ndarray, "f 3"] | None:
     """Return the true x_mm, y_mm and F_N of each frame, NaN without contact; None for a protocol with a robot.
 
-    In protocol `log`, the probe log has one dwell per frame in contact, without errors of place, force and clock. In
-    other protocols, the log has the errors of the simulated robot.
+    In protocol `log`, the probe log has one dwell per frame in contact, and its places, forces and times have no
+    errors. In other protocols, the probe log has the errors of the simulated robot.
     """
     if capture.card_rate_hz is None:
         return None
@@ -274,7 +278,7 @@ def inject(script: Script, fault: Fault) -> Script:
 
 
 def _change_values(frames: Frames, fault: str) -> None:
-    """Apply a fault to the measured values of all these frames, in place."""
+    """Apply a fault to the measured values of all given frames, in place."""
     b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
     chip_i = min(1, temperature_degC.shape[1] - 1)
     match fault:
@@ -296,7 +300,7 @@ def _change_values(frames: Frames, fault: str) -> None:
         case "int16-wrap":
             b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
         case "magnet":
-            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated only about z, so all of them measure the same change of Bz
+            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated only about z, so all chips measure the same change of Bz
         case "too-hot":
             temperature_degC[:, chip_i] = HOT_degC
         case "crlf":
@@ -308,7 +312,7 @@ def _change_values(frames: Frames, fault: str) -> None:
 
 
 def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
-    """Apply a fault of the connection to the bytes of all these frames."""
+    """Apply a fault of the connection to the bytes of all given frames."""
     if fault == "repeated":
         return [2 * piece for piece in pieces]
     if fault == "dropped":
@@ -347,7 +351,7 @@ class EmulatedPort:
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal. With a symbolic link, its name does not change when the board is unplugged and plugged in."""
+    """A pseudo-terminal. A symbolic link, if any, has the same name after the board is plugged in again."""
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):
@@ -370,7 +374,7 @@ class Terminal(EmulatedPort):
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # A reader that opens the terminal flushes it. In packet mode, the flush is reported to this process.
+        # A reader that opens the terminal flushes its buffer. Packet mode reports this flush to this process.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
@@ -382,7 +386,7 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            # Remove the link first: after the close, another emulator may create the same link.
+            # Remove the link before closing the terminal, because afterwards another emulator may create the same link.
             self._link.unlink(missing_ok=True)
         for descriptor in self._open_ends:
             os.close(descriptor)
@@ -393,7 +397,8 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                if readable:  # use only the first byte, the packet status; ignore the data that the reader sends
+                # use only the first byte, which is the packet status, and ignore the data that the reader sends
+                if readable:
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])
@@ -471,7 +476,7 @@ def play(
     ----------
     stop : event that another thread sets to end sending
     speed : factor by which due times are divided; with `math.inf`, the script is sent as fast as the reader reads
-    loop : whether to restart the script at its end, and whenever a reader opens the port
+    loop : whether to restart the script at its end and whenever a reader opens the port
     on_sent : called with the index of the last piece that was sent
 
     Returns
@@ -486,7 +491,7 @@ def play(
                 port.unplug()
                 stop.wait(script.unplugged_s[i])
                 port.plug_in()
-                replugged = True  # the next opening of the port does not restart the script
+                replugged = True  # do not restart the script when the port is opened next
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
@@ -507,7 +512,7 @@ def play(
 
 
 def _end_of_batch(script: Script, first: int, script_s: float) -> int:
-    """Return the index after the last piece of the batch to send now; no batch extends past an unplugging."""
+    """Return the index after the last piece of the batch to send now; a batch ends before the board is unplugged."""
     last = first + 1
     end = min(len(script), first + BATCH_MAX_N)
     while last < end and script.t_s[last] <= script_s and last not in script.unplugged_s:
@@ -516,7 +521,7 @@ def _end_of_batch(script: Script, first: int, script_s: float) -> int:
 
 
 class EmulatedBoard:
-    """A board that is emulated by this process: its port, and its true contact at any time."""
+    """A board that this process emulates, with its port and its current true contact."""
 
     def __init__(self, script: Script, port: EmulatedPort) -> None:
         self.port, self.source = port.name, script.source
@@ -531,7 +536,7 @@ class EmulatedBoard:
         self._sent_i = piece_i
 
     def true_contact(self) -> tuple[float, float, float]:
-        """Return the true x_mm, y_mm and F_N of the frame that was sent last; NaN without contact, or if unknown."""
+        """Return the true x_mm, y_mm and F_N of the last frame that was sent; NaN without contact, or if unknown."""
         if self._true_contacts is None:
             return (np.nan, np.nan, np.nan)
         x_mm, y_mm, force_N = self._true_contacts[self._sent_i].tolist()
@@ -557,7 +562,7 @@ class RobotLog:
         if piece_i < self._sent_i:  # the script has restarted
             self._sent_i = -1
         now_s = time.time()
-        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent at once, but were due one after another
+        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent together, but were due one after another
             self._last_s = max(self._last_s, now_s - float(self._due_s[piece_i] - self._due_s[i]))
             self._stream.write(f"{self._last_s:.6f},{self._cells[i]}\n")
         self._sent_i = piece_i
@@ -567,7 +572,7 @@ class RobotLog:
 
 
 def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: int) -> list[str]:
-    """Return the cells of each frame after its time: phase, pass, place and force."""
+    """Return for each frame the cells that follow the time in its row: phase, pass, place and force."""
     contact = np.isfinite(true_contacts[:, 0])
     edges = np.flatnonzero(np.diff(contact, prepend=False, append=False)).tolist()  # starts and ends in turn
     cells = ["noload,0,,,"] * len(contact)
@@ -576,7 +581,8 @@ def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: 
         for i, (x_mm, y_mm, force_N) in enumerate(true_contacts[first:end].tolist(), first):
             phase = "contact" if force_N >= AT_REST * force_max_N else "moving"
             cells[i] = f"{phase},{press_i // presses_per_pass_n},{x_mm:g},{y_mm:g},{force_N:.4f}"
-        # The rows after a press have its pass, so that each no-load dwell is one run of rows.
+        # The rows without contact after a press have the pass of the next press, so that each no-load dwell is one run
+        # of rows.
         following = edges[2 * press_i + 2] if 2 * press_i + 2 < len(edges) else len(contact)
         pass_i = (press_i + 1) // presses_per_pass_n
         cells[end:following] = [f"noload,{pass_i},,,"] * (following - end)
@@ -584,7 +590,7 @@ def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: 
 
 
 class TouchPrinter:
-    """Prints the true place and the largest true force of each touch when its first frame has been sent.
+    """Prints the true place and the largest true force of each touch when the touch's first frame has been sent.
 
     Raises `ParamsError` if the true contacts of the script are unknown.
     """

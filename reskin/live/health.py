@@ -12,17 +12,19 @@ from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
 BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
-REPEATS_FRAMES_N = 400  # frames per check for single repeated readings; their share is small
+REPEATS_FRAMES_N = 400  # frames per check for repeated readings of single chips, whose share is small
 RATE_WINDOW_S = 1.0
 SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
-USUAL_GAIN = 1e-4  # weight of a new rate in the running mean, the usual rate; time constant 25 s at 400 Hz
+# weight of a new rate in the running mean, which is the usual rate; its time constant is 25 s at 400 Hz
+USUAL_GAIN = 1e-4
 ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
-# A field change is external if the fraction of |dB|^2 that is not common to all chips is below this limit. For all
-# presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
+# A field change dB has an external cause if only a small fraction of |dB|^2, below this limit, is not common to all
+# chips. For all presses of scenes `quick` and `lab`, this fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
 COMMON_MIN_uT = 50.0  # smallest external field that raises an alarm; about the strength of the earth's field
 READINGS_REPEAT = f"over {100 * REPEATED_MAX:.0f} % of readings repeat: the board sends faster than its chips convert"
-EXTERNAL_SDS = 3.0  # if external fields are expected, larger ones than this multiple of their size raise an alarm
+# if external fields are expected, a field that is larger than this multiple of their expected size raises an alarm
+EXTERNAL_SDS = 3.0
 
 # Default policy for live readings. Saturated readings are dropped, because a controller would use a wrong estimate.
 LIVE_POLICY = FaultPolicy(
@@ -51,20 +53,20 @@ class Health:
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        # A chip's LSB is accepted from fewer equal steps than in ingestion: ingestion rejects a whole capture if the
-        # LSB is wrong, but an alarm has no lasting effect.
+        # Fewer equal steps than in ingestion are enough for an estimate of a chip's LSB. In ingestion, a wrong estimate
+        # may reject a whole capture, but here it causes only an alarm, which has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._repeats = RepeatCounter(chips_n)
-        self._frames_repeat = False  # whether whole frames repeated since the last check of readings
-        self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
+        self._frames_repeat = False  # whether whole frames were repeated since the last check of single readings
+        self._stuck = False  # whether frames are dropped now, because a chip was stuck at the end of the last batch
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 
     def note(self, name: str, count_n: int, now_s: float, fault: str | None = None) -> None:
         """Add `count_n` occurrences to an alarm, which is created if necessary.
 
-        The alarm's action is that of the policy for `fault`, or `flag` if no fault is given.
+        The action that the alarm shows is that of the policy for `fault`, or `flag` if no fault is given.
         """
         if count_n:
             action: Action = getattr(self.policy, fault) if fault is not None else "flag"
@@ -87,7 +89,7 @@ class Health:
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")
         faulty |= self._note_chips("field at the end of the range", readings.saturated, now_s, "saturated")
         self._measure_rate(len(frames), now_s)
-        self._batch.append(frames.where(~readings.faulty_rows))  # without failed reads, which would hide a stuck chip
+        self._batch.append(frames.where(~readings.faulty_rows))  # leave out failed reads, which would hide a stuck chip
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
             self._note_batch(batch, self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
@@ -102,7 +104,7 @@ class Health:
     ) -> None:
         """Raise an alarm if all chips measure nearly the same field change.
 
-        The cause is then an external field or a rotation of the board, and not a press.
+        In this case, the cause is an external field or a rotation of the board, and not a press.
 
         `turn` rotates the axes of each chip to those of the board. External fields of size `expected_uT` are expected
         and raise no alarm.
@@ -126,7 +128,7 @@ class Health:
             self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
-        """Raise an alarm if single readings repeat the previous one; repeated whole frames have another alarm."""
+        """Raise an alarm if single chips repeat their previous reading; repeated whole frames have another alarm."""
         self._repeats.feed(batch.b_uT)
         self._frames_repeat |= bool(faults.repeated.any())
         if self._repeats.frames_n >= REPEATS_FRAMES_N:
@@ -145,7 +147,7 @@ class Health:
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
         """Measure the frame rate over one second, and raise an alarm if it is low.
 
-        Frames are not numbered, so missing frames can be detected only by a low rate.
+        Frames have no numbers, so only a low rate shows that frames are missing.
         """
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n

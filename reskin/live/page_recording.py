@@ -19,15 +19,16 @@ from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.recordings.stream_recorder import CaptureWriter
 
-# Assumed times of a labelled press. The no-load dwell ends before the contact, because the tip may approach slowly, and
-# begins some time after the previous contact, because the skin needs time to recover.
+# Assumed times for the no-load dwell of a labelled press. The dwell begins RECOVERY_S or more after the previous
+# contact, because the skin needs time to recover. It ends APPROACH_S before the press, because the tip may approach
+# slowly. It lasts between REST_MIN_S and REST_MAX_S.
 REST_MAX_S, REST_MIN_S, RECOVERY_S, APPROACH_S = 1.0, 0.2, 0.3, 0.05
 PLATEAU = 0.8  # assumed: the press is held while |dB| is at least this fraction of its maximum
-PRESS_READINGS_MAX_N = 20_000  # most readings that are kept of one press, to limit memory; 50 s at 400 Hz
+PRESS_READINGS_MAX_N = 20_000  # maximum number of readings that are kept of one press, to limit memory; 50 s at 400 Hz
 
 
 class LabelledPress:
-    """Finds the next press in a stream of estimates: the time in which it is held, and the no-load time before it.
+    """Finds the next press in a stream of estimates: the time in which it is held, and the no-load dwell before it.
 
     Parameters
     ----------
@@ -41,7 +42,8 @@ class LabelledPress:
         self.rest_s: tuple[float, float] | None = None  # start and end of the no-load dwell before the press
         self.held_s: tuple[float, float] | None = None  # start and end of the time in which the press was held
         self.db_uT: Float64[np.ndarray, " ch"] | None = None  # mean field change while the press was held
-        self._rest: tuple[float, float] | None = None  # first and last reading without contact before the press
+        # times of the first and last reading without contact before the press
+        self._rest: tuple[float, float] | None = None
         self._press: list[tuple[float, Float64[np.ndarray, " ch"]]] = []
 
     @property
@@ -95,7 +97,7 @@ class PageRecording:
         self, board: DetectedBoard, reader: Reader, *, port_in_name: bool, source: Source = "recorded"
     ) -> None:
         self.folder = new_folder()
-        if port_in_name:  # two boards may start recording in the same second
+        if port_in_name:  # because two boards may start recording in the same second
             port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
             self.folder = self.folder.with_name(f"{self.folder.name}-{port}")
         self._part, self._header = begin_capture(
@@ -128,7 +130,7 @@ class PageRecording:
             )
         if self._labels is None:  # a capture without labels has no probe log
             self._labels = ProbeLogWriter(self._part)
-            # Labels and arrivals are on the same clock, so one mark with equal times aligns them.
+            # Labels and arrivals have times of the same clock, so a single mark with two equal times aligns them.
             clock = Clock(kind="arrivals", rate_hz=None, marks=((self._begun_s, self._begun_s),))
             options = self._header.options | {"labels": "page"}
             self._change_header(clock=clock, options=options)

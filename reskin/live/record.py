@@ -35,7 +35,7 @@ class RecordingResult(NamedTuple):
 
     folder: Path
     summary: str
-    error: Exception | None  # exception from the source of labels, which ended the recording
+    error: Exception | None  # exception of the label source that ended the recording, if any
 
 
 def label_source(
@@ -45,7 +45,7 @@ def label_source(
 
     Parameters
     ----------
-    labels : places for which the user is prompted, such as `grid:5x5:4`, or a CSV file to which a robot appends labels
+    labels : places that the user is asked to press, such as `grid:5x5:4`, or a CSV file to which a robot appends labels
     gauge : port of a force gauge, `PORT` or `PORT@BAUD`
     scan : order of the prompts, "random" or "snake"; the default is "random"
     dwell_s : time for which a label from a prompt is valid
@@ -92,8 +92,7 @@ def record_board(
     folder : folder to create for the capture; the default is captures/DATE-TIME
     seconds : maximum duration
     baud : baud rate; USB ports ignore it
-    names : values for the capture's header: names of the board and the skin, and the order of places, under the keys
-        board, skin and scan
+    names : values for the capture's header under the keys board and skin (names) and scan (order of the places)
     source : "simulated" if the port is an emulated board that sends a simulation
     """
     check_name(board.port)  # before a folder is created

@@ -1,8 +1,8 @@
 """The web server of `reskin live`: an HTML page, and one websocket per page and board.
 
 By default, only this machine can connect. If the server listens on another address, requests need a token. A client can
-request only fixed files, boards and actions. Of the files that are read or written, it can choose only the names of
-saved skins, all of which are in one folder.
+request only fixed files, boards and actions. The only file names that it can choose are those of saved skins, all of
+which are in one folder.
 """
 
 import asyncio
@@ -63,7 +63,7 @@ class Server:
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             raise web.HTTPForbidden(text="token missing or wrong: use the address that reskin live printed\n")
-        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protects against DNS rebinding
+        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protection against DNS rebinding
             raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
@@ -97,7 +97,7 @@ class Server:
         return socket
 
     async def _send(self, session: Session, socket: web.WebSocketResponse) -> None:
-        """Send a board's new data to a page at most 30 times per second, or less often if the page is slow."""
+        """Send a board's new data to a page 30 times per second, or less often if the page is slow."""
         after_bin, sent_state, next_state_s, clock = 0, "", 0.0, asyncio.get_running_loop().time
         with suppress(ConnectionError):
             while not socket.closed:
@@ -131,8 +131,8 @@ def serve(
 ) -> None:
     """Serve the page of one or more boards until Ctrl-C.
 
-    When the server listens, `say` is called with the address of the page, and with `where`, which names the folders of
-    saved files.
+    As soon as the server listens, `say` is called with a text that contains the address of the page and `where`, which
+    names the folders of saved files.
     """
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:

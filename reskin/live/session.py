@@ -1,4 +1,4 @@
-"""One board on the page of `reskin live`: the thread that estimates, messages to the page, and button actions."""
+"""One board on the page of `reskin live`: the thread that estimates, the messages to the page, and button actions."""
 
 import math
 import struct
@@ -24,28 +24,30 @@ from reskin.seeds import rng_for
 from reskin.universal.layout import BoardLayout, paper_layout
 
 POLL_S = 0.1
-# With several boards, frames are collected for this time and then estimated together, which needs less computing time.
-# The delay is not visible, because pages are redrawn at most 30 times per second.
+# If there are several boards, frames are collected for this time and then estimated together, which needs less
+# computing time. This delay is not visible, because pages are redrawn at most 30 times per second.
 GATHER_S = 0.02
 
 WINDOW_S, BIN_S = 10.0, 0.02  # duration and bin width of traces; must equal the values in page/trace.js
 BINS_N = round(WINDOW_S / BIN_S)
 LATENCIES_N = 4000  # number of latest latencies in the statistics; 10 s at 400 Hz
-UNCONFIRMED_MAX_N = 64  # largest number of sent messages for which a confirmation is awaited
+UNCONFIRMED_MAX_N = 64  # maximum number of sent messages that wait for a confirmation
 UNKNOWN_CONTACT = (math.nan,) * 3
-HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading
-# x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, four latencies in ms, dropped frames, and the true place and
-# force of an emulated board (x, y, F; NaN for real boards and without contact)
+HEAD = struct.Struct("<IHHd")  # fields: message number, number of chips, number of bins, time of the last reading
+# The numbers are: x_mm, y_mm, F_N, standard deviations of x and y, contact, rate, number of lost bytes, four latencies
+# in ms, number of dropped frames, and the true x, y and F of an emulated board (NaN for real boards and without
+# contact).
 NUMBERS_N = 16
 
 PRESSES_N = 12
-# Grid of places to press along x and along y, relative to the board's centre, as fractions of the area's half width.
+# Coordinates of the grid of places to press, along x and along y, relative to the board's centre and as fractions of
+# half the area's width.
 GUIDED = 0.375 * np.array([-1.5, -0.5, 0.5, 1.5])
 READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
 
 
 class Traces:
-    """Minimum and maximum of the force and of the field changes in 20 ms bins, for the last ten seconds."""
+    """Minima and maxima of the force and of the field changes in bins of 20 ms, for the last ten seconds."""
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
@@ -64,7 +66,7 @@ class Traces:
         return int(self._bin.max())
 
     def add(self, estimates: Estimates, now_s: float) -> None:
-        """Add estimates to the bins of their arrival times; `now_s` is the time at which they were computed."""
+        """Add estimates, computed at time `now_s`, to the bins of their arrival times."""
         self._last = estimates
         self.to_estimate_s.extend((now_s - estimates.t_s).tolist())
         chips_uT = np.linalg.norm(estimates.db_uT.reshape(len(estimates), -1, 3), axis=2)
@@ -113,7 +115,7 @@ class Traces:
             *latencies_ms,
             np.array([dropped_frames_n, *true_contact]),
             change_uT.ravel(),
-            numbers * BIN_S - t_s,  # relative to t_s, because float32 cannot resolve 20 ms after days
+            numbers * BIN_S - t_s,  # relative to t_s, because a float32 cannot resolve 20 ms in a time of several days
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
@@ -124,14 +126,14 @@ class Traces:
         return [int((t_s - self._start_s) / BIN_S) for t_s in times_s]
 
     def confirm(self, message_i: int, now_s: float) -> None:
-        """Record the time from the arrival of a reading until a page has drawn the message with this reading."""
+        """Record the latency of a drawn message: the time from the arrival of its last reading until now."""
         for sent_i, t_s in self._unconfirmed:
             if sent_i == message_i:
                 self.to_screen_s.append(now_s - t_s)
 
 
 class Presses:
-    """Collects presses for calibration: stores the largest field change of each contact."""
+    """Collects presses for calibration, and stores the largest field change of each."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
@@ -177,7 +179,7 @@ class Presses:
 class GuidedPresses(Presses):
     """Presses at grid places, which the page shows in random order.
 
-    Every second press is held out from the calibration, to measure the error of the calibrated model.
+    Every second press is held out, that is, not used for calibration, to measure the error of the calibrated model.
     """
 
     def __init__(self, board: BoardLayout | None = None) -> None:
@@ -202,18 +204,18 @@ class GuidedPresses(Presses):
 
 
 ADAPTING = ("adapt", "places")  # names of the buttons that request presses
-PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0  # limits of typed labels, to detect wrong units
+PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0  # limits of labels that the user enters, to detect wrong units
 
 
 class Session:
-    """One board on the page: a thread that polls the board, the traces, the current recording, and the calibration.
+    """One board on the page, with its traces, current recording and calibration, and the thread that polls the board.
 
     Parameters
     ----------
     port : the board's port
-    models : the model that estimates
+    models : the model that makes the estimates
     source : description of the board that the page shows
-    fault_policy : which faulty readings give no estimate
+    fault_policy : decides which faulty readings get no estimate
     alone : whether this is the only board of the page
     skins : folder of saved calibrations
     model_name : name of the model's file; empty for the shipped model
@@ -240,10 +242,11 @@ class Session:
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
         self._guided_press: LabelledPress | None = None  # the current guided press, whose label is recorded
-        self._adapted = self._labelled = ""  # results of the last calibration, and of the last labelled press
+        self._adapted = self._labelled = ""  # texts about the last calibration and the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
-        # Requested changes of the model. The polling thread makes them, because it also estimates with the model.
+        # Requested changes of the model. The polling thread makes these changes, because it also estimates with the
+        # model.
         self._changes: deque[Callable[[UniversalEstimator], str]] = deque()
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
@@ -282,7 +285,7 @@ class Session:
             self._error = f"estimation stopped: {error!r}"
 
     def _change_model(self) -> None:
-        """Make the requested changes of the model, such as the loading of a saved skin."""
+        """Make the requested changes of the model, such as loading a saved skin."""
         while self._changes:
             change, estimator = self._changes.popleft(), self.skin.estimator
             try:
@@ -295,7 +298,7 @@ class Session:
                 self._adapted = str(error)
 
     def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if a button requested them; calibrate the universal model when there are enough.
+        """Collect presses if a button requested this; calibrate the universal model when there are enough presses.
 
         Bytes that arrive during the calibration stay in the reader's buffer.
         """
@@ -315,7 +318,7 @@ class Session:
                         self._presses = None
 
     def _collect(self, presses: Presses, estimates: Estimates) -> None:
-        """Add readings to the presses; write the labels of guided presses to the recording, if there is one."""
+        """Add readings to the presses; write the labels of guided presses to the current recording, if any."""
         before_n, next_mm = len(presses), presses.next_mm
         if next_mm is not None and self._guided_press is None:
             self._guided_press = LabelledPress(Label(True, x_mm=next_mm[0], y_mm=next_mm[1]), learn=False)
@@ -338,7 +341,7 @@ class Session:
                     )
 
     def _label(self, estimates: Estimates) -> None:
-        """Wait for the press that the user has labelled; then record its label and calibrate the model to it."""
+        """Wait for the press that the user has labelled; then record its label and calibrate the model to the press."""
         press = self._labelled_press
         if press is None:
             return
@@ -415,7 +418,7 @@ class Session:
         return state
 
     def confirm(self, message_i: object) -> None:
-        """Record the latency of message number `message_i`, which a page has drawn; ignore anything but an integer."""
+        """Record the latency of message number `message_i`, which a page has drawn; ignore non-integers."""
         if isinstance(message_i, int) and self.traces is not None:
             with self._lock:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
@@ -462,12 +465,15 @@ class Session:
         return estimator.load(self._skins.file(name))
 
     def _request_label(self, label: object) -> None:
-        """Wait for a press with this label: `x_mm`, `y_mm`, `force_N` (None: unknown) and `learn`; None: do not wait.
+        """Wait for a press with a label (`x_mm`, `y_mm`, `force_N`, `learn`), or stop waiting if the label is None.
+
+        A `force_N` of None is unknown. `learn` states whether to calibrate the model to the press.
 
         Raises
         ------
         ParamsError
-            If the label is invalid, it would be neither recorded nor used, or other presses are being collected.
+            If the label is invalid, if it would be neither recorded nor used for calibration, or if other presses are
+            being collected.
         """
         self._labelled_press, self._labelled = None, ""
         if label is None:
@@ -540,7 +546,7 @@ def open_sessions(
 ) -> list[Session]:
     """Create one session per port. Sessions share the weights of the models and the folder of saved skins.
 
-    They do not share the calibration. See `Session` for the arguments.
+    Each session has its own calibration. See `Session` for the arguments.
     """
     check_ports(ports, models, "--port")
     skins, alone = skins or SkinFolder(), len(ports) == 1

@@ -1,4 +1,4 @@
-"""The folder in which `reskin live` saves what it has learnt about skins: one calibration file per skin."""
+"""The folder in which `reskin live` saves calibrations, in one file per skin."""
 
 import re
 import threading
@@ -15,7 +15,7 @@ LISTED_S = 1.0  # the folder is listed again after this time
 
 
 class SkinFolder:
-    """Saved calibrations in a folder. All boards of a page share one `SkinFolder`, so that no name is used twice."""
+    """A folder of saved calibrations. All boards of a page share one `SkinFolder`, so that no name is used twice."""
 
     def __init__(self, folder: Path = SKINS) -> None:
         if folder.exists() and not folder.is_dir():
@@ -40,7 +40,7 @@ class SkinFolder:
         Raises
         ------
         ParamsError
-            If the name contains anything but letters, digits, - and _.
+            If the name contains other characters than letters, digits, - and _.
         """
         if not isinstance(name, str) or not re.fullmatch(NAME, name):
             got = repr(name)[:40] if name else "nothing"

@@ -1,7 +1,8 @@
-"""Estimate contacts on a running board: bytes from its port -> frames -> field changes -> place and force.
+"""Estimate contacts on a running board: convert bytes to frames, frames to field changes, and these to place and force.
 
 `reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that no bytes
-are lost if the controller is slow. The controller's own thread decodes the bytes and estimates.
+are lost if the program that uses the contacts (the controller) is slow. The controller's own thread decodes the bytes
+and estimates the contacts.
 """
 
 import threading
@@ -44,19 +45,20 @@ from reskin.universal.layout import BoardLayout
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
-NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
+NOLOAD_S = 1.0  # the no-load reading is the mean over this time without contact
 NOLOAD_FRAMES_MAX_N = 10_000
 # The wire format is detected when data for `HEAD_S` seconds, or `HEAD_BYTES_MAX_N` bytes, have arrived.
 HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18
 SILENT_S = 0.3  # after this time without data, a controller receives a contact whose values are NaN
-OPENING_S = 10.0  # longest time for format detection and the no-load reading after a port is opened
-ENDS_KEPT_N = 256  # number of latest chunks whose end and arrival time are stored; a frame may end in an earlier chunk
-FRAME_BYTES_MIN_N = 16  # bytes per chip of a frame in the wire format with the shortest frames
+OPENING_S = 10.0  # maximum time for format detection and the no-load reading after a port was opened
+# number of latest chunks whose end and arrival time are stored, because a frame may end in an earlier chunk
+ENDS_KEPT_N = 256
+FRAME_BYTES_MIN_N = 16  # minimum number of bytes per chip in a frame, over all wire formats
 SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
-# Assumed limit of a network's inputs, in standard deviations of its training data. The largest observed input is 6 in
-# scene `quick` and 7 in scene `lab`, each for models that were trained in the same scene.
+# Assumed limit of a network's inputs, in standard deviations of the network's training data. For models that were
+# trained in the same scene, the largest observed input is 6 in scene `quick` and 7 in scene `lab`.
 UNKNOWN_SDS = 10.0
-UNDO_MAX_N = 100  # steps of learning that can be undone
+UNDO_MAX_N = 100  # maximum number of calibration steps that can be undone
 ZEROINGS_KEPT_N = 16  # number of latest no-load readings whose times are stored
 
 WAITING = "waiting for data"
@@ -85,11 +87,12 @@ class NetworkEstimator:
         self._inputs = [
             (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
         ]
-        for network in networks:  # so that torch is imported and the network is built before the first contact
+        # predict once, so that torch is imported and the network is built before the first contact
+        for network in networks:
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Do nothing, because networks use only field changes."""
+        """Do nothing, because networks use only field changes and not the no-load reading."""
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
@@ -113,9 +116,9 @@ class Labels(NamedTuple):
 class LearningState(NamedTuple):
     """The calibration data of a `UniversalEstimator`, except for the no-load reading.
 
-    `origin` is the model that was passed or loaded, and `origin_name` the name of a loaded skin. `presses_uT` are field
-    changes of presses at unknown places. `guided` are presses at the places that the page showed, and `typed` those
-    whose places the user entered.
+    `origin` is the model that was passed or loaded. `origin_name` is the name of the loaded skin, if any. `presses_uT`
+    are field changes of presses at unknown places. `guided` are presses at places that the page showed. `typed` are
+    presses whose places the user entered.
     """
 
     origin: Universal
@@ -123,7 +126,7 @@ class LearningState(NamedTuple):
     presses_uT: Float64[np.ndarray, "n ch"]
     guided: Labels
     typed: Labels
-    step: str  # the last step of learning, such as "the 12 presses"
+    step: str  # the last calibration step, such as "the 12 presses"
 
     @property
     def labels(self) -> Labels:
@@ -131,7 +134,7 @@ class LearningState(NamedTuple):
 
     @classmethod
     def start(cls, origin: Universal, origin_name: str = "", step: str = "") -> "LearningState":
-        """Return the state in which nothing has been learnt from presses on the page."""
+        """Return the state before any calibration to presses on the page."""
         none_uT = np.zeros((0, origin.channels_n))
         none = Labels(np.zeros((0, 2)), np.zeros(0), none_uT)
         return cls(origin, origin_name, none_uT, none, none, step)
@@ -141,7 +144,7 @@ class UniversalEstimator:
     """Predicts with a copy of a universal model, which is further calibrated to no-load readings and to presses.
 
     The model that was passed is not changed. A call of `adapt` or `label` replaces the presses of an earlier call of
-    the same method, so that the user can repeat bad presses. `undo` takes back the last of these steps.
+    the same method, so that the user can repeat bad presses. `undo` reverts the last calibration step.
     """
 
     name = "universal model"
@@ -150,17 +153,17 @@ class UniversalEstimator:
         self.channels_n, self.board = model.channels_n, model.layout
         # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
-        self._states = [LearningState.start(model)]  # the last one is in use, earlier ones are for `undo`
+        self._states = [LearningState.start(model)]  # the last state is in use; the earlier states are for `undo`
         self._use(self._states[0])
 
     @property
     def learnt(self) -> LearningState:
-        """The data that the model is calibrated with now."""
+        """The current calibration data of the model."""
         return self._states[-1]
 
     @property
     def undoable(self) -> bool:
-        """Whether there is a step of learning that `undo` can take back."""
+        """Whether there is a calibration step that `undo` can revert."""
         return len(self._states) > 1
 
     @property
@@ -239,7 +242,7 @@ class UniversalEstimator:
         )
 
     def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
-        """Calibrate also to one press at a place in mm; its force in N is NaN if it is unknown.
+        """Calibrate to one more press, at a place in mm and with a force in N (NaN if it is unknown).
 
         Returns
         -------
@@ -260,7 +263,7 @@ class UniversalEstimator:
         return f"calibrated to a labelled press; before it, the place was wrong by {error_mm:.2f} mm{forces}"
 
     def load(self, file: Path) -> str:
-        """Replace everything that was learnt by a saved calibration; return a text for the user.
+        """Replace all calibration data by a saved calibration; return a text for the user.
 
         Raises
         ------
@@ -268,14 +271,14 @@ class UniversalEstimator:
             If the file is missing or damaged, is not a calibration, or is one for another board. The calibration is
             then unchanged.
         """
-        if not file.is_file():  # for example deleted since the page listed it
+        if not file.is_file():  # for example because it was deleted since the page listed it
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
         origin = copy(self.learnt.origin).remember(file)
         self._learn(LearningState.start(origin, file.stem, f"the loading of {file.stem}"))
         return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
 
     def undo(self) -> str:
-        """Take back the last step of learning; return a text for the user."""
+        """Revert the last calibration step; return a text for the user."""
         if not self.undoable:
             return "nothing to undo: the model has learnt nothing here yet"
         step = self._states.pop().step
@@ -292,7 +295,7 @@ class UniversalEstimator:
         return self._model.estimate(db_uT + self._noload_uT)
 
     def _learn(self, state: LearningState) -> None:
-        """Calibrate with a new state, and keep the previous one for `undo`; if this fails, nothing changes."""
+        """Calibrate with a new state, and keep the previous state for `undo`; if this fails, nothing changes."""
         self._use(state)
         self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
 
@@ -304,14 +307,14 @@ class UniversalEstimator:
         known = np.isfinite(force_N)
         if known.any():
             model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
-        if not known.all():  # after the known forces, because they help to estimate the unknown ones
+        if not known.all():  # after the presses with known forces, because these help to estimate the unknown forces
             model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
-        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
+        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so make it before the first contact
         self._model, self.warnings = model, model.warnings
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
-    """Raise ParamsError for an invalid or repeated port, and for several ports with a model calibrated to one skin."""
+    """Raise ParamsError for an invalid or repeated port, or for several ports and a model calibrated to one skin."""
     find.check_named_once(ports, where)
     for port in ports:  # the port need not exist: an unplugged board may be plugged in later
         check_name(port)
@@ -367,7 +370,7 @@ class Contact(NamedTuple):
     """One reading of a board, with its estimate.
 
     Without contact, the place is NaN and the force is 0. If the reading is not usable, place and force are NaN, and
-    `alarms` contains the reason, such as a failed read, or a board that is silent or unplugged.
+    `alarms` contains the reason, for example that a read failed or that the board is silent or unplugged.
     """
 
     t_s: float  # unix time at which the last byte of the reading arrived
@@ -378,7 +381,7 @@ class Contact(NamedTuple):
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # current problems of the board
     sd_F_N: float = np.nan  # standard deviation of the force (between networks; NaN for a single network)
-    usable: bool = True  # False if a chip is faulty, the board is silent, or there is no no-load reading
+    usable: bool = True  # False if a chip is faulty, if the board is silent, or if there is no no-load reading yet
 
 
 @dataclass(frozen=True)
@@ -419,8 +422,8 @@ class LiveSkin:
             self.estimator = NetworkEstimator(models)
         self._model_problem = ""
         self._head: list[Chunk] = []
-        self._partial_first_bytes_n = 0  # bytes of frames that were cut by opening the port
-        self.dropped_frames_n = 0  # frames without an estimate because of a fault
+        self._partial_first_bytes_n = 0  # number of bytes of frames that were cut by opening the port
+        self.dropped_frames_n = 0  # number of frames that have no estimate because of a fault
         self.zeroings_n = 0
         self.zeroings_s: deque[float] = deque(maxlen=ZEROINGS_KEPT_N)  # times of the latest no-load readings
         self._restart_noload()
@@ -446,7 +449,7 @@ class LiveSkin:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Yield the contact of the latest reading, skipping older readings; never yield a reading twice.
+        """Yield the contact of the latest reading; skip older readings, and never yield a reading twice.
 
         Yields a contact whose values are NaN if no data arrives for `SILENT_S` or if the board is unplugged.
         """
@@ -456,7 +459,7 @@ class LiveSkin:
     def every(self) -> Iterator[Contact]:
         """Yield the contact of every reading.
 
-        If the caller is two minutes late, the oldest bytes are discarded and counted in `reader.missed_bytes_n`.
+        If the caller falls two minutes behind, the oldest bytes are discarded and counted in `reader.missed_bytes_n`.
         """
         while True:
             estimates = self.poll(SILENT_S)
@@ -464,8 +467,9 @@ class LiveSkin:
                 yield self._contact(estimates, i)
 
     def zero(self) -> None:
-        """Request a new no-load reading, from the next second without contact. May be called from any thread."""
-        self._noload_requested = True  # the polling thread takes the reading, because it collects the frames
+        """Request a new no-load reading, taken in the next second without contact. May be called from any thread."""
+        # the polling thread takes the no-load reading, because this thread collects the frames
+        self._noload_requested = True
 
     @property
     def zeroed(self) -> bool:
@@ -481,7 +485,7 @@ class LiveSkin:
     def lost_bytes_n(self) -> int:
         """Number of bytes that were discarded or were not in a complete frame.
 
-        The rest of a frame that was being sent when the port was opened is not counted.
+        If the board was sending a frame when the port was opened, the rest of this frame is not counted.
         """
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
         return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
@@ -536,7 +540,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks, and return []; once the wire format can be detected from them, return all of them."""
+        """Collect chunks and return [] until the wire format can be detected; then return all collected chunks."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
@@ -553,14 +557,15 @@ class LiveSkin:
         if isinstance(self.estimator, UniversalEstimator):
             self.layout = layout_of_board(self.estimator.board)
         self._start_stream(detected)
-        self.detected = detected  # set last: other threads use the attributes above as soon as a board is detected
+        # this attribute is set last, because other threads use the attributes above as soon as it is set
+        self.detected = detected
         return chunks
 
     def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
         """Handle a model that does not fit the board's number of chips.
 
-        For networks, raise `SchemaError`, because the user chose them. The universal model may be the default, so it is
-        only disabled, with an alarm.
+        For networks, raise `SchemaError`, because the user chose them. A universal model may be the default, so it is
+        only disabled, and an alarm is raised.
         """
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
@@ -578,7 +583,7 @@ class LiveSkin:
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Return the frames in the chunks, and their arrival times; start a new stream where a board was plugged in."""
+        """Return the frames in the chunks and their arrival times; start a new stream where a board was plugged in."""
         starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
         for first, last in pairwise([0, *starts, len(chunks)]):
@@ -601,7 +606,7 @@ class LiveSkin:
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count_bytes(self, now_s: float) -> None:
-        """Add to `account` what the stream has counted since the last call, and raise alarms for lost bytes."""
+        """Add the stream's counts since the last call to `account`, and raise alarms for lost bytes."""
         frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
         new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
@@ -609,7 +614,7 @@ class LiveSkin:
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
         # If the port was opened in the middle of a frame, the rest of this frame is not counted as lost. One more byte
-        # may be skipped, because one byte of the cut frame is not enough to recognise the next frame.
+        # is allowed: if only one byte of the cut frame arrives, the next frame cannot be recognised and is skipped too.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n
@@ -621,11 +626,12 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # readings with a larger |dB|, without external fields, are in contact
+        # readings are in contact if their |dB|, after external fields were removed, is larger than this value
+        self._contact_uT = np.inf
         self._suppressor: Float64[np.ndarray, "ch ch"] | None = None  # removes external fields, if they are expected
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._noload_requested = False  # set last: this call also fulfils a request that arrives during it
+        self._noload_requested = False  # set last, so that a request that arrives during this call is fulfilled by it
 
     def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
         """Collect frames for one second. If the field did not change, their mean becomes the no-load reading."""
@@ -638,8 +644,9 @@ class LiveSkin:
         if len(b_uT) < 2 or (duration_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # `quiet_start` raises it if the field changed; the next second is then tried
-            # Evenly spaced times replace the arrival times, which are equal for all frames of a chunk.
+        with suppress(CaptureError):  # raised by `quiet_start` if the field changed; then the next second is tried
+            # Use evenly spaced times instead of arrival times, because all frames of a chunk have the same arrival
+            # time.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)

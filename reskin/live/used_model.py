@@ -1,8 +1,8 @@
-"""Texts of the page about the model in use: name, calibration data, expected accuracy, smallest detected force.
+"""Texts of the page about the model in use: its name, calibration data, expected accuracy and smallest detected force.
 
-Expected accuracies are results of the pipeline: for networks, those in the card; for the shipped universal model, those
-in `reskin/universal/measured.json`. That file is not part of the card, because the results depend on the card. Other
-universal models were not measured.
+Expected accuracies are results of the pipeline. Those of networks are in their cards. Those of the shipped universal
+model are in `reskin/universal/measured.json`, and not in its card, because the results depend on the card. The accuracy
+of other universal models was not measured.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ ByBoard = Annotated[tuple[float, ...], Field(min_length=1)]  # one value per rec
 
 
 class MeasuredAccuracy(Strict):
-    """Scores on held-out recorded boards after a calibration with some unlabelled presses and labels."""
+    """Scores on held-out recorded boards, after a calibration with `presses_n` presses and `labels_n` labels."""
 
     presses_n: int
     labels_n: int
@@ -34,7 +34,7 @@ class MeasuredAccuracy(Strict):
 
 
 class MeasuredDetection(Strict):
-    """The lightest recorded force, how many of all presses were detected, and false alarms without contact."""
+    """The lightest recorded force, the percentage of detected presses, and the percentage of false alarms."""
 
     lightest_N: ByBoard
     detected_pct: ByBoard
@@ -42,7 +42,7 @@ class MeasuredDetection(Strict):
 
 
 class Measured(Strict):
-    """Results of the shipped universal model, from the numbers of a recorded scene."""
+    """Results of the shipped universal model on a recorded scene."""
 
     scene: str
     source: Literal["recorded"]
@@ -55,7 +55,8 @@ def describe(
 ) -> dict[str, str | bool]:
     """Return the texts `model`, `learnt`, `expected` and `least_force` of the page, and whether `undo` is possible.
 
-    `models` are the models that the user chose, and `model_name` the names of their files (empty: the shipped model).
+    `models` are the models that the user chose. `model_name` contains the names of their files, or is empty for the
+    shipped universal model.
     """
     if isinstance(estimator, UniversalEstimator):
         state, model = estimator.learnt, estimator.model
@@ -131,7 +132,7 @@ def _join(values: Sequence[float], digits: str) -> str:
 
 
 def _measured_of(model: Universal) -> Measured | None:
-    """Return the results of a model; None if it is not the shipped one."""
+    """Return the results of the shipped universal model; None for any other model."""
     return _shipped()[1] if model.card == _shipped()[0] else None
 
 

@@ -1,1 +1,1 @@
-"""Networks and classical methods that estimate place and force from a single reading: recipes, losses, training."""
+"""Networks and classical methods that estimate place and force from a single reading, and their training."""

@@ -1,9 +1,10 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
-A second network, the discriminator, predicts from the features of the first network whether a reading is from a known
-skin or from the new skin. The first network is trained so that the discriminator fails. In the control experiment, the
-weight of the discriminator is 0, so that it does not affect the features. This module has a separate training loop,
-because `reskin.models.train` supports neither batches from two sets of skins nor a second network.
+The first network estimates place and force. A second network, the discriminator, predicts from the features of the
+first network whether a reading is from a known skin or from the new skin. The first network is trained so that the
+discriminator fails. In the control experiment, the discriminator's gradient has weight 0, so that it does not affect
+the features. This module has its own training loop, because `reskin.models.train` supports neither batches from two
+sets of skins nor a second network.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from reskin.models.train import AdamW, clip_gradients, one_cycle
 DISCRIMINATOR_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
 RAMP_RATE = 10.0  # the factor 10 in the formula of `ramp` (Ganin et al.)
-# The third layer has `FEATURES_N` outputs, as required by `Stack`.
+# The third layer has `FEATURES_N` outputs, because `Stack` requires it.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
 
@@ -41,9 +42,10 @@ def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: 
     """Train one network from random initial weights, and return its weights.
 
     Each batch has equal numbers of readings from the known skins and from the new skin. The discriminator's gradient is
-    reversed before it reaches the features; `weight` is its weight at the end of training.
+    reversed before it reaches the features, and is multiplied by a factor that rises to `weight` during training.
     """
-    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
+    # Use one thread, so that the order of summation does not depend on the number of other processes.
+    torch.set_num_threads(1)
     layers = paper_layers(domains.known.shape[1], domains.target.shape[1])
     net = Stack(layers, [draw_weights(layers, rng)])
     discriminator = Stack(DISCRIMINATOR, [draw_weights(DISCRIMINATOR, rng)])
@@ -73,7 +75,7 @@ def reverse_gradient(values: Float[torch.Tensor, "m b d"], weight: float) -> Flo
 
 
 def ramp(fraction: float) -> float:
-    """Return the factor of the discriminator's weight after a fraction p of the training: 2 / (1 + exp(-10 p)) - 1.
+    """Return the factor of the discriminator's weight, 2 / (1 + exp(-10 p)) - 1, after a fraction p of the training.
 
     The factor starts at 0, so that the network first learns features that predict the targets.
 

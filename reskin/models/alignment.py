@@ -1,7 +1,7 @@
-"""Reference methods for adaptation, which map the inputs of one skin to those of another by a fitted affine map.
+"""Reference methods for adaptation: fit an affine map from the inputs of one skin to the inputs of another.
 
-Two methods need no labels: matching the mean and the standard deviation of each channel, and matching the covariance of
-the channels (CORAL). Direct standardisation needs pairs of readings of both skins at the same places.
+Two methods need no labels: one matches the mean and the standard deviation of each channel, the other matches the
+covariance of the channels (CORAL). Direct standardisation needs readings of both skins at the same places.
 """
 
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 CORAL_RIDGE = 1.0  # added to each variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
 SD_MIN = 1e-6  # lower limit of standard deviations, which avoids a division by zero for constant channels
-# Candidates for the ridge of `direct`, in units of (mean square of a channel) * (number of pairs).
+# Candidates for the argument `ridge` of `direct`, in units of (mean square of a channel) * (number of pairs).
 RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))
 Inputs = Float[np.ndarray, "n c"]
 
@@ -37,8 +37,8 @@ def match_channels(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "
 def coral(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"], ridge: float = CORAL_RIDGE) -> Map:
     """Fit the map that gives inputs of the source skin the covariance and the mean of the target skin (CORAL).
 
-    With both skins in units of the standard deviations of `source`, the matrix is C_source^-1/2 C_target^1/2, where
-    `ridge` times the identity is added to each covariance C.
+    Let C_source and C_target be the covariances of both skins' inputs in units of the standard deviations of `source`,
+    with `ridge` times the identity added to each. In these units, the matrix of the map is C_source^-1/2 C_target^1/2.
     """
     scale = _sd(source)
     covariances = [np.cov(side / scale, rowvar=False) + ridge * np.eye(source.shape[1]) for side in (source, target)]
@@ -49,9 +49,9 @@ def coral(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"], ri
 def direct(source: Float[np.ndarray, "p c"], target: Float[np.ndarray, "p c"], ridge: float) -> Map:
     """Fit a linear map to p pairs of inputs at the same places (direct standardisation, Wang & Kowalski 1991).
 
-    The map is the identity plus a ridge regression of the differences within pairs. It therefore leaves inputs
-    unchanged in directions without data. There is no constant term, because the field change without contact is zero
-    for any skin.
+    The map is the identity plus a ridge regression of the difference between the two inputs of a pair. It therefore
+    leaves inputs unchanged in directions without data. The map has no constant term, because the field change without
+    contact is zero for any skin.
     """
     origin = np.zeros(source.shape[1])
     gain = np.linalg.solve(source.T @ source + _penalty(source, ridge), source.T @ (target - source))

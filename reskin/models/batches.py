@@ -1,4 +1,4 @@
-"""Prepare the training data of a stack of networks: scaled rows, initial weights, and the batches of each step."""
+"""Prepare the data of networks that are trained together: scaled rows, initial weights, and batches."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ AXES_N = 3
 
 @dataclass(frozen=True)
 class LabelledRows:
-    """Scaled inputs and targets, and `points` to sample triplets from (None if the recipe has no triplet loss)."""
+    """Scaled inputs and targets, and the `points` from which triplets are drawn (None without a triplet loss)."""
 
     inputs: Float32[np.ndarray, "n c"]
     targets: Float32[np.ndarray, "n t"]
@@ -28,10 +28,10 @@ class LabelledRows:
 
 @dataclass(frozen=True)
 class UnlabelledRows:
-    """Scaled inputs of unlabelled pokes, of which only the order along lines is known.
+    """Scaled inputs of unlabelled pokes; only the order of the pokes along lines is known.
 
-    `points` are the points of all lines, for sampling triplets, and `row` contains the number of the row in `inputs`
-    for each point. A row may be a point of two lines.
+    `points` are the points of all lines, from which triplets are drawn. `row` contains for each point the number of its
+    row in `inputs`; a row may be a point of two lines.
     """
 
     inputs: Float32[np.ndarray, "p c"]
@@ -43,7 +43,7 @@ class UnlabelledRows:
 class PreparedJob:
     """Initial weights, random generator and scaled training rows of one network of a stack.
 
-    `unlabelled` (for adaptation) and `few_labels` (for fine-tuning) are rows of a new skin.
+    `unlabelled` (for adaptation) and `few_labels` (for fine-tuning) are rows of a new skin, or None.
     """
 
     initial_weights: Weights
@@ -54,23 +54,23 @@ class PreparedJob:
 
 
 def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
-    """Scale the training rows of a job and draw initial weights; return them, and the scaler.
+    """Scale the training rows of a job and draw initial weights; return both as a `PreparedJob`, and the scaler.
 
-    The scaler is fitted to the training rows. Adaptation and fine-tuning use the scaler and the weights of the trained
-    network from which they start.
+    The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network, and use its
+    scaler and its weights.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The names that seed the random generator do not include the recipe, so that all recipes have the same initial
-    # weights and the same batches.
+    # The names from which the random generator is made do not include the recipe, so that all recipes have the same
+    # initial weights and the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:
         view = VIEW[recipe.inputs](data.db_uT[job.train])
         scaler = FIT[recipe.scaling](view, target)
         layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
-        # The initial output bias is the mean of the scaled target. With a random bias, about one in three networks of
-        # the released architecture, which has a ReLU on the outputs, would have an output that is always 0 and never
-        # learns.
+        # The initial bias of an output is the mean of the scaled target. The released architecture has a ReLU on the
+        # outputs. With random biases, about one in three of its networks would have an output that is always 0 and
+        # never learns.
         known = ~np.isnan(target).all(axis=0)
         mean = np.zeros(target.shape[1], np.float32)
         mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
@@ -81,7 +81,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        # Of the new skin, only the field changes and the order of the pokes along lines are used.
+        # From the new skin, only the field changes and the order of the pokes along lines are used.
         lines = job.tuning.lines
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
@@ -115,13 +115,13 @@ def virtual_boards(
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
     """Copy all rows `copies_n` times, and modify the copied field changes as if other boards had measured them.
 
-    For each copy of a skin, random gains of the channels and tilts of the chips are drawn. Noise is drawn for each
+    Each copy of a skin has its own random gains of the channels and tilts of the chips. Noise is drawn for each
     reading.
 
     Returns
     -------
-    db_uT : field changes [v ch], v = copies_n * f; row c * f + i is the copy c of row i
-    skin : number of the virtual skin of each row; each copy of a skin has a different number
+    db_uT : field changes [v ch] with v = copies_n * f; row c * f + i is copy c of row i
+    skin : number of the virtual skin of each row; each copy of a skin has its own number
     """
     from scipy.spatial.transform import Rotation  # imported late, because few recipes have virtual boards
 
@@ -142,20 +142,20 @@ def virtual_boards(
 
 
 Batch = dict[str, torch.Tensor]
-# Name of a tensor of a batch -> name of the array in `BatchSampler.rows` from which the tensor is gathered.
+# Maps the name of each tensor of a batch to the name of the array in `BatchSampler.rows` from which it is gathered.
 _SOURCE = {
     "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
     "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
     "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
 }  # fmt: skip
-# Each loss term has separate random generators, so that adding a loss term does not change the draws of the others.
+# Each loss term has its own random generator, so that adding a loss term does not change the draws of other terms.
 _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """Draws batches for all networks of a stack.
+    """Draws batches for all networks of a stack, which are trained together.
 
-    The rows of the networks are concatenated and stored on the device.
+    The rows of all networks are concatenated and stored on the device that trains the networks.
     """
 
     def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:

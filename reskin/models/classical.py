@@ -1,4 +1,4 @@
-"""Classical regression methods, which are trained on the same folds as the networks, as reference methods."""
+"""Classical regression methods: reference methods that are trained on the same folds as the networks."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ from reskin.seeds import rng_for
 
 
 class _Method(Strict):
-    """Base class of the settings of a method. `inputs` is a view of the field change (`reskin.models.inputs.VIEW`)."""
+    """Base class of a method's settings. `inputs` names a view of the field change (`reskin.models.inputs.VIEW`)."""
 
     inputs: Literal["raw", "shape"]
 
 
 class Ridge(_Method):
-    """Linear ridge regression. `alpha` is the weight of the penalty relative to the sum of scaled squared errors."""
+    """Linear ridge regression. `alpha` is the weight of the penalty; the sum of scaled squared errors has weight 1."""
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -42,7 +42,7 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """Mean of the targets of the nearest training rows, with weights (row weight / distance)."""
+    """Mean of the targets of the nearest training rows; each row is weighted by its row weight / its distance."""
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -52,7 +52,7 @@ class Neighbours(_Method):
 class RbfRidge(_Method):
     """Kernel ridge regression with kernel exp(-gamma d^2) and at most `rows_max_n` rows.
 
-    Inputs are standardised, so the squared distance d^2 of two rows is on average 2 per input.
+    d is the distance of two rows. Inputs are standardised, so d^2 is on average 2 times the number of inputs.
     """
 
     title: ClassVar[str] = "RBF kernel ridge"
@@ -65,7 +65,8 @@ class RbfRidge(_Method):
 class Boosting(_Method):
     """Gradient-boosted trees, one model per target.
 
-    Early stopping is disabled, because it would split the readings of an indentation into training and validation.
+    Early stopping is disabled, because it would use some readings of an indentation for training and others for
+    validation.
     """
 
     title: ClassVar[str] = "gradient boosting"
@@ -80,7 +81,7 @@ Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Fie
 
 @dataclass(frozen=True)
 class _Part:
-    """A regressor for targets that are known in the same training rows."""
+    """A fitted regressor for one group of targets, which are known in the same training rows."""
 
     targets: list[int]  # columns of the targets: 0 is x, 1 is y, 2 is the force
     regressor: Any  # has methods fit(inputs, target, weight) and predict(inputs)
@@ -89,7 +90,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class FittedRegressor:
-    """A fitted method: one regressor per group of targets, and the scaler, fitted to the same training rows."""
+    """A fitted method: one regressor per group of targets, and a scaler that was fitted to the same training rows."""
 
     scaler: Scaler
     parts: tuple[_Part, ...]
@@ -122,7 +123,7 @@ def fit(
     """Fit a method to rows; the targets are x in mm, y in mm and the force in N, and unknown targets are NaN.
 
     Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss, or
-    in the mean over nearest neighbours. It is not used for fitting the scaler.
+    in the mean over nearest neighbours. The scaler is fitted without these weights.
     """
     assert weight is None or (weight > 0).all()
     _check_rows(settings, inputs, target)
@@ -146,8 +147,8 @@ def fit(
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
     """Set the scale of constant inputs to infinity, so that they are scaled to 0.
 
-    With the scale `SCALE_FLOOR`, an input that is constant in training but not in the test would dominate all
-    distances.
+    With the scale `SCALE_FLOOR` instead, an input that is constant in the training rows, but not in the test rows,
+    would dominate all distances.
     """
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
@@ -167,8 +168,9 @@ def _thin(
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of `rows_n` rows without replacement; return the row numbers and the weights of the drawn rows.
 
-    All rows whose weight is above the minimum are kept, because they are the few labelled rows of a new skin. Their
-    weight is multiplied by the kept fraction of the other rows, so that their share of the total weight is unchanged.
+    Rows whose weight is above the minimum are the few labelled rows of a new skin, so all of them are kept. Their
+    weight is multiplied by the fraction of the other rows that is kept, so that their share of the total weight is
+    unchanged.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -195,8 +197,8 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel matrix with 6000 training rows takes 200 MB
-_THREADS = ThreadpoolController()  # created once, because its creation takes 3 ms, and each use only 15 us
+BLOCK_ROWS_N = 4096  # rows per block, to limit memory; the kernel matrix of a block and 6000 training rows takes 200 MB
+_THREADS = ThreadpoolController()  # created only once, because this takes 3 ms, but each use takes only 15 us
 
 
 def one_thread() -> Any:
@@ -205,7 +207,7 @@ def one_thread() -> Any:
 
 
 def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
-    """Create the regressor of these settings, which has methods fit(inputs, target, weight) and predict(inputs)."""
+    """Create a regressor with these settings; it has methods fit(inputs, target, weight) and predict(inputs)."""
     # scikit-learn is imported late, because it takes .7 s, and modules that only read settings do not need it.
     match settings:
         case Ridge():
@@ -217,8 +219,8 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
         case Neighbours(neighbours_n=k):
             from sklearn.neighbors import KNeighborsRegressor
 
-            # A k-d tree is fast, because readings vary along few directions. With 16 or more inputs, scikit-learn would
-            # use brute force by default.
+            # A k-d tree is fast here, because readings vary along few directions. By default, scikit-learn would use
+            # brute force for 16 or more inputs.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             from sklearn.kernel_ridge import KernelRidge
@@ -241,14 +243,14 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 class _BlockwiseCubicRidge:
     """Ridge regression on products of inputs, computed in blocks of rows to limit memory.
 
-    The products for all rows of the paper's data would take 5 GB.
+    For all rows of the paper's data, the products would take 5 GB at once.
     """
 
     def __init__(self, alpha: float) -> None:
         from sklearn.preprocessing import PolynomialFeatures
 
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1; its coefficient is not penalised
+        self.lift = PolynomialFeatures(3)  # the first product is the constant 1, whose coefficient is not penalised
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_
@@ -268,7 +270,7 @@ class _BlockwiseCubicRidge:
 class _WeightedNeighbours:
     """Nearest neighbours with row weights w, which scikit-learn does not support.
 
-    The prediction is scikit-learn's prediction of the target w y, divided by its prediction of the target w.
+    With targets y, the prediction is scikit-learn's prediction of w y, divided by its prediction of w.
     """
 
     neighbours: Any  # sklearn.neighbors.KNeighborsRegressor
@@ -291,8 +293,8 @@ def blocks(rows_n: int) -> list[slice]:
 class ClassicalJob:
     """Training and test of a method on one fold; `train` and `test` are row numbers.
 
-    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the row numbers of additional
-    training rows, from a new skin. Their total weight equals that of all other training rows.
+    If there are more than `rows_max_n` training rows, a random selection of them is used. `few_labels` are the row
+    numbers of additional training rows of a new skin. Their total weight equals that of all other training rows.
     """
 
     name: str

@@ -1,7 +1,8 @@
 """Convert field changes to the inputs of models, and targets to scaled outputs.
 
-A view is a fixed function of the field change of a row. A scaler converts between a view or physical units and a
-network's scaled values. It is fitted only to training rows, so that it contains no information about test rows.
+A view is a fixed function of the field change of a row. A scaler converts a view to a network's scaled inputs, and
+converts between targets in physical units and scaled outputs. It is fitted only to training rows, so that it contains
+no information about test rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,12 +11,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed lower limit of |dB|. It is below the noise (3 uT per channel, about 15 uT in the norm of 15 channels). The log
-# of this limit is 0, so that all inputs are 0 if the field change is 0.
+# Assumed lower limit of |dB|, the norm of the field change. It is below the noise of the norm (3 uT per channel, about
+# 15 uT for 15 channels). The logarithm of this limit is 0, so all inputs are 0 if the field change is 0.
 DB_FLOOR_uT = 1.0
 # Lower limit of scales, which avoids a division by zero for channels that are constant in training.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # about the input scale of the network that the authors released
+RELEASED_INPUT_SDS = np.float32(5.0)  # about the scale of the inputs in the network that the authors released
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 

@@ -1,4 +1,4 @@
-"""Training jobs: a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
+"""Training jobs: training with a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
 
 `JobKeys` computes the cache key of a job: a digest of everything on which the job's result depends.
 """
@@ -20,8 +20,8 @@ from reskin.models.inputs import Scaler
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Schedule
 from reskin.numerics import device, signature
 
-# A network has collapsed if its explained variance (R2) of a target on training rows is below this limit; usually it is
-# above 0.9.
+# A network has collapsed if, for any target, its explained variance (R2) on training rows is below this limit. Usually,
+# R2 is above 0.9.
 COLLAPSED = 0.05
 # The modules on whose code the result of training depends (tests/models/test_job.py compares them with the imports).
 CODE_MODULES = (
@@ -30,7 +30,7 @@ CODE_MODULES = (
 )
 LIBRARIES = ("torch", "numpy", "scipy")
 REPEATS_N = 25
-CURVE_POINTS_N = 50  # points of a loss curve; a training with fewer steps has one point per step
+CURVE_POINTS_N = 50  # number of points of a loss curve; a training run with fewer steps has one point per step
 
 Weights = Mapping[str, np.ndarray]
 
@@ -64,10 +64,11 @@ class TrainingData:
 class TrainingResult:
     """The result of a training run.
 
-    key: name of the result in the cache. curve: mean squared error (scaled units) of the steps between two entries of
-    `curve_steps`. predicted: x, y in mm and F in N for the test rows. stopped_step: step at which training diverged;
-    None if it did not. If training diverged, `weights` are those before the divergence, and the curve ends there.
-    explained_min: explained variance (R2) of the worst target on training rows; None for a short training run.
+    key: name of the result in the cache. curve: mean squared error in scaled units; point i is the mean over the steps
+    between entries i - 1 and i of `curve_steps`. predicted: x, y in mm and F in N for the test rows. stopped_step: step
+    at which training diverged, or None. If training diverged, `weights` are those before the divergence, and the curve
+    ends there. explained_min: smallest explained variance (R2) of a target on training rows; None for a short training
+    run.
     seconds: training time of the stack, divided by its number of networks. started_s: Unix time at which the training
     of the stack started. one_reading_s: median time of a prediction for one reading. reused: whether the result is
     from the cache. collapsed_before_n: number of earlier training runs of this job, all of which collapsed.
@@ -88,7 +89,7 @@ class TrainingResult:
 
     @property
     def collapsed(self) -> bool:
-        """Whether the network predicts nearly the same value for any input, for at least one target."""
+        """Whether the network predicts nearly the same value of at least one target for all inputs."""
         return self.explained_min is not None and self.explained_min < COLLAPSED
 
 
@@ -105,7 +106,7 @@ class Pretrained:
 class Adaptation:
     """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
 
-    Of the new skin, only the field changes of the rows in `lines` and the order of these rows are used.
+    From the new skin, only the field changes of the rows in `lines` and the order of these rows are used.
     """
 
     start: Pretrained
@@ -167,7 +168,7 @@ class TrainingJob:
 class JobKeys:
     """Computes cache keys for jobs on the same data.
 
-    A key is a digest of the rows, recipe, seed and initial weights of a job, and of the code and versions of libraries.
+    A key is a digest of a job's rows, recipe, seed and initial weights, of the code, and of the versions of libraries.
     """
 
     def __init__(self, data: TrainingData) -> None:
@@ -194,7 +195,7 @@ class JobKeys:
         return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
-        if id(train) not in self._train_digests:  # the array is stored below, so that its id is not reused
+        if id(train) not in self._train_digests:  # the array is stored below, so no other array gets its id
             skin = np.unique(self.data.skin[train], return_inverse=True)[1]
             content = _digest(self.data.db_uT[train], self.data.target[train], skin)
             self._train_digests[id(train)] = (train, content)
@@ -210,7 +211,7 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def curve_steps(steps_n: int) -> list[int]:
-    """Return the steps at which the points of the loss curve of a training of `steps_n` steps end.
+    """Return for each point of a loss curve the last step that it covers, in a training run of `steps_n` steps.
 
     >>> curve_steps(3), curve_steps(800)[:3], len(curve_steps(800))
     ([1, 2, 3], [16, 32, 48], 50)

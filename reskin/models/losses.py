@@ -1,4 +1,4 @@
-"""Training losses: the squared error, and the triplet loss of section 5 of the paper with the sampling of triplets.
+"""Training losses: the squared error and the triplet loss (paper section 5), with the sampling of triplets.
 
 A triplet consists of three points of the same group (a skin, or a line of pokes): an anchor, a positive and a negative.
 The positive is strictly nearer to the anchor than the negative.
@@ -12,11 +12,12 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # if half of all draws are ties, only a fraction of 1e-30 of the anchors has ties in all draws
+MAX_DRAWS_N = 100  # if half of all draws are ties, all draws of an anchor are ties with a probability of only 1e-30
 # Two squared distances are a tie if they differ by less than this fraction of their sum. Rounding to float32 causes
 # differences of 1e-6.
 TIE_RTOL = 1e-5
-# Places per group whose distances are compared. A point at the same distance from all of them is not used as an anchor.
+# Number of places per group to which distances are compared. A point at the same distance from all these places is not
+# used as an anchor.
 COMPARED_PLACES_N = 64
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
@@ -30,7 +31,7 @@ def squared_error(
     Unknown targets (NaN) contribute neither to the loss nor to the gradient.
     """
     known = ~torch.isnan(truth)
-    # Differences are masked before squaring, because otherwise the gradient would be 0 * NaN = NaN.
+    # Unknown differences are replaced before squaring, because otherwise their gradient would be 0 * NaN = NaN.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
@@ -40,8 +41,8 @@ def triplet_loss(
 ) -> Float[torch.Tensor, " m"]:
     """Return the mean of max(0, |a - p|^2 - |a - n|^2) over a batch, for each of m networks (section 5 of the paper).
 
-    a, p and n are the features of anchor, positive and negative; the loss has no margin. Distances are squared, so that
-    the gradient is 0 and not infinite where points coincide.
+    a, p and n are the features of the anchor, the positive and the negative. The loss has no margin. Distances are
+    squared, so that the gradient is 0, and not infinite, if two points coincide.
     """
     positive_d2 = ((anchor - positive) ** 2).sum(-1)
     negative_d2 = ((anchor - negative) ** 2).sum(-1)
@@ -50,10 +51,10 @@ def triplet_loss(
 
 @dataclass(frozen=True)
 class TripletPoints:
-    """Points from which triplets are drawn, with an index by group.
+    """Points from which triplets are drawn, with an index of the points of each group.
 
     The numbers of the points of group g are `order[start[g] : start[g] + count[g]]`. A point can be an anchor if the
-    other points of the group are not all at the same distance from the point.
+    other points of its group are not all at the same distance from it.
     """
 
     place: Float[np.ndarray, "n d"]
@@ -99,8 +100,9 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
     """Draw a positive and a negative for each anchor; return their point numbers.
 
-    Both are drawn uniformly from the other points of the anchor's group, and ties are redrawn. If a point in `anchor`
-    cannot be an anchor, the positive and the negative are the point itself, so that the loss and the gradient are 0.
+    Two other points of the anchor's group are drawn uniformly; the nearer one is the positive. If both are equally near
+    (a tie), they are drawn again. If a point in `anchor` cannot be an anchor, the point itself is used as positive and
+    negative, so that the loss and the gradient are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
@@ -127,7 +129,7 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
     """Return the mask of points of one group that can be anchors.
 
-    To save time, only the distances of a point from the first `COMPARED_PLACES_N` places are compared.
+    To save time, only the distances of a point from the group's first `COMPARED_PLACES_N` places are compared.
     """
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)

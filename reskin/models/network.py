@@ -1,7 +1,8 @@
-"""The paper's network and the one that its authors released: architecture, initial weights, and stacks of networks.
+"""The paper's network and the network that its authors released: architecture, initial weights, and stacks of networks.
 
-A stack of m networks has one weight tensor per layer, so that one batched product replaces m small products. This is
-faster, because for networks of this size the overhead of a call exceeds the time for the arithmetic.
+A stack is a set of m networks that are computed together. It has one weight tensor per layer, so that one batched
+product replaces m small products. This is faster, because the overhead of a call exceeds the time for the arithmetic of
+such small networks.
 """
 
 from collections.abc import Sequence
@@ -19,13 +20,13 @@ from reskin.models.reproducible import affine
 HIDDEN_N = 200
 FEATURES_N = 40  # width of the bottleneck layer, on whose output the triplet loss is computed (paper section 4)
 FEATURE_LAYERS_N = 3
-OUTPUTS_N = 3  # x, y, F; with shear there are five: x, y, Fx, Fy, Fz
+OUTPUTS_N = 3  # x, y, F; with shear forces, there are five outputs: x, y, Fx, Fy, Fz
 BLOCK_ROWS_N = 65_536  # rows per forward pass, to limit memory
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A linear layer, and whether a ReLU follows it."""
+    """A linear layer, with or without a ReLU after it."""
 
     in_n: int
     out_n: int
@@ -71,7 +72,7 @@ class Stack(nn.Module):
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        # Contiguous, because autograd and AdamW would otherwise copy the gradients of a transposed view.
+        # The weights are made contiguous, because autograd and AdamW would copy the gradients of a transposed view.
         self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 

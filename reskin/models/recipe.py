@@ -6,9 +6,9 @@ from pydantic import Field
 
 from reskin.config import Strict
 
-HEADLINE = "paper"  # the recipe whose results are compared with the paper; other recipes are variants
+HEADLINE = "paper"  # the recipe whose results are compared with those of the paper; other recipes are variants
 
-# restricted characters, because names are used in file names
+# The characters are restricted, because names are used in file names.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
 Weight = Annotated[float, Field(ge=0)]
 
@@ -16,8 +16,8 @@ Weight = Annotated[float, Field(ge=0)]
 class Schedule(Strict):
     """Optimisation: AdamW with a one-cycle learning rate that peaks at `rate_max`.
 
-    The gradient with respect to all weights of a network, as one vector in scaled units, is clipped to a norm of at
-    most `gradient_norm_max`.
+    The gradient of a network's loss with respect to all its weights, taken as one vector, is clipped to a norm of at
+    most `gradient_norm_max`. Targets are in scaled units.
     """
 
     steps_n: Annotated[int, Field(ge=1)]
@@ -44,9 +44,9 @@ class Recipe(Schedule):
 
 
 class Augmentation(Strict):
-    """Virtual copies of each training skin, as if other boards had measured it.
+    """Settings for virtual copies of each training skin, as if other boards had measured the skin.
 
-    Except for `copies_n`, the settings are standard deviations.
+    `copies_n` is the number of copies. The other settings are standard deviations.
     """
 
     copies_n: Annotated[int, Field(ge=1, le=100)]
@@ -64,8 +64,8 @@ class AugmentedRecipe(Recipe):
 class AdaptationRecipe(Schedule):
     """Adaptation to a new skin: the recipe's loss plus a triplet loss on unlabelled pokes along lines.
 
-    This is the method in section 5 of the paper. unlabelled_weight: weight of this triplet loss; 0 in the control
-    experiment.
+    This is the method of section 5 of the paper. unlabelled_weight: weight of the triplet loss on unlabelled pokes; 0
+    in the control experiment.
     """
 
     unlabelled_weight: Weight
@@ -74,7 +74,7 @@ class AdaptationRecipe(Schedule):
 class FineTuningRecipe(Schedule):
     """Fine-tuning to a new skin: the recipe's loss plus the squared error on a few labelled pokes of the new skin.
 
-    own_weight: weight of this squared error.
+    own_weight: weight of the squared error on the labelled pokes of the new skin.
     """
 
     own_weight: Weight

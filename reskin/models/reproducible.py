@@ -1,11 +1,11 @@
 """Differentiable operations whose results are bit-identical on every x86-64 processor with AVX2.
 
 On a CPU, PyTorch computes matrix products, `exp`, `log`, `sqrt` and `erf` with MKL. MKL's results differ between AMD
-and Intel processors, even if MKL_CBWR is set, and training amplifies a difference in the last bit to millimetres.
-Therefore, this module computes matrix products with NumPy's OpenBLAS, with the kernels that `reskin.numerics` selects.
-For layers of this size, OpenBLAS is as fast as MKL. `exp` is computed by `exp2`, for which PyTorch does not use MKL.
-The other operations of the networks (sums, ReLU, sigmoid, AdamW) do not use MKL, and logarithms are computed with
-NumPy.
+and Intel processors, even if MKL_CBWR is set. Training amplifies a difference in the last bit to millimetres.
+Therefore, this module computes matrix products with NumPy's OpenBLAS, which uses the kernels that `reskin.numerics`
+selects. For layers of this size, OpenBLAS is as fast as MKL. `exp` is computed with `exp2`, for which PyTorch does not
+use MKL. Logarithms are computed with NumPy. The other operations of the networks (sums, ReLU, sigmoid, AdamW) do not
+use MKL.
 """
 
 import math
@@ -56,5 +56,6 @@ class _Affine(torch.autograd.Function):
 
 
 def _product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    with np.errstate(all="ignore"):  # as in PyTorch, an overflow results in inf, which the training loop detects
+    # as in PyTorch, an overflow gives inf without a warning; the training loop detects it
+    with np.errstate(all="ignore"):
         return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

@@ -1,9 +1,9 @@
 """Run many training jobs in parallel, with a cache of completed training runs.
 
-Jobs with equal settings and seed are trained together as a stack. The other networks of a stack affect the last bits of
-a network's weights. Therefore, stacks are formed from all requested jobs, including those with cached results, and the
-cache key of a result depends on the keys of all jobs in the stack. If a stage is killed and run again, it trains only
-the incomplete stacks.
+Jobs with equal settings and seed are trained together as a stack. The last bits of a network's weights depend on the
+other networks of its stack. Therefore, stacks are formed from all requested jobs, including those with cached results,
+and the cache key of a result depends on the keys of all jobs in the stack. If a stage is killed and run again, it
+trains only the incomplete stacks.
 """
 
 import hashlib
@@ -27,10 +27,12 @@ from reskin.numerics import device
 # and `reskin predict` rejects the network.
 MAX_ATTEMPTS_N = 3
 STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
-NO_ROWS = np.zeros(0, np.int64)  # replaces the row numbers of a `RemoteJob`, which are in the shared file
+NO_ROWS = np.zeros(0, np.int64)  # placeholder in a `RemoteJob`, whose row numbers are in the shared file
 
-RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; names of `train` and `test` in the shared file
-FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array of row numbers -> name in the shared file, the array
+# a job without row numbers, and the names of `train` and `test` in the shared file
+RemoteJob = tuple[TrainingJob, str, str]
+# id of an array of row numbers -> its name in the shared file, and the array
+FoldRows = Mapping[int, tuple[str, np.ndarray]]
 
 
 def run_jobs(
@@ -38,7 +40,7 @@ def run_jobs(
 ) -> list[TrainingResult]:
     """Train the jobs whose results are not in the cache, and return all results in the order of `jobs`.
 
-    A job whose network collapses is run again with other random draws, up to `MAX_ATTEMPTS_N` runs in total.
+    A job whose network collapses is run again with other random draws; there are at most `MAX_ATTEMPTS_N` runs.
 
     Parameters
     ----------
@@ -66,18 +68,18 @@ def _run_once(
 ) -> list[TrainingResult]:
     job_keys = JobKeys(data)
     keys = [job_keys.key(job) for job in jobs]
-    unique = dict(zip(keys, jobs, strict=True))  # equal jobs are trained once
+    unique = dict(zip(keys, jobs, strict=True))  # equal jobs are trained only once
     planned = [(stack, _result_files(stack, cache)) for stack in make_stacks(unique, STACK_N[device()])]
     missing = [(stack, files) for stack, files in planned if not all([_is_intact(file, log) for file in files])]
     fresh = {key for stack, _ in missing for key in stack}
     if len(fresh) < len(unique):
         log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
     if missing:
-        # a separate file for each process that runs jobs
+        # The file's name contains the process number, because several processes may run jobs at the same time.
         shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"
         work = [([unique[key] for key in stack], files) for stack, files in missing]
-        # Workers receive the names of arrays of row numbers, which are digests of the content, and read the arrays from
-        # the shared file. This keeps calls small, and a worker reads each array only once.
+        # Workers receive only the names of the arrays of row numbers (digests of their content), and read the arrays
+        # from the shared file. Therefore, little data is sent, and a worker reads each array only once.
         sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
         folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
         skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
@@ -130,7 +132,7 @@ def _run_stacks(
 
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
-    """Train a stack (in a worker process), and write the result of each job to its file."""
+    """Train a stack in a worker process, and write the result of each job to the job's file."""
     from reskin.models.train import train_stack  # imported here, because it imports torch, which only workers need
 
     jobs = [

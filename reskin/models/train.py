@@ -1,4 +1,4 @@
-"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks with equal settings."""
+"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks (see `reskin.models.network`)."""
 
 import math
 import time
@@ -30,10 +30,11 @@ from reskin.models.recipe import Schedule
 from reskin.numerics import device
 
 BLOCK_STEPS_N = 50  # steps in a block; batches are drawn and the loss is checked once per block
-# Mean squared error (scaled units) above which training is stopped, because networks hardly ever recover. A network
-# that predicts the mean has an error of 1.
+# Training is stopped if the mean squared error (scaled units) exceeds this value, because networks hardly ever recover
+# from it. A network that predicts the mean has an error of 1.
 DIVERGED = 1e8
-CHECKED_STEPS_N = 200  # with fewer steps, a network may not have learned anything, so collapse is not checked
+# collapse is not checked after fewer steps, because the network may not have learned anything yet
+CHECKED_STEPS_N = 200
 CHECKED_ROWS_N = 2000  # collapse is checked on about this many evenly spaced training rows
 
 # Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
@@ -47,10 +48,10 @@ BETA2, EPS = 0.999, 1e-8
 class Outcome:
     """The weights of a trained network, and its loss curve: the mean squared error between points (scaled units).
 
-    Point i of the curve is the mean error of the steps up to `curve_steps(steps_n)[i]`, after those of the previous
-    point. If a loss or a weight was not finite in some block of steps, or if the loss exceeded `DIVERGED`,
-    `stopped_step` is the last step of that block; the weights are those after the previous block, where the curve
-    ends. Otherwise, `stopped_step` is None.
+    Point i of the curve is the mean error of the steps after `curve_steps(steps_n)[i - 1]`, up to
+    `curve_steps(steps_n)[i]`. Training diverges in a block of steps if a loss or a weight is not finite, or if the loss
+    exceeds `DIVERGED`. In this case, `stopped_step` is the last step of the block, and the curve and the weights are
+    those after the previous block. Otherwise, `stopped_step` is None.
     """
 
     weights: Weights
@@ -86,9 +87,9 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Train a stack: minimise the squared error plus the weighted loss terms of `LossWeights`.
+    """Train a stack: minimise the squared error plus the other loss terms, weighted by `loss_weights`.
 
-    The paper specifies neither the optimiser nor the schedule. The choice here is AdamW with PyTorch's one-cycle
+    The paper specifies neither the optimiser nor the schedule. This implementation uses AdamW with PyTorch's one-cycle
     schedule of learning rate and momentum.
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
@@ -128,7 +129,7 @@ def clip_gradients(net: Stack, norm_max: float) -> None:
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
-    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # for a norm of 0, the quotient inf is clamped to 1
+    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # if the norm is 0, the quotient is inf and is clamped to 1
     for gradient in gradients:
         gradient.mul_(scale)
 
@@ -159,7 +160,7 @@ def _cosine(start: float, end: float, part: float) -> float:
 class AdamW:
     """PyTorch's fused AdamW, with learning rate and momentum passed to each step.
 
-    This class calls the functional interface, because the first use of `torch.optim.AdamW` in a process imports
+    This class calls PyTorch's functional interface, because the first use of `torch.optim.AdamW` in a process imports
     PyTorch's compiler, which takes a second of CPU time. The results are bit-identical to `torch.optim.AdamW`.
     """
 
@@ -202,7 +203,7 @@ class Monitor:
         return len(self.stopped_step) < len(is_sound)
 
     def outcomes(self, steps_n: int) -> list[Outcome]:
-        """Return the outcome of each network of a training that was to take `steps_n` steps."""
+        """Return the outcome of each network; `steps_n` is the planned number of steps."""
         errors = torch.cat(self.errors).double().cpu().numpy()
         outcomes = []
         for i, (weights, sound_n) in enumerate(zip(self.weights, self.sound_steps_n, strict=True)):

@@ -70,7 +70,7 @@ class Network:
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """The network as a PyTorch model; cached, because controllers predict for every frame."""
+        """The network as a PyTorch model. The model is cached, because controllers predict for every frame."""
         from reskin.models.network import Predictor  # imported here, because it imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
@@ -128,7 +128,7 @@ def read_network(model: Path) -> Network:
 
 
 def _find_models(missing: Path) -> str:
-    """Return advice for the user on a missing model file; stages write model files to data/models/SCENE/STAGE."""
+    """Return advice for the user on a missing model file. Pipeline stages write models to data/models/SCENE/STAGE."""
     if names := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
         return f"Models in this folder: {', '.join(names[:3])}{', ...' if names[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
@@ -151,7 +151,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment, by fold, one per seed; return {} if the scene does not run the experiment."""
+    """Read the networks of an experiment: for each fold, one network per seed; {} if the scene does not run it."""
     by_fold: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)

@@ -46,13 +46,13 @@ class Relaxation(Strict):
 
 
 class Memory(Strict):
-    """Hysteresis of the field: dB grows slowly during an indentation, and the growth decays after the indentation.
+    """Hysteresis of the field: an indentation adds a field change that builds up slowly and afterwards decays slowly.
 
-    The settings are chosen so that the same fraction of dB remains in the next no-load reading as on recorded boards
-    (5 to 8 %). The division of this fraction among the time constants is assumed.
+    With the nominal settings, about the same fraction of the field change dB remains in the next no-load reading as on
+    recorded boards (5 to 8 %). How this fraction is divided among the time constants is assumed.
     """
 
-    # per time constant: fraction of dB that a very long indentation adds
+    # for each time constant: field change that a very long indentation adds, as a fraction of dB
     share: tuple[Annotated[float, Field(ge=0, le=1)], ...]
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
     contact_s: Annotated[float, Field(ge=0, le=1e4)]  # time from the start of an indentation to the end of its readings
@@ -68,17 +68,17 @@ class Memory(Strict):
 def field_memory(
     change_T: Float[np.ndarray, "n p k 3"], memory: Memory
 ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n p k 3"]]:
-    """Return the change of the field in T due to hysteresis, given dB at p stops of n successive indentations.
+    """Return the field change in T due to hysteresis, given the field change dB without hysteresis at each stop.
 
     For each time constant, a state q starts at 0 and follows q' = (share dB - q) / tau during an indentation and
-    q' = -q / tau after it. The change of the field is the sum of all q. The times of the stops are not known.
-    Therefore, q at a stop is computed as if the indentation had lasted `contact_s` with the mean dB of the stops up to
-    this one.
+    q' = -q / tau after it. The field change due to hysteresis is the sum of q over all time constants. The times of the
+    stops are not known. Therefore, q at a stop is computed as if the indentation had lasted `contact_s` with a constant
+    dB: the mean over the stops up to this one.
 
     Returns
     -------
-    before_T : sum of q in the no-load reading before each indentation; caused by earlier indentations.
-    added_T : sum of q at each stop, minus the sum in the no-load reading of the same indentation.
+    before_T : sum of q in the no-load reading before each indentation, due to earlier indentations.
+    added_T : sum of q at each stop, minus the sum of q in the no-load reading before the same indentation.
     """
     running_mean_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
     before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
@@ -103,9 +103,9 @@ def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> flo
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:
     """Integrate q' = -q / tau + share e' over a step of `dt_s`, in which the elastic force e changes by `change`.
 
-    `state` is q for each term of the Prony series. The solution is exact if e changes linearly:
-    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). For a jump
-    of e, dt is 0.
+    `state` has the value of q for each term of the Prony series. With x = dt / tau, the new value is exp(-x) q + share
+    change (1 - exp(-x)) / x. It is exact if e changes linearly (Taylor, Pister & Goudreau 1970). For a jump of e, dt is
+    0.
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
@@ -117,8 +117,9 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
 def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony) -> Float[np.ndarray, " t"]:
     """Return the force of a viscoelastic skin at each time, given the force of an elastic skin at these times.
 
-    The elastic force starts from 0 and is linear between the times. Lee & Radok 1960: force = integral of
-    relaxation(t - s) d elastic(s), which is valid while the contact area does not shrink.
+    The elastic force starts from 0 and is linear between the times. The force at time t is the integral over earlier
+    times s of relaxation(t - s) d elastic(s) (Lee & Radok 1960). This solution is valid only while the contact area
+    does not shrink.
     """
     state = np.zeros_like(prony.tau_s)
     relaxed = np.empty_like(elastic)
@@ -158,13 +159,13 @@ def temperature_rise_K(time_s: Float[np.ndarray, "..."], temperature: Temperatur
 def relative_remanence(rise_K: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Return the skin's magnetisation after a temperature rise, relative to its initial value.
 
-    No-load fields and dB are proportional to the magnetisation.
+    No-load fields and field changes are proportional to the magnetisation.
     """
     return 1 + REMANENCE_PER_K * rise_K
 
 
 SETTLING_CONTACTS = 300  # number of contacts after which 63 % (1 - 1/e) of the initial softening has occurred
-AGEING_CONTACTS = 1e3  # after about this number of contacts, softening is proportional to the logarithm of the number
+AGEING_CONTACTS = 1e3  # beyond about this number of contacts, the softening grows with the logarithm of the number
 
 
 class Ageing(Strict):
@@ -180,7 +181,7 @@ class Ageing(Strict):
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
     """Return the force after N contacts, relative to the force of a new skin at the same depth.
 
-    1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)
+    The result is 1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000).
     """
     _check_counts(contacts_n)
     settled = -np.expm1(-contacts_n / SETTLING_CONTACTS)
@@ -200,10 +201,10 @@ def fading(contacts_n: Int[np.ndarray, " n"], *, per_decade: float) -> Float[np.
 def baseline_walk(
     contacts_n: Int[np.ndarray, " n"], channels_n: int, *, step_T: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
-    """Draw the drift of each channel's no-load field in T: a random walk with a step from N(0, step_T^2) per contact.
+    """Draw the drift of each channel's no-load field in T: a random walk with a normal step of sd `step_T` per contact.
 
-    `contacts_n` is the number of contacts before each reading and must not decrease. If it increases by more than 1,
-    the walk takes a step for each contact.
+    `contacts_n` is the number of contacts before each reading and must not decrease. If this number increases by more
+    than 1 between two readings, the walk takes one step for each contact.
     """
     _check_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)

@@ -1,7 +1,8 @@
 """Ambient fields: the earth's field and the field of an iron ball. SI units.
 
-A ball in a uniform field has the field of one dipole. A ball near dipoles has the field of image dipoles and poles. The
-effect of the ball on the magnetisation of nearby dipoles is neglected.
+In a uniform field, an iron ball produces the field of one dipole. Near magnetic dipoles, such as those of a skin, it
+produces the field of image dipoles and image poles. The effect of the ball on the magnetisation of these dipoles is
+neglected.
 """
 
 import numpy as np
@@ -11,11 +12,13 @@ from scipy.constants import micro, mu_0
 from reskin.physics import magnet
 from reskin.physics.magnet import MU0_4PI, Dipoles
 
-# The earth's field at a middle latitude; it varies from 25 to 65 uT over the globe (IGRF). x is north, z is up.
+# The earth's field at a middle latitude; its magnitude is between 25 and 65 uT over the globe (IGRF). x is north, z is
+# up.
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])
-# relative permeability of soft iron; the moment of a ball is 0.3 % smaller than at infinite permeability
+# Relative permeability of soft iron. With this value, the moment of a ball is 0.3 % smaller than with infinite
+# permeability.
 IRON_MU_R = 1000.0
 
 
@@ -26,7 +29,10 @@ def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 
 
 
 def ball_moment(radius_m: float, b_T: Float[np.ndarray, "3"], mu_r: float = IRON_MU_R) -> Float[np.ndarray, "3"]:
-    """Return the moment in A m^2 of a ball in a uniform field: (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B."""
+    """Return the moment in A m^2 of a ball in a uniform field.
+
+    For a ball of radius a in the field B, the moment is (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B.
+    """
     return 4 * np.pi * radius_m**3 / mu_0 * (mu_r - 1) / (mu_r + 2) * b_T
 
 
@@ -51,9 +57,9 @@ def ball_images(
 ) -> Float[np.ndarray, "o 3"]:
     """Return the field in T that a ball of infinite permeability adds to the field of dipoles outside the ball.
 
-    The solution is that of a conducting, uncharged sphere in electrostatics (Jackson, chapter 2): each dipole has an
-    image dipole and a magnetic pole at its inverse point in the ball, and an opposite pole at the ball's centre. Close
-    to a skin, a single dipole at the ball's centre would be a poor approximation, with a much smaller field.
+    Each dipole has an image dipole and a magnetic pole at its inverse point in the ball, and an opposite pole at the
+    ball's centre. This is the solution for a conducting, uncharged sphere in electrostatics (Jackson, chapter 2). Close
+    to a skin, the field of a single dipole at the ball's centre would be much too small.
     """
     away_m = dipoles[0] - centre_m
     distance_m = np.linalg.norm(away_m, axis=1, keepdims=True)

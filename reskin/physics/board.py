@@ -39,7 +39,8 @@ class BoardDesign(Strict):
     """Positions of the chips relative to the centre of the board, and the rotation of each chip about z.
 
     The rotations in the scenes were determined from recordings (tests/recordings/test_lab_frames.py), because there is
-    no board layout file. With `tiles`, there are several boards of this design, and chips are numbered board by board.
+    no board layout file. If `tiles` is set, several boards of this design are under one skin, and chips are numbered
+    board by board.
     """
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
@@ -129,8 +130,9 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Return the relative height error of each chip due to tilt and bow of the board, to be scaled by `board_uneven`. At
-    # the outermost chips, each of the three terms is about a standard normal number. The skin is assumed to be flat.
+    # Return the relative height error of each chip due to tilt and bow of the board, to be scaled by `board_uneven`.
+    # The sum has three terms: tilt along x, tilt along y, and bow. At the outermost chips, each term is about a
+    # standard normal number. The skin is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

@@ -71,13 +71,14 @@ def read_temperature(
 
 CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 OSR_MAX, DIG_FILT_MAX = 3, 7
-START_AND_END_S = 232e-6  # time in table 18 of the data sheet beyond the conversions themselves
+START_AND_END_S = 232e-6  # time that table 18 of the data sheet includes in addition to the conversions
 
 
 def conversion_s(osr: int, dig_filt: int) -> float:
     """Return the time of one conversion of X, Y, Z and temperature at settings OSR and DIG_FILT, with OSR2 0.
 
-    The data sheet states the times of one axis and of temperature; tests compare their sum with its table 18.
+    The data sheet states the time for one axis and the time for temperature. Tests compare the total time with table 18
+    of the data sheet.
     """
     axis_s = 67e-6 + 64e-6 * 2**osr * (2 + 2**dig_filt)
     temperature_s = 67e-6 + 192e-6
@@ -87,7 +88,7 @@ def conversion_s(osr: int, dig_filt: int) -> float:
 def last_conversions(
     frame_s: Float[np.ndarray, " f"], phase_s: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "f k"]]:
-    """Return the age in s of each chip's last conversion at each frame, and the first frame with the same conversion.
+    """Return the age in s of each chip's last conversion at each frame, and the first frame that has this conversion.
 
     `phase_s` is the time of each chip's first conversion; further conversions follow every `CONVERSION_S`.
     """
@@ -102,7 +103,7 @@ def last_conversions(
 def sample_at_conversion(
     value: Float[np.ndarray, "f k a"], age_s: Float[np.ndarray, "f k"], rate_hz: float
 ) -> Float[np.ndarray, "f k a"]:
-    """Interpolate values linearly between frames, to each chip's last conversion, `age_s` before the frame."""
+    """Interpolate values linearly between frames, at each chip's last conversion (`age_s` before the frame)."""
     frames_n, chips_n = age_s.shape
     place = np.maximum(np.arange(frames_n)[:, None] - age_s * rate_hz, 0.0)
     before = np.minimum(place.astype(np.intp), max(frames_n - 2, 0))

@@ -2,9 +2,9 @@
 
 The linear solution of `layer` is valid only for small depths. Here the depth increases in small steps (12 to 24 for the
 usual depths). Each step solves for the pressure change that keeps the deformed surface on the spherical tip, and
-displaces the material by the linear solution for this pressure. The result is axisymmetric and, in units of the
-thickness, depends only on R/h (tip radius over thickness). Therefore, a few tables for different R/h suffice for skins
-of any thickness, and an indentation is simulated by interpolation between the tables.
+displaces the material by the linear solution for this pressure. The result is axisymmetric. If all lengths are in units
+of the thickness, it depends only on R/h (tip radius over thickness). Therefore, a few tables for different R/h suffice
+for skins of any thickness, and an indentation is simulated by interpolation between the tables.
 """
 
 from dataclasses import asdict, dataclass
@@ -24,15 +24,16 @@ from reskin.physics import layer
 from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
 from reskin.physics.magnet import Dipoles
 
-# Depth of a step in units of `depth_scale`; about 0.05 mm for a skin of 2 mm. Halving the step changes dB by 0.3 % on a
-# slipping base and by 0.6 % on a bonded base.
+# Depth of a step in units of `depth_scale`; about 0.05 mm for a skin of 2 mm. If the step is halved, the field change
+# dB changes by 0.3 % on a slipping base and by 0.6 % on a bonded base.
 STEP = 0.025
-# Depths after each step, in units of `depth_scale`. They are the same for all requested depths. The first step is
+# Depths after each step, in units of `depth_scale`. They do not depend on the requested depths. The first step is
 # divided in three, because the contact radius grows as the square root of the depth.
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # largest height of the bulging rim, in thicknesses; above 1, the waves of the solution grow as exp(kz)
+RIM_MAX = 1.2  # largest height of the bulging rim, in thicknesses; above a height of 1, waves grow as exp(kz)
 MARKERS_N = 48  # number of markers on the surface; they are denser towards the axis
-# Number of basis pressures. With 4 or 8, the positions of the markers at a depth of 1.2 mm change by less than 0.03 mm.
+# Number of basis pressures (see `pressure_change`). With 4 or 8 instead, the positions of the markers at a depth of 1.2
+# mm change by less than 0.03 mm.
 PRESSURES_N = 6
 DAMPING = 1e-3  # damping of the least squares for the pressure, relative to the largest singular value
 
@@ -99,10 +100,10 @@ def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pre
 def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
     """Solve for the pressure change that moves the surface markers onto the tip at a greater depth.
 
-    The first points of `material` are the markers. The pressure is a weighted sum of `PRESSURES_N` pressures, which the
-    same tip would exert with smaller contact radii. The weights are the damped least-squares solution that moves all
-    markers inside the contact from their current positions to the tip. Damping is needed, because markers that have
-    moved down are hardly affected by waves shorter than the depth.
+    The first points of `material` are the markers. The pressure is a weighted sum of `PRESSURES_N` basis pressures:
+    those that the same tip would exert at contact radii up to the current one. The weights are the damped least-squares
+    solution that moves all markers inside the contact from their current positions to the tip. Damping is needed,
+    because pressure waves that are shorter than the depth hardly move markers that are already deep.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
@@ -150,15 +151,15 @@ def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
 
 
 # Tables extend this far beyond the contact radius, in thicknesses. Farther away, material on a bonded base does not
-# move, and material on a slipping base moves outward rigidly, apart from waves that decay as exp(-pi r / h). With
-# tables that end at 4 thicknesses from the axis, the error of dB is up to 17 %.
+# move, and material on a slipping base moves outward rigidly, apart from waves that decay as exp(-pi r / h). If the
+# tables ended at 4 thicknesses from the axis, the error of dB would be up to 17 %.
 REACH = 5.0
 SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
 STENCIL_N = 4  # number of points for cubic interpolation, both between tables and between depths
 DET_F_ERROR_MAX = 0.1  # largest relative error of the volume of the material, which is incompressible
 COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which displacements are computed, relative to `reach`
 FINE_R = np.linspace(0, 1, 512)  # radii at which displacements are tabulated; fine enough for linear interpolation
-PACKAGE = Path(__file__).parent  # the cache of tables is in this folder, and its keys depend on the source files here
+PACKAGE = Path(__file__).parent  # tables are cached in this folder, and computed again if its source files change
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class RestingDipoles:
 
 @dataclass(frozen=True)
 class MovedDipoles:
-    """The dipoles that an indentation moves: their indices `i`, and their positions and moments before and after it."""
+    """The dipoles that an indentation moves: indices `i`, positions and moments (before and after the motion)."""
 
     i: Int[np.ndarray, " m"]
     before: Dipoles
@@ -217,7 +218,7 @@ def tabulate(
 ) -> DeformationMap:
     """Tabulate the displacement of material for depths up to `deepest_m`, or slightly beyond.
 
-    The result is interpolated between tables for multiples of `SIZE_STEP` in ln(R/h). Its values at a given depth do
+    The result is interpolated between tables whose ln(R/h) are multiples of `SIZE_STEP`. The values at a given depth do
     not depend on `deepest_m`.
 
     Parameters
@@ -250,7 +251,7 @@ def _tabulate(
     weights = _lagrange(tables_i.astype(float), position)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(weights, parts, strict=True))
-    # Contiguous, because `at_depth` would otherwise copy the part that it needs for each indentation.
+    # The array is made contiguous, because `at_depth` would otherwise copy a part of it for each indentation.
     moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
     # Material at height 0 stays on the base and, on a bonded base, does not move sideways. It may rotate.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
@@ -278,7 +279,7 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
 
 
 def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
-    """Move and rotate the dipoles within `reach_m` of an indentation (x, y, depth); on a slipping base, all dipoles.
+    """Move and rotate the dipoles within `reach_m` of an indentation (x, y, depth), or all dipoles on a slipping base.
 
     With the deformation gradient F = R U, a moment m becomes R m and not F m, because the magnetisation does not depend
     on stretch (Danas & Reis 2024).

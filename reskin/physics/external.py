@@ -8,11 +8,12 @@ uniform over the board; how much they vary depends on the distance.
 import numpy as np
 from jaxtyping import Float
 
-# Distance of the dipole. It was chosen on recordings of a moving hand whose fingers have skins (data/leaphand; 40 mm is
-# most likely there) and on simulated skins (a larger distance is more accurate if sources are farther away).
+# Distance of the dipole from the board's centre, chosen on recordings and on simulated skins. For recordings of a
+# moving hand whose fingers have skins (data/leaphand), 40 mm has the largest likelihood. On simulated skins, estimates
+# are more accurate with a larger distance if the sources are farther away.
 DISTANCE_MM = 50.0
 CHIP_RATIO = 3.0  # smallest distance of the dipole, in units of the distance of the farthest chip; assumed
-NOISE_MIN_uT = 0.1  # smallest noise for the suppressor; a log may begin with equal readings
+NOISE_MIN_uT = 0.1  # smallest noise for `suppressor`; the measured noise is 0 if a log begins with equal readings
 DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
 
 
@@ -33,10 +34,10 @@ def covariance(
 
 
 def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
-    """Return a symmetric matrix that shrinks external fields in a reading to the size of its noise.
+    """Return a symmetric matrix that shrinks external fields in a reading to the size of the noise.
 
-    It is the whitening matrix of external field plus noise, multiplied by the standard deviation of the noise. The
-    part of a reading that no external field can explain is unchanged.
+    The matrix whitens the sum of external field and noise, and is multiplied by the standard deviation of the noise.
+    The part of a reading that no external field can explain is unchanged.
     """
     noise_uT = max(noise_uT, NOISE_MIN_uT)
     variances, axes = np.linalg.eigh(external_cov)

@@ -1,9 +1,10 @@
 """An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
 
-The layer is bonded to a rigid base or slips on it without friction. Displacements are Hankel integrals over waves
-J0(kr) of the pressure. In names, kh is the wave number times the thickness, and kz the wave number times the height.
-Primes on functions are derivatives with respect to kz. For a bonded base, the vertical displacement is W = a (sinh z' -
-z' cosh z') + b z' sinh z', and the radial displacement is U = -W'/k, with z' = kz.
+The layer is bonded to a rigid base or slips on it without friction. The pressure is a sum of waves J0(kr) with wave
+numbers k, and displacements are Hankel integrals over these waves. At the height z, a wave displaces the material
+vertically by W J0(kr) and radially by U J1(kr), with U = -W'. A prime on a function is its derivative with respect to
+kz. For a bonded base, W = a (sinh kz - kz cosh kz) + b kz sinh kz, with two constants a and b. In names, kh is the wave
+number times the thickness, and kz is the wave number times the height.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from reskin.errors import ParamsError
 
 Base = Literal["bonded", "slipping"]
 
-# Fraction of the thickness up to which Long et al. 2011 verified their solution by finite elements.
+# Largest depth, as a fraction of the thickness, for which Long et al. 2011 verified their solution by finite elements.
 VERIFIED_DEPTH = 0.6
 CURVE_N = 48  # number of contact radii on the force curve
 
@@ -33,7 +34,7 @@ def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np
 
 
 # Nodes and weights of three Gauss quadratures. CONTACT: over the contact, in units of its radius. KERNEL: over kh up to
-# 24; above that, 1 - compliance is negligible, because it falls as exp(-2 kh). WAVES: over kh up to 40, for
+# 24; for larger kh, 1 - compliance is negligible, because it falls as exp(-2 kh). WAVES: over kh up to 40, for
 # displacements; in a skin of 2 mm, kh = 40 is a wavelength of 0.3 mm.
 CONTACT_X, CONTACT_W = _gauss(1.0, 48)
 KERNEL_KH, KERNEL_W = _gauss(24.0, 160)
@@ -42,9 +43,9 @@ WAVES_KH, WAVES_W = _gauss(40.0, 240)
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact and its pressure p, given by the Hankel transform p^(k) / 2G = sum_i weights_i cos(k x_i).
+    """A contact and its pressure, given by the Hankel transform p^(k) of the pressure.
 
-    G is the shear modulus.
+    p^(k) / 2G = sum_i weights_i cos(k x_i), where G is the shear modulus.
     """
 
     radius_m: float
@@ -55,7 +56,8 @@ class Contact:
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure on the layer as a sum of waves J0(k r): wave numbers k, and amplitudes p^(k) dk / 2G of the waves."""
+    """A pressure on the layer as a sum of waves J0(k r) with wave numbers k and amplitudes p^(k) dk / 2G (see
+    `Contact`)."""
 
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
@@ -65,7 +67,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement of material points (outward `r_m`, up `z_m`) and its gradient.
+    """Displacement of material points (outward `r_m`, up `z_m`), and the gradient of the displacement.
 
     `r_z` is the derivative of the outward component with respect to z, and so on. `hoop` is `r_m` divided by the
     radius.
@@ -83,8 +85,8 @@ class Displacement:
 def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     """Return the surface compliance of a bonded layer to a pressure wave, relative to that of a half-space.
 
-    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
-    overflow.
+    With A = kh, the relative compliance is (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1). Numerator and denominator are
+    divided by exp(2A) / 2 to avoid overflow.
     """
     double = np.minimum(2 * kh, 1e3)  # keeps `double**2` finite; at this limit, the compliance is 1
     fade = np.exp(-double)
@@ -97,8 +99,8 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     """Return the surface compliance of a slipping layer to a pressure wave, relative to that of a half-space.
 
-    (cosh 2A - 1) / (sinh 2A + 2A), A = kh (Johnson 1985, 5.8), with numerator and denominator divided by exp(2A) / 2 to
-    avoid overflow. For long waves, the limit A / 2 is returned.
+    With A = kh, the relative compliance is (cosh 2A - 1) / (sinh 2A + 2A) (Johnson 1985, 5.8). Numerator and
+    denominator are divided by exp(2A) / 2 to avoid overflow. For long waves, the limit A / 2 is returned.
     """
     double = np.minimum(2 * kh, 1e3)
     fade = np.exp(-double)
@@ -110,8 +112,9 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
     """Solve a Fredholm equation for the pressure and the depth of a contact with this radius (Lebedev & Ufliand 1958).
 
-    The pressure is expressed as p^(k) = integral of chi(x) cos(kx) dx over the contact, and therefore vanishes outside.
-    It deforms the surface to the sphere if chi - K chi = 2/pi (depth - x artanh(x/R)). The depth follows from
+    The Hankel transform of the pressure is expressed as the integral of chi(x) cos(kx) dx from 0 to the contact radius.
+    With this form, the pressure is zero outside the contact. The pressure deforms the surface to a sphere of radius R
+    if chi - K chi = 2/pi (depth - x artanh(x/R)), where K is the integral operator of `_kernel`. The depth follows from
     chi(radius) = 0, because the pressure is finite at the edge of the contact.
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
@@ -132,8 +135,8 @@ def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float,
         contact = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return contact.depth_m - depth_m
 
-    # Bounds of the contact radius a: a^2 = R d for a thick layer. For a thin layer, whose material can only flow
-    # sideways, a^2 = 4 R d.
+    # Bounds of the contact radius a. With tip radius R and depth d, a^2 is R d for a thick layer, and 4 R d for a thin
+    # layer, whose material can only flow sideways.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(depth_error_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
@@ -202,7 +205,8 @@ def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pressure: Waves) -> Displacement:
     """Return the displacement of material points at (r, z) due to a pressure.
 
-    u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0, with g from `depth_profile`.
+    The components are u_r = sum of amplitude g'(kz) J1(kr) and u_z = -sum of amplitude g(kz) J0(kr), summed over all
+    waves. The function g is that of `depth_profile`.
     """
     top = float(np.max(r_m, initial=0.0) * pressure.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
@@ -216,7 +220,8 @@ def depth_profile(
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
     """Return the depth profile g(kz) of each wave, and its first two derivatives with respect to kz.
 
-    g = k W 2G / p^ is the vertical displacement W at height z in dimensionless form; g(kh) is the surface compliance.
+    A pressure wave of amplitude p^ displaces material at the height z downwards by p^ g(kz) / (2G k), where G is the
+    shear modulus. At the surface, g(kh) is the compliance relative to that of a half-space.
     """
     factors_of, wave = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
     profiles = [[wave(z, h, factors_of(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
@@ -226,8 +231,9 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / (E d^1.5) is a smooth function of sqrt(d) and is therefore interpolated over sqrt(d). At d = 0, where the
-    # contact is small compared with the layer, its value is 16/9 sqrt(R), from Hertz contact.
+    # F / (E d^1.5), with force F, Young's modulus E and depth d, is a smooth function of sqrt(d) and is therefore
+    # interpolated over sqrt(d). At d = 0, where the contact is small compared with the layer, its value is 16/9
+    # sqrt(R), from Hertz contact.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
@@ -240,7 +246,8 @@ def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSp
 def _kernel(
     points_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
-    # K of the Fredholm equation: 2/pi times the integral over k of (1 - compliance) cos(k point) cos(k x).
+    # Return the kernel K of the Fredholm equation: 2/pi times the integral over k of (1 - compliance) cos(k point)
+    # cos(k x).
     compliance = bonded_compliance if base == "bonded" else slipping_compliance
     missing = KERNEL_W / thickness_m * (1 - compliance(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
@@ -264,7 +271,7 @@ def _bonded_factors(kh):
 def _bonded_wave(kz, kh, factors):
     """Return g of one wave at height z of a bonded layer, and its first two derivatives with respect to kz.
 
-    g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), A = kh, z' = kz, t = A - z'.
+    With A = kh, z' = kz and t = A - z', g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2).
     Numerator and denominator are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
     t = kh - kz
@@ -290,9 +297,9 @@ def _slipping_factors(kh):
 def _slipping_wave(kz, kh, factors):
     """Return g of one wave at height z of a slipping layer, and its first two derivatives with respect to kz.
 
-    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A). This is the odd solution in z', because
-    both W and the shear W'' + W vanish at the base. Numerator and denominator are multiplied by 4 exp(-2A), so that no
-    exponent is positive inside the layer.
+    With A = kh and z' = kz, g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A). This solution
+    is odd in z', because W and the shear stress, which is proportional to W'' + W, vanish at the base. Numerator and
+    denominator are multiplied by 4 exp(-2A), so that no exponent is positive inside the layer.
     """
     size, first, second = factors
     top, low = exp(kz - kh), exp(-kh - kz)

@@ -20,7 +20,8 @@ ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from
 ARRAY_ABOVE_M = 0.25e-3  # gap between the skin's top and the upper cubes, from the authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
 
-# Signs of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the cube below it.
+# Polarity of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the lower cube
+# that is opposite to it.
 Polarity = Literal["checkerboard", "same"]
 
 
@@ -42,7 +43,7 @@ def cuboid_field(
 
 
 def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
+    """Return the contribution of one corner of a cuboid to the cuboid's field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
     # The published formula contains log(y + r). asinh(y / hypot(x, z)) differs by a term that cancels in the sum over
@@ -54,7 +55,7 @@ def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
 def cubes_along(side_m: float) -> int:
     """Return the smallest number of magnet cubes that cover a side of a skin: 4 for the authors' skin.
 
-    It is assumed that other skins are magnetised with the same cubes.
+    Skins of other sizes are assumed to be magnetised with the same cubes.
     """
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
@@ -180,7 +181,11 @@ def field(
 def field_of_each(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o s 3"]:
-    """Return the field in T of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3)."""
+    """Return the field in T of each dipole at each observer.
+
+    The field is mu0/4pi (3 (m.r) r / |r|^5 - m / |r|^3), with the moment m and the vector r from the dipole to the
+    observer.
+    """
     # The axis of the components x, y, z is first, so that every product is over long contiguous rows.
     separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
     moment = moments_A_m2.T[:, None, :]

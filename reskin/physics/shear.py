@@ -17,7 +17,7 @@ from reskin.physics import deformation, layer
 
 
 class Friction(Strict):
-    """Section `terms.friction`: Coulomb friction between tip and skin."""
+    """Section `terms.friction` of the settings: Coulomb friction between tip and skin."""
 
     coefficient: Annotated[float, Field(ge=0, le=10)]
 
@@ -41,9 +41,9 @@ def drag_force(
     """Return the friction force along the path of a tip that touches down at `path_m[0]`.
 
     The method is return mapping (Simo & Hughes 1998): each step of the path is first assumed to be elastic. If the
-    resulting force exceeds Coulomb's limit mu F, the tip slides and the force is reduced to the limit. If the tip is
-    not in contact at both ends of a step, the force is zero, because the place where it lifted off or touched down is
-    unknown.
+    resulting force exceeds Coulomb's limit mu F, the tip slides and the force is reduced to the limit. After a step
+    that begins or ends without contact, the force is zero, because the place where the tip lifted off or touched down
+    is unknown.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def _check_drag(
 REACH = 5.0  # tables extend this far beyond the contact, in thicknesses; material farther away does not move
 WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` is too coarse for larger contacts
 RIM_MAX = 1.2  # largest height of the rim in thicknesses, as in `deformation`; nodes in the rim move like the surface
-STEP = 0.75  # largest rotation (half the curl) per integration step; at mu = 0.8, one step is enough down to 0.6 mm
+STEP = 0.75  # largest rotation (half the curl) per integration step; for mu = 0.8, one step suffices down to 0.6 mm
 STEEPEST = 1.5  # largest rotation for which the step size was verified (mu = 0.8 at a depth of 1.2 mm)
 TABLE_R_N, TABLE_Z_N = 512, 80  # numbers of radii and heights in a table; fine enough for linear interpolation
 DEPTH_STEP_M = 10e-6  # step between tabulated depths, over which the stiffness changes by 1 % and dB by 0.1 uT
@@ -110,7 +110,7 @@ class Traction:
 
 @dataclass(frozen=True)
 class WaveResponse:
-    """Displacement of the layer due to a wave of tangential traction T, as a function of kz.
+    """Displacement of the layer due to a wave of tangential traction T, as a function of wave number k times height z.
 
     If T is along the wave vector, the displacement in units of T / 2Gk is w' along the wave vector and -i w upwards. If
     T is across the wave vector, the displacement in units of T / Gk is v in the direction of T. Primes are derivatives
@@ -126,11 +126,11 @@ class WaveResponse:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """Displacement, and half of its curl, due to a force Q along x, on a grid with equal steps in r and in z.
+    """Displacement due to a force Q along x, and half of its curl, on a grid with equal steps in r and in z.
 
-    Both are divided by Q / G, where G is the shear modulus. At the angle f from x, the components along x, y and z are
-    A + B cos 2f, B sin 2f and C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for the half curl.
-    The last axis of `parts` is A, B, C in 1/m and D, E, S in 1/m^2.
+    All values are divided by Q / G, where G is the shear modulus. At the angle f from the x axis, the components along
+    x, y and z are A + B cos 2f, B sin 2f and C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for
+    the half curl. The last axis of `parts` is A, B, C in 1/m and D, E, S in 1/m^2.
     """
 
     r_m: Float[np.ndarray, " i"]
@@ -149,21 +149,22 @@ class ShearDisplacement:
 
 
 def slip_traction(contact: layer.Contact) -> Traction:
-    """Return the traction of a sliding tip, which has the distribution of the pressure (Coulomb: q = mu p).
+    """Return the traction q of a sliding tip, which is proportional to the pressure p (Coulomb's law: q = mu p).
 
-    This traction is used for a whole drag, because the tip slides after the first one or two millimetres. The
-    tangential stiffness is lower than with `stick_traction`: by 19 to 20 % on the nominal skin at depths of 0.2 to 1.2
-    mm, and by 1/6 on a thick layer.
+    This traction is used at all stops of a drag, because the tip slides from the first one or two millimetres on. With
+    it, the tangential stiffness is lower than with `stick_traction`: by 19 to 20 % on the nominal skin at depths of 0.2
+    to 1.2 mm, and by 1/6 on a thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
 
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
-    """Return the axisymmetric traction of a sticking tip, which displaces the whole contact by the same amount.
+    """Return the axisymmetric traction that displaces the whole contact by the same amount, as a sticking tip does.
 
-    The term B of `ShearMap`, which makes the displacement non-uniform, is neglected. The traction is the solution of
-    chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer, chi is constant, which is Mindlin's traction
-    (a^2 - r^2)^(-1/2).
+    The term B of `ShearMap`, which makes the displacement non-uniform, is neglected. The Hankel transform of the
+    traction is the integral of chi(x) cos(kx) dx over the contact, as in `layer.contact_of_radius`. The function chi is
+    the solution of chi - K chi = 1, with the kernel K from `_kernel`. For a thick layer, K is zero and chi is constant.
+    The traction is then proportional to (a^2 - r^2)^(-1/2), with the contact radius a (Mindlin's solution).
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -174,9 +175,11 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
     """Return the tangential stiffness k_t of the layer, divided by the shear modulus G.
 
-    k_t is the force divided by the mean displacement along the force, weighted with the traction. By Parseval's
-    theorem, k_t / G is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3, and the
-    integral has a closed form. The kernel describes the additional effect of the base.
+    k_t is the force divided by the mean displacement along the force; the traction is the weight of this mean.
+    According to Parseval's theorem, k_t / G = 8 pi / I, where I is the integral of q(k)^2 (w' + 2v) dk. Here q(k) is
+    the Hankel transform of the traction for a force of 1, and w' and v are those of `WaveResponse` at the surface. For
+    a half-space, w' + 2v is 3 and I has a closed form. The effect of the base is subtracted from this form (see
+    `_kernel`).
     """
     chi = traction.weights / (traction.radius_m * layer.CONTACT_W)
     base_effect = _kernel(traction.x_m, thickness_m) @ traction.weights
@@ -201,7 +204,8 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
 def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
     """Return the shear map at a depth, by linear interpolation between tabulated depths.
 
-    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is almost zero, the map at that depth is used.
+    Below the first tabulated depth (`DEPTH_STEP_M`), the force is almost zero, and the map of the first tabulated depth
+    is used.
     """
     steps = max(depth_m / DEPTH_STEP_M, 1.0)
     first, share = int(steps), steps - int(steps)
@@ -240,8 +244,8 @@ def evaluate_map(
 ) -> Float[np.ndarray, "i j 6"]:
     """Compute `ShearMap.parts` on a grid: Hankel integrals with J0, J1 and J2, as matrix products.
 
-    A traction q along x has the components q cos f along the wave vector and -q sin f across it, for a wave vector at
-    the angle f. The integrals over f are Bessel functions.
+    If the wave vector is at the angle f from the x axis, a traction q along x has the component q cos f along the wave
+    vector and the component -q sin f across it. The integrals over f are Bessel functions.
     """
     k_per_m = layer.WAVES_KH / thickness_m
     window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # avoids ringing
@@ -265,9 +269,9 @@ def evaluate_map(
 def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
     """Return the response of a layer that is fixed at the base to a wave of tangential traction on top.
 
-    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'. The
-    function w is the solution W of `layer` with the boundary condition W''' = 3 W' at the top. Numerators and
-    denominators are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
+    With A = kh, z' = kz and t = A - z', the functions are v = sinh z' / cosh A and w = [A z' cosh t - t cosh A sinh z']
+    / (cosh^2 A + A^2). The function w is the solution W of `layer` with the boundary condition W''' = 3 W' at the top.
+    Numerators and denominators are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)
@@ -316,9 +320,9 @@ def shear_in_steps(
     """Return the finite shear of nodes that `deformation` has already moved, computed in steps by the midpoint rule.
 
     `centre_m` is the rest position of the material under the tip: the place of the tip minus `DragForce.elastic_m`. The
-    nodes must have been moved by an indentation with the same centre. With mu = 0.8, dB differs from the result of 24
-    steps by up to 1.2 % for depths up to 0.8 mm, and by 3 % at 1.2 mm. If `shear_displacement` were applied once to the
-    nodes at rest, dB would differ by 13 to 90 %.
+    nodes must have been moved by an indentation with the same centre. With mu = 0.8, the resulting field change dB
+    differs from that of 24 steps by up to 1.2 % for depths up to 0.8 mm, and by 3 % at 1.2 mm. If `shear_displacement`
+    were applied once to the nodes at rest, dB would differ by 13 to 90 %.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = shear_map.steepest_per_m2 * float(np.hypot(*shear_m2))
@@ -359,7 +363,8 @@ def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[n
 @njit(cache=True, fastmath=False)
 @no_type_check
 def _at_places(parts, steps, places, centre, force):
-    # Interpolate `ShearMap.parts` bilinearly at each place, then combine A to S for the direction of the force.
+    # Interpolate `ShearMap.parts` bilinearly at each place, then combine the parts A to S for the direction of the
+    # force.
     r_n, z_n, _ = parts.shape
     moved, half_curl = np.zeros_like(places), np.zeros_like(places)
     values, (fx, fy) = np.empty(6), force
@@ -386,8 +391,8 @@ def _at_places(parts, steps, places, centre, force):
 
 
 def _kernel(x_m: Float[np.ndarray, " q"], thickness_m: float) -> Float[np.ndarray, "q q"]:
-    # Effect of the base: 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk. For a half-space,
-    # w' + 2v = 3, so the kernel is 0.
+    # Return the kernel K(x, x') for the effect of the base: 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x)
+    # cos(k x') dk. For a half-space, w' + 2v = 3, so the kernel is 0.
     response = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
     missing = layer.KERNEL_W / thickness_m * (1 - (response.w_slope[0] + 2 * response.v[0]) / 3)
     waves = np.cos(np.outer(x_m, layer.KERNEL_KH / thickness_m))

@@ -28,7 +28,7 @@ class SkinDesign(Strict):
     """Section `skin` of the settings: the design of all skins of a scene, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # whether the magnetisation is reversed, which equals a rotation of a checkerboard skin by 90 degrees
+    flipped: bool  # whether the magnetisation is reversed, as by a rotation of a checkerboard skin by 90 degrees
     base: layer.Base
     # How a finite skin slides on its base. None: the skin is an infinite layer that does not slide (see `layer.force`).
     hold: slide.HoldDesign | None
@@ -136,9 +136,9 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """Yield, for each indentation in contact, its index, and the dipoles that it moves before and after the motion.
+    """For each indentation in contact, yield its index and the dipoles that it moves, before and after the motion.
 
-    `slid` is, for each indentation, the fraction of the skin's rigid motion that takes place (default: 1). The caller
+    `slid` is the fraction of the skin's rigid motion that takes place during each indentation (default: 1). The caller
     may displace the dipoles further before calling `change_of_field`.
     """
     true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
@@ -162,7 +162,7 @@ def moved_dipoles(
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
     """Return the rigid motion of the skin due to presses (x, y, true depth), limited by friction with the tip.
 
-    The displacement without this limit depends on the depth but not on the modulus. The limit depends on the force.
+    Without this limit, the displacement depends on the depth but not on the modulus. The limit depends on the force.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
@@ -207,8 +207,8 @@ def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # Return the local variation of the magnetisation, a smooth random factor: the exponential of a sum of plane waves.
-    # The waves do not depend on the nodes, so that a finer quadrature samples the same skin.
+    # Return the local variation of the magnetisation: a smooth random factor, which is the exponential of a sum of
+    # plane waves. The waves do not depend on the nodes, so that a finer quadrature samples the same skin.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

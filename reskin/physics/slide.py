@@ -2,12 +2,13 @@
 
 The base is modelled as evenly distributed, isotropic springs that hold the whole skin. Therefore, the rigid motion of
 the skin follows from the displacement of the material under the tip (for a press) or from the tangential force (for a
-drag). Friction between tip and skin limits the motion, which vanishes with the normal force (`limit_by_friction`).
+drag). Friction between tip and skin limits the motion, so that there is no motion without normal force
+(`limit_by_friction`).
 
-The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), because the layer stiffens as
-it thins: for a skin of 2 mm, by a factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm. This factor and the displacement due to a
-press are empirical. They were fitted to two recorded boards (scene lab), whose data the elastic layer alone does not
-describe.
+The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), with depth d and thickness h,
+because the layer stiffens as it becomes thinner. For a skin of 2 mm, this factor is 1.2 at a depth of 0.2 mm and 4.0 at
+1.2 mm. The factor and the displacement due to a press are empirical. They were fitted to two recorded boards (scene
+lab), whose data the elastic layer alone does not describe.
 """
 
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ from reskin.physics.magnet import Dipoles
 STIFFENING = 1.5  # exponent, from the two recorded boards; values from 1.25 to 2 fit their data equally well
 DEEPEST = 0.72  # greatest depth of `depth_at`, as a fraction of the thickness
 CENTRE_M = np.zeros(2)
-CURVE_N = 2000  # number of points of the inverse force curve, in which d is interpolated linearly in F^(2/3) (Hertz)
+CURVE_N = 2000  # number of points of the inverse force curve, which is linear in force^(2/3) between points (Hertz)
 
 
 class HoldDesign(Strict):
@@ -84,8 +85,8 @@ def press_displacement_m(
 ) -> Float[np.ndarray, "n 2"]:
     """Return the displacement of the material under a tip that does not slip: give - away (1 - load) p.
 
-    p is the place relative to the skin's centre. The second term displaces the material towards the centre. `load` is
-    the force divided by the force at which this term vanishes. A light press causes only a fraction of this
+    p is the place relative to the skin's centre. The term with `away` displaces the material towards the centre. `load`
+    is the force divided by the force at which this term vanishes. A light press causes only a fraction of this
     displacement (see `limit_by_friction`).
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
@@ -94,9 +95,9 @@ def press_displacement_m(
 def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], grip_N_per_m: float) -> RigidMotion:
     """Reduce rigid motions to those that Coulomb friction can cause at these normal forces F.
 
-    A displacement u of the skin needs the lateral force k |u|, but friction exerts at most mu F. The motion is
-    multiplied by 1 - exp(-mu F / (k |u|)). With this factor, the lateral force is always below mu F, and the motion
-    is complete for a strong press. `grip_N_per_m` is k / mu.
+    A displacement u of the skin needs the lateral force k |u|, where k is the stiffness of the base's springs, but
+    friction exerts at most mu F. The motion is therefore multiplied by 1 - exp(-mu F / (k |u|)). With this factor, the
+    lateral force is always below mu F, and the motion is complete for a strong press. `grip_N_per_m` is k / mu.
     """
     with np.errstate(invalid="ignore"):  # inf * 0 is NaN, if both motion and friction are 0
         needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
@@ -111,7 +112,7 @@ def compliance_m_per_N(
 ) -> Float[np.ndarray, "n 2 2"]:
     """Return the displacement of the skin at each place per lateral force at the same place.
 
-    The compliance matrix is (I + q q^T / rho^2) / k, with q and rho as in `rigid_motion`.
+    The compliance matrix is (I + q q^T / rho^2) / k, with q and rho as in `rigid_motion` and k = `springs_N_per_m`.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     rotational = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
@@ -121,11 +122,12 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """Return for each place the rigid motion that displaces it by D with the least elastic energy of the base.
+    """For each place, return the rigid motion with the least elastic energy of the base that displaces the place by D.
 
-    D is `displacement_m`. A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The
-    solution is f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is
-    the mean of r^2 over the skin.
+    D is `displacement_m`. A rigid motion displaces the point X by u(X) = f + theta z x X, where z is the unit vector
+    along z. The condition is u(p) = D at the place p. The solution is f = (I + q q^T / rho^2)^-1 D and theta = q.f /
+    rho^2, where q = z x p. The length rho is given by rho^2 = (a^2 + b^2) / 12, the mean of r^2 over a skin with sides
+    a and b.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
@@ -154,7 +156,7 @@ def apply_in_place(
     positions_m, moments_A_m2 = dipoles
     cos, sin = float(np.cos(motion.spin_rad[i])), float(np.sin(motion.spin_rad[i]))
     (x_m, y_m), (centre_x_m, centre_y_m) = motion.move_m[i], centre_m
-    # R (X - centre) + centre + move
+    # A point X moves to R (X - centre) + centre + move, with the rotation matrix R.
     move_m = x_m + (1 - cos) * centre_x_m + sin * centre_y_m, y_m + (1 - cos) * centre_y_m - sin * centre_x_m
     _turn(positions_m.T, (cos, sin), move_m)
     _turn(moments_A_m2.T, (cos, sin), (0.0, 0.0))

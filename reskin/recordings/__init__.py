@@ -1,6 +1,7 @@
-"""Captures on disk, readers of other layouts, the probe log, labels, clocks, and ingestion into readings."""
+"""Recordings: captures on disk, readers of other layouts, probe logs, labels, clocks, and conversion to readings."""
 
 from typing import Literal
 
-# Layouts that have a reader in `readers`. Defined here, because `reskin --help` lists them and must not import readers.
+# Layouts that have a reader in `readers`. They are listed here, because `reskin --help` shows them without importing
+# the readers.
 ReaderLayout = Literal["table", "lab", "ini", "eflesh", "eflash7", "leaphand"]

@@ -56,9 +56,9 @@ def render(arrivals: Arrivals) -> str:
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
     """Return the time of each frame's last byte, interpolated linearly between the ends of chunks.
 
-    Apart from the delay in the port's buffer, a byte arrived after the previous chunk was read and before its chunk was
-    read, so the error is less than the time between these two reads. In the first chunk, times are extrapolated at the
-    stream's mean rate. The time of a frame after the last chunk is NaN.
+    Apart from the delay in the port's buffer, a byte arrived after the previous chunk was read and before its own chunk
+    was read. Therefore, the error is less than the time between these two reads. In the first chunk, times are
+    extrapolated at the stream's mean rate. The time of a frame after the last chunk is NaN.
     """
     byte_end, t_s = arrivals.byte_end, arrivals.t_s
     s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
@@ -69,43 +69,50 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
     """Return the time of each frame in s from the start of a stream with a constant frame rate.
 
-    `frame` is the position of each frame's end in the stream, in frames. If all frames have the same length, it is the
-    number of bytes up to the frame's end, divided by this length, so that damaged bytes also take time. Otherwise, it
-    is the number of the frame, from 1. Frames that were lost before the stream was saved make later times too early.
+    `frame` is the position of each frame's end in the stream, in units of frames. If all frames have the same length,
+    this position is the number of bytes up to the frame's end, divided by the length, so that damaged bytes also take
+    time. Otherwise, it is the number of the frame, from 1. If frames were lost before the stream was saved, all later
+    times are too early.
     """
     return frame / rate_hz
 
 
-# Maximum deviation of a clock's fitted rate from 1. Real deviations are some per cent, if the nominal frame rate is
-# inaccurate. A larger deviation means that a mark is in milliseconds, or that its two times belong to different events.
+# Maximum deviation of a clock's fitted rate from 1. Real deviations are a few per cent, because the nominal frame rate
+# may be inaccurate. A larger deviation means that a mark is in milliseconds, or that its two times belong to different
+# events.
 RATE_LIMIT = 0.1
 
-# To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for its first
-# SEARCH_STEPS_N steps; `_follow` then finds one offset per window of WINDOW_STEPS_N steps; a line is fitted to these.
-STEPS_PER_DWELL_N = 16  # steps in the median contact dwell (a "dwell length")
-STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
-SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm adds up to 0.2 dwell lengths
+# To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for the first
+# SEARCH_STEPS_N steps. Then `_follow` finds one offset per window of about WINDOW_STEPS_N steps. Finally, `_line` fits
+# a line to the offsets of the windows.
+STEPS_PER_DWELL_N = 16  # number of steps in the median contact dwell, which is called a dwell length below
+STEPS_MAX_N = 2**27  # maximum length of a stream: 128 MB, or 1e6 indentations of 8 dwell lengths each
+SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm accumulates to 0.2 dwell lengths
 WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
-# Minimum fraction of dwell time that agrees with the field. The fraction is 1 if every dwell agrees, and 0 on average
-# for a random offset.
+# Minimum match between dwells and field, as a fraction of the largest possible match. The fraction is 1 if the field
+# agrees with every dwell. For a random offset, it is 0 on average.
 EXPLAINED_MIN = 0.5
-# The best offset must match this many more indentations than every other offset. An offset that is wrong by one period
-# of a periodic protocol matches one indentation less, and one contact may be too weak to detect.
+# The best offset must match this many more indentations than every other offset. The number exceeds 1, because an
+# offset that is wrong by one period of a periodic protocol matches only one indentation less, and one contact may be
+# too weak to detect.
 MARGIN_MIN = 1.5
-# Minimum overlap of stream and dwells, relative to the largest overlap at any offset: the few dwells of a small overlap
-# can fit by chance.
+# Minimum overlap of stream and dwells, relative to the largest overlap at any offset. If the overlap is small, its few
+# dwells can fit by chance.
 OVERLAP_MIN = 0.5
-# The top of a peak can be flat, so the position of the peak is the middle between its flanks at 5 % below the top.
+# A peak of the match can have a flat top. Its position is therefore the middle between the two points where the match
+# has dropped to 5 % below the top.
 PEAK_DROP = 0.05
-# Contact threshold for the distance of a frame from the no-load field, as a multiple of the median distance of frames
-# without contact. For 15 channels, the threshold is 2.7 standard deviations of these distances above their median.
+# Contact threshold for the distance of a frame's field from the no-load field, as a multiple of the median distance of
+# frames without contact. For 15 channels, the threshold is 2.7 standard deviations of these distances above their
+# median.
 AWAY_NOISES = 1.5
-STRETCH_PERIODS_N = 32  # the no-load field is updated once per stretch; a stretch has this many indentations
+# the no-load field is updated once per stretch of the stream; a stretch has this many indentations
+STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
 REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
 _REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S (the times of one event on the two clocks)."
 
-# Stream times [f] and fields in uT [f ch]; the axes are not named, because f differs from block to block.
+# Stream times [f] and fields in uT [f ch]. The annotations do not name the axes, because f differs from block to block.
 Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 
 
@@ -113,9 +120,9 @@ Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 class ClockMap:
     """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
-    `residual_s` is the largest misfit of the sync marks (or of the windows) to which the line was fitted. `explained`
-    states how well the dwells coincide with contacts in the field: 1 if all of them do, 0 on average for a random
-    offset. It is 1 if marks were given.
+    `residual_s` is the largest misfit of the sync marks, or of the windows, to which the line was fitted. `explained`
+    states how well the dwells coincide with contacts in the field. It is 1 if all dwells coincide or if marks were
+    given, and on average 0 for a random offset.
     """
 
     offset_s: float
@@ -131,7 +138,7 @@ class ClockMap:
 def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
     """Fit the clock map to sync marks, one row (stream time, probe time) each.
 
-    A single mark determines the offset, with a rate of 1; several marks also determine the rate.
+    A single mark determines only the offset, and the rate is 1. Several marks also determine the rate.
     """
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
@@ -172,7 +179,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
 
 
 class _Pattern:
-    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with equal total weights."""
+    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with a sum of zero."""
 
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
@@ -182,13 +189,13 @@ class _Pattern:
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
         # Fraction of the time without contact.
         self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
-        scaled = len(firsts) * weight * dwell_s  # so that one indentation has weight 1
+        scaled = len(firsts) * weight * dwell_s  # scaled so that one indentation has weight 1
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
         self._signed = _running(np.where(log.contact, scaled, -scaled))
         self._unsigned = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the weights of `steps_n` steps of probe time: contact > 0, no-load < 0, between dwells 0."""
+        """Return the weights of `steps_n` steps of probe time; they are 0 between dwells."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
     def unsigned(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
@@ -203,19 +210,19 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Return the offset (probe time minus stream time, in s) that fits best; raise if another fits about as well."""
+    """Return the best offset (probe time minus stream time, in s); raise if another offset fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
     samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
     weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
     overlap = _correlate(unsigned, np.abs(samples))
-    # The score is the match minus the match of a barely acceptable fit. Without the second term, an offset could
-    # compensate for a mismatched dwell by a larger overlap with the log.
+    # The score is the match minus the match of a barely acceptable fit with the same overlap. Without the second term,
+    # an offset with a larger overlap could have a higher score despite a mismatched dwell.
     score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
     score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[elsewhere].max(initial=0.0)
-    # The overlap minus the match, in indentations; a dwell with the wrong sign counts twice.
+    # The overlap minus the match, in indentations. A dwell in which the signal has the wrong sign counts twice.
     unexplained = (1 - EXPLAINED_MIN) * overlap[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
@@ -230,7 +237,8 @@ def _follow(
 ) -> tuple[float, float, float]:
     """Find the best shift in s of a window of the contact signal, which is expected to begin at `probe_s`.
 
-    Also returns the window's match with the pattern, and its overlap with the dwells: the largest possible match.
+    Also returns the window's match with the pattern, and the window's overlap with the dwells, which is the largest
+    possible match.
     """
     reach_n = int(pattern.period_s / step_s) // 2 + 1
     begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
@@ -246,7 +254,7 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
     This replaces scipy.signal.correlate, whose import takes a second.
     """
-    from scipy.fft import irfft, next_fast_len, rfft  # imported late: only captures without clock marks need it
+    from scipy.fft import irfft, next_fast_len, rfft  # imported late, because only captures without clock marks need it
 
     lags_n = len(signal) + len(window) - 1
     size = next_fast_len(lags_n, real=True)
@@ -279,7 +287,7 @@ def _contact_signal(
             rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
             raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
         first_i, index_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
-        # A step with several frames takes the sign of their majority.
+        # The sign of a step with several frames is that of the majority of these frames.
         parts.append((first_i, np.sign(np.bincount(index_i, np.where(contact, 1, -1))).astype(np.int8)))
     if start_s is None:
         raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
@@ -292,17 +300,17 @@ def _contact_signal(
 def _detect_contact(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Yield times, and for each frame whether its field differs from the current no-load field by more than noise.
+    """Yield times, and for each frame whether its field differs from the no-load field by more than noise.
 
-    The no-load field is updated in each stretch of frames. The probe log gives the fraction of time without contact. It
-    is assumed that this fraction of the frames, those nearest to the previous no-load field, are without contact. The
-    nearer half of these frames gives the new no-load field and the noise.
+    The no-load field is updated in each stretch of frames. The probe log gives the fraction of time without contact.
+    This fraction of the frames, namely those with the smallest distance from the previous no-load field, is assumed to
+    be without contact. The half of these frames with the smaller distances gives the new no-load field and the noise.
     """
     noload_uT, noise_uT = None, np.inf
     for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
         if noload_uT is None:
             noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
-        # Do not update the no-load field from a short stretch, which may consist of contact only.
+        # Do not update the no-load field from a short stretch, because all its frames may be in contact.
         if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:
             sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
             distance_uT = np.linalg.norm(sample - noload_uT, axis=1)
@@ -325,8 +333,9 @@ def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
 def _line(
     stream_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
-    """Fit the clock map to offsets (probe time minus stream time) by least squares; one offset gives a rate of 1."""
-    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision: clocks may count from 1970
+    """Fit the clock map to offsets (probe time minus stream time) by least squares; with one offset, the rate is 1."""
+    # the times are centred for precision, because clocks may count from 1970
+    mid_s, mean_s = stream_s.mean(), offset_s.mean()
     spread_s2 = ((stream_s - mid_s) ** 2).sum()
     slope = float(((stream_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(stream_s) > 1 else 0.0
     residual_s = float(np.abs(offset_s - mean_s - slope * (stream_s - mid_s)).max())

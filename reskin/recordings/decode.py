@@ -44,7 +44,8 @@ def read_frames(
     if np.isfinite(device_s).all():
         t_s = device_s.astype(np.float64)
     else:
-        frame_bytes_n = record_type("binary", chips_n).itemsize  # a text frame is longer than a binary frame
+        # a text frame is longer than this, so a frame of this length shows that the format is binary
+        frame_bytes_n = record_type("binary", chips_n).itemsize
         is_binary = (np.diff(end_byte, prepend=0) == frame_bytes_n).any()
         t_s = clocks.constant_rate(end_byte / frame_bytes_n if is_binary else 1.0 + np.arange(len(table)), rate_hz)
     return t_s, np.stack(values[: 3 * chips_n], axis=1), np.stack(values[3 * chips_n : -2], axis=1)

@@ -1,6 +1,7 @@
 """Policy for each kind of fault: drop the faulty readings, flag them (keep and count), or refuse the recording.
 
-`FaultLog` applies the policy to a stream in portions, `check_rows` to a whole table; both count the faults.
+`FaultLog` applies the policy to a stream that arrives in portions, and `check_rows` applies it to a whole table. Both
+count the faults.
 """
 
 import math
@@ -27,8 +28,8 @@ from reskin.errors import CaptureError, ParamsError, did_you_mean
 USUAL_LSB = "that of the other chips, and not that of a reset chip"
 
 Action = Literal["drop", "flag", "refuse"]
-DropOrRefuse = Literal["drop", "refuse"]  # for bytes between frames, which cannot be kept
-FlagOrRefuse = Literal["flag", "refuse"]  # for faults without a faulty reading that could be dropped
+DropOrRefuse = Literal["drop", "refuse"]  # actions for stray bytes between frames, which cannot be kept
+FlagOrRefuse = Literal["flag", "refuse"]  # actions for faults that have no faulty reading that could be dropped
 
 
 class FaultPolicy(Strict):
@@ -38,8 +39,8 @@ class FaultPolicy(Strict):
     zeros: Action  # zeros in place of a reading
     stuck: Action  # the readings of a chip stay the same while others change
     constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
-    chip_reset: FlagOrRefuse  # a chip's LSB differs from that of the other chips, or changes
-    too_hot: Action  # a chip's temperature is out of range (too hot or too cold)
+    chip_reset: FlagOrRefuse  # a chip's LSB changes, or differs from the LSB of the other chips
+    too_hot: Action  # a chip's temperature is out of range: too hot or too cold
     saturated: Action  # field at the end of the chip's range
     int16_wrap: Action  # field jumps by more than the range of int16
     repeated: Action  # many frames equal the previous frame; a few are normal if the firmware reads fast
@@ -51,8 +52,8 @@ class FaultPolicy(Strict):
 
 
 REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
-# A policy that never refuses a recording, to test whether the recording can be read. The first possible action of each
-# fault is the mildest one.
+# A policy that never refuses a recording, to test whether the recording can be read. For each fault, it takes the first
+# possible action, which is the mildest.
 REFUSE_NONE = FaultPolicy.model_validate(
     {name: get_args(field.annotation)[0] for name, field in FaultPolicy.model_fields.items()}
 )
@@ -67,7 +68,7 @@ STANDARD_POLICY = FaultPolicy(
 
 
 def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> FaultPolicy:
-    """Change the actions of some faults by texts `NAME=ACTION`; `where` names the command-line option in errors.
+    """Change the actions for some faults, given as texts `NAME=ACTION`; errors name the command-line option `where`.
 
     >>> override(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
@@ -93,8 +94,8 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 class FaultRecord:
     """Number of times a fault occurred, its first and last position (stream time in s, or row), and the action taken.
 
-    The positions are NaN as long as no faulty frame has a known time: the last bytes before a recorder was killed may
-    have no time.
+    The positions are NaN if no faulty frame has a known time. This happens if the recorder was killed, because the last
+    bytes then may have no time.
     """
 
     count_n: int
@@ -148,8 +149,8 @@ class FaultLog:
     ) -> Bool[np.ndarray, " f"]:
         """Record the rows (or frames) that `mask` marks as faulty; return the mask of the rows that the policy drops.
 
-        `position` is the time in s or the number of each row. The fault is counted `count_n` times; None: once per
-        marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
+        `position` is the time in s or the number of each row. The fault is counted `count_n` times or, if this is None,
+        once per marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         action: Action = getattr(self._policy, fault)
         if mask.any():
@@ -195,7 +196,7 @@ class FaultLog:
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
         """Record the faults that can be detected from a single reading.
 
-        Returns two masks of rows to drop: rows with a failed read, and other rows with a reading that is out of range.
+        Returns two masks of rows to drop: the rows with a failed read, and the other rows with a reading out of range.
         """
         failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
         dropped = self.record("failed_read", failed, position) | self.record("zeros", zeros & ~failed, position)
@@ -233,7 +234,7 @@ class FaultLog:
     ) -> None:
         """Record channels that never changed in a whole recording; raise `CaptureError` if the policy refuses this.
 
-        `position` is the position of each reading; None: the first and the last time of the stream.
+        `position` is the position of each reading. If it is None, the first and the last time of the stream are used.
         """
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
@@ -268,11 +269,11 @@ def check_rows(
 ) -> CheckedRows:
     """Find the faults of a whole table of readings, and decide which rows to keep.
 
-    The LSB is checked on all rows without a failed read, whether they are kept or not.
+    The LSB is checked in all rows without a failed read, including rows that are not kept.
 
     Parameters
     ----------
-    row : number of each row in its file, if some rows of the file are missing here; None: rows are counted from 1.
+    row : number of each row in its file, if some rows of the file were left out; None: rows are counted from 1.
 
     Raises
     ------

@@ -38,8 +38,8 @@ class _Frozen(BaseModel):
 class Clock(_Frozen):
     """Source of frame times: the file arrivals.csv, a constant rate, or the recording's own files (`recording`).
 
-    `marks` are pairs (stream time, probe time) in seconds, each for one event that both clocks recorded. Without marks,
-    ingestion aligns the clocks by the contacts.
+    `marks` are pairs (stream time, probe time) in seconds; each pair belongs to one event that both clocks recorded.
+    Without marks, ingestion aligns the clocks by the contacts.
     """
 
     kind: Literal["arrivals", "rate", "recording"]
@@ -64,7 +64,8 @@ class Firmware(_Frozen):
 class Rate(_Frozen):
     """Frame rate and repeated readings, as the recorder measured them; see `reskin.board.rates.RateMeasurement`.
 
-    `sent_hz` is the rate by the board's clock (`method` is `clock`) or, without such a clock, the rate of arrival.
+    `sent_hz` is the rate according to the board's clock (`method` is `clock`) or, if the board sends no time, the rate
+    of arrival.
     """
 
     sent_hz: Annotated[float, Field(gt=0)]
@@ -77,7 +78,8 @@ class Rate(_Frozen):
 class Header(_Frozen):
     """The header of a capture. All fields except `rate` must be present in the file.
 
-    Captures that were recorded before rates were measured, or in another program, have no `rate`.
+    A capture has no `rate` if it was recorded by another program, or by a version of this program that did not measure
+    rates.
     """
 
     format: Literal["reskin-capture/1"]
@@ -125,7 +127,7 @@ def parse(text: str, where: str) -> Header:
 
 
 def make_header(where: str, **fields: Any) -> Header:
-    """Create and check a header; fields that are not given suit a recording in a layout other than `native`."""
+    """Create and check a header; by default, its fields suit a recording in another layout than `native`."""
     defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
@@ -142,14 +144,14 @@ def render(header: Header) -> str:
 
 
 def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if the name of a capture folder differs from the name in its header, as after renaming the folder."""
+    """Raise if a capture folder has another name than its header states, for example after it was renamed."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
         raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename the folder.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
-    """Write the files of a capture, given as bytes or as paths to copy, and then its header with the files' hashes.
+    """Write the files of a capture (bytes, or paths to copy), and then the header with the hashes of these files.
 
     Returns the header that was written.
     """

@@ -1,6 +1,7 @@
-"""Convert a capture of any layout to readings, and count every lost or dropped byte, frame and row in an account.
+"""Convert a capture of any layout to readings, and count all lost or dropped bytes, frames and rows in an account.
 
-In native captures, frames are assigned to the dwells of the probe log by time, after the two clocks were aligned.
+In native captures, the clocks of the board and of the probe log are first aligned. Then frames are assigned to the
+dwells of the probe log by their times.
 """
 
 from collections import Counter
@@ -49,12 +50,12 @@ COUNTS = (
     "dropped_no_noload_indentations_n",
 )
 
-OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # a key of the account only if there are such frames
+OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # this key is in the account only if there are such frames
 
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames, the stream time of each (NaN: unknown for this frame and all later ones), and which frames to keep."""
+    """Frames, their stream times, and which frames to keep. After an unknown time (NaN), all times are unknown."""
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
@@ -82,7 +83,7 @@ class _DwellFrames:
 def join(
     blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
 ) -> Iterator[Readings]:
-    """Assign the frames of a stream to dwells, and yield the readings of each indentation that has ended.
+    """Assign the frames of a stream to dwells, and yield the readings of each indentation after it has ended.
 
     After the last readings, the counts of frames and indentations are added to `account`.
     """
@@ -107,7 +108,7 @@ class Joiner:
 
     def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
         self._log, self._clock, self._header = log, clock, header
-        begins = ~log.contact  # each indentation begins with its only no-load dwell
+        begins = ~log.contact  # because each indentation begins with its only no-load dwell
         self._group_i = np.cumsum(begins) - 1  # index of the indentation of each dwell
         touched = np.zeros(int(begins.sum()), np.int64)
         touched[self._group_i[log.contact]] = 1
@@ -123,14 +124,14 @@ class Joiner:
         if not len(known_s) or not len(pending.dwell_i):
             self._pending = pending
             return self._readings(self._empty())
-        # Times never decrease, so an indentation has ended once the time of a frame is in a later indentation.
+        # Times never decrease, so an indentation has ended when the time of a frame is in a later indentation.
         now_i = np.searchsorted(self._log.t_start_s, known_s[-1], "right") - 1
         ended_n = int(np.searchsorted(self._group_i[pending.dwell_i], self._group_i[now_i], "left"))
         self._pending = pending.where(slice(ended_n, None))
         return self._readings(pending.where(slice(0, ended_n)))
 
     def close(self) -> Readings:
-        """Return the readings of the last indentation, as far as it was recorded."""
+        """Return the readings of the last indentation, of which only a part may have been recorded."""
         pending, self._pending = self._pending, self._empty()
         return self._readings(pending)
 
@@ -204,7 +205,7 @@ class Joiner:
 def _means(
     b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
 ) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
-    """Return the mean field of each group of rows, and the index of the mean for each group number in `wanted_i`.
+    """Return the mean field of each group of rows, and for each group number in `wanted_i` the index of its mean.
 
     `group_i` is the group number of each row, in increasing order.
     """
@@ -222,17 +223,18 @@ def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
 
 
 BLOCK_BYTES_N = 2**22
-SPREAD_MAX_degC = 10.0  # maximum spread of the temperatures in a block, over time and the chips of a board
-# Key of a total, and prefix and suffix of the keys that count its losses.
+# maximum spread of the temperatures in a block of frames, over time and over the chips of a board
+SPREAD_MAX_degC = 10.0
+# Each entry has the key of a total, and the prefix and the suffix of the keys that count the losses of this total.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
     ("frames_n", "dropped_", "_frames_n"),
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# These do not count as losses: frames between dwells, frames of an indentation without a no-load dwell or without a
-# contact, and rows of zeros, which a recorder writes when it polls faster than the chips measure (layout `eflash7`
-# limits their number).
+# Keys that do not count as losses. These are frames between dwells, frames of an indentation without a no-load dwell or
+# without a contact, and rows of zeros. A recorder writes zeros when it polls faster than the chips measure; the reader
+# of layout `eflash7` limits their number.
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
@@ -240,7 +242,8 @@ NO_LOSS = (
     "dropped_zero_rows_n",
 )
 
-Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, number of earlier frames -> stream time of each
+# a function of frames and the number of earlier frames, which returns the stream time of each frame
+Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]
 
 
 class OpenedCapture(NamedTuple):
@@ -252,7 +255,7 @@ class OpenedCapture(NamedTuple):
 
 
 def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
-    """Check a capture's header and files, and begin to read it; `policy` decides what to do about faults."""
+    """Check a capture's header and files, and begin to read the capture; `policy` decides what happens to faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
@@ -281,7 +284,7 @@ def read_header(folder: Path) -> Header:
 
 
 def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
-    """Raise if a capture lost more than the fraction `limit` of its bytes, frames, rows or indentations."""
+    """Raise if a capture lost a fraction of more than `limit` of its bytes, frames, rows or indentations."""
     for total, prefix, suffix in LOSSES:
         lost = [key for key in account if key.startswith(prefix) and key.endswith(suffix) and key not in NO_LOSS]
         lost_n = sum(account[key] for key in lost)
@@ -294,7 +297,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
     """Return an iterator over the readings of a native capture, and the account (complete after the iteration).
 
-    Without sync marks, the stream is read twice, the first time to align the clocks.
+    Without sync marks, the stream is read twice: first to align the clocks, then to yield the readings.
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
@@ -347,9 +350,9 @@ def _timed_frames(
 
 
 def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
-    """Raise if the fault-free frames have wrong units or, in text formats, the columns of the other text format.
+    """Raise if the fault-free frames have wrong units or, in a text format, seem to be in the other text format.
 
-    Returns False if there are no fault-free frames, so nothing was checked.
+    Returns False if nothing was checked because there are no fault-free frames.
     """
     read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
     read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
@@ -358,7 +361,8 @@ def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
     b_uT, temperature_degC = frames.b_uT[read], frames.temperature_degC[read]
     if wire in TEXT_WIRES:
         other, axis = ("text-txyz", 0) if wire == "text-xyzt" else ("text-xyzt", 2)
-        swapped_degC = b_uT[:, axis::3]  # the temperatures, if the columns have the other order
+        # these are the temperatures if the columns have the order of the other text format
+        swapped_degC = b_uT[:, axis::3]
         (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
         is_swapped = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
         if not _mostly_possible(temperature_degC) or (is_swapped and _mostly_possible(swapped_degC)):
@@ -390,7 +394,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; raise if they list more bytes than the stream has, for example if the stream was truncated."""
+    """Read the arrivals; raise if they list more bytes than the stream has, for example because it was truncated."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

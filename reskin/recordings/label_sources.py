@@ -33,14 +33,15 @@ from reskin.recordings.labels import (
 class LabelContext:
     """The objects that a source of labels uses during a recording.
 
-    These are the writer of the probe log, the host's clock in unix seconds, the event that stops the recording, and a
-    function that sets the clock mark in the capture's header.
+    These are the writer of the probe log, this machine's clock in unix seconds, the event that stops the recording, and
+    a function that sets the clock mark in the capture's header.
     """
 
     writer: ProbeLogWriter
     unix_s: Callable[[], float]
     stop: threading.Event
-    mark: Callable[[float, float], object]  # takes an event's unix time and its time on the clock of the source
+    # called with the unix time of an event, and the event's time on the clock of the label source
+    mark: Callable[[float, float], object]
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
         """Wait for `dwell_s`, or until the recording stops; return a dwell that spans this time."""
@@ -54,7 +55,8 @@ class LabelSource(NamedTuple):
 
     name: str  # name of the source, for the capture's header
     scan: str | None  # order of the places
-    run: Callable[[LabelContext], str]  # writes labels until they end or the recording stops; returns a summary
+    # function that writes labels until they end or the recording stops, and returns a summary
+    run: Callable[[LabelContext], str]
 
 
 def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> LabelSource:
@@ -117,14 +119,14 @@ RANDOM, SNAKE = "random", "snake"
 
 @dataclass(frozen=True)
 class Places:
-    """Numbered places, (x, y) in mm, row by row; `row_n` is the number of places in a row."""
+    """Places (x, y) in mm, numbered row by row; `row_n` is the number of places in a row."""
 
     name: str
     xy_mm: Sequence[tuple[float, float]]
     row_n: int
 
     def order(self, scan: str, rng: np.random.Generator) -> list[int]:
-        """Return the numbers of all places in the order of a pass: random, or row by row, every other row backwards."""
+        """Return the numbers of all places in random order, or row by row with every other row backwards."""
         if scan == RANDOM:
             return [int(i) for i in rng.permutation(len(self.xy_mm))]
         rows = [list(range(first, first + self.row_n)) for first in range(0, len(self.xy_mm), self.row_n)]
@@ -132,7 +134,7 @@ class Places:
 
 
 def parse_places(text: str) -> Places | None:
-    """Parse `line:N:STEP_MM` (along x) or `grid:NXxNY:STEP_MM`; both may end in `@X_MM,Y_MM`, the first place.
+    """Parse `line:N:STEP_MM` (along x) or `grid:NXxNY:STEP_MM`; `@X_MM,Y_MM` at the end sets the first place.
 
     >>> parse_places("line:3:2@0,8").xy_mm
     [(0.0, 8.0), (2.0, 8.0), (4.0, 8.0)]
@@ -150,11 +152,11 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a clock mark is replaced if the delay of the new mark is shorter by more than this
+BETTER_s = 0.005  # a clock mark is replaced by a new mark if the new delay is shorter by more than this
 
 
 def from_table(file: Path) -> LabelSource:
-    """Take labels from a CSV file to which a robot's program appends rows; skip rows older than the recording."""
+    """Take labels from a CSV file to which a robot's program appends rows; skip rows written before the recording."""
 
     def run(context: LabelContext) -> str:
         table, dwells, least_delay_s = SampleTable(str(file)), DwellBuilder(), math.inf
@@ -164,7 +166,8 @@ def from_table(file: Path) -> LabelSource:
                 if not samples or not is_new:
                     continue
                 delay_s = arrival_s - samples[-1].t_s if table.clock == "t_s" else least_delay_s
-                # Rows are read with a delay, so the mark with the shortest delay is the most accurate.
+                # Rows are read some time after they were written, so the mark with the shortest delay is the most
+                # accurate.
                 if delay_s < least_delay_s - BETTER_s:
                     least_delay_s = delay_s
                     context.mark(arrival_s, samples[-1].t_s)
@@ -183,7 +186,8 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
 def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
     """Yield the content of a file, then all data that is appended to it, until `stop` is set.
 
-    Each chunk comes with a flag: whether it was written after the call. If the file does not exist, wait for it.
+    Yields pairs of a chunk and a flag, which states whether the chunk was written after the call. If the file does not
+    exist, wait for it.
     """
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
@@ -231,7 +235,7 @@ class ForceGauge:
     def during(self, start_s: float, end_s: float) -> Label:
         """Return a label with the mean force between two times.
 
-        If the gauge sent no sample in this time, the force is NaN, and a contact without force is counted.
+        If the gauge sent no sample in this time, the force is NaN, and the contact is counted as one without force.
         """
         labels = [sample.label for sample in list(self._kept) if sample.label and start_s <= sample.t_s <= end_s]
         self._without_force_n += not labels
@@ -245,7 +249,7 @@ class ForceGauge:
 
     @contextmanager
     def listening(self, context: LabelContext) -> Iterator[None]:
-        """Read the gauge in a thread during the `with` block; raise `CaptureError` if the port cannot be opened."""
+        """Read the gauge in a thread during the `with` block; raise `CaptureError` if its port cannot be opened."""
         with open_port(self.port, self._baud) as device:
             thread = threading.Thread(target=self._listen, args=[device, context], daemon=True)
             thread.start()
@@ -262,7 +266,7 @@ class ForceGauge:
             self._problem = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
-        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged earlier."""
+        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged before."""
         while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
@@ -291,19 +295,19 @@ def from_gauge(port: str, baud: int) -> LabelSource:
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
-# A place, a force, or both, separated by a space; without the space, 12N could be place 1 with 2 N.
+# A place, a force, or both, separated by a space. The space is needed, because 12N could also mean place 1 with 2 N.
 REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Prompts:
-    """Prompt a person to press one place after another, and to press the Enter key when the tip does not move."""
+    """Ask a person to press one place after another, and to hit the Enter key while the tip does not move."""
 
     places: Places
     dwell_s: float
     say: Say
-    lines: Callable[[], Iterable[str]]  # returns the lines that the person types
+    lines: Callable[[], Iterable[str]]  # function that returns the lines that the person types
     forces: ForceGauge | None
     rng: np.random.Generator
     scan: str = RANDOM
@@ -342,7 +346,7 @@ class Prompts:
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
         """Return the label that a person types for a press; None if the person ends the recording.
 
-        For a skipped place, the label is without contact.
+        For a skipped place, the label is one without contact.
         """
         for line in typed:
             match = REPLY.fullmatch(line)
@@ -365,7 +369,7 @@ class Prompts:
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:
-    """Yield typed lines, stripped, until they end or `stop` is set; a thread waits for the input."""
+    """Yield typed lines without surrounding spaces until they end or `stop` is set; a thread waits for the input."""
     typed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def read() -> None:

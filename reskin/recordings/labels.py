@@ -1,4 +1,4 @@
-"""Labels during a recording: combine samples of a table or a force gauge into dwells, and write them to `probe.csv`.
+"""Labels during a recording: combine samples of a table or a force gauge into dwells; write dwells to `probe.csv`.
 
 The sources of labels are in `label_sources`.
 """
@@ -21,22 +21,23 @@ from reskin.recordings.units import SAME_PLACE_mm
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # resolution of the written times
-TIME_MAX_s = 1e11  # unix time in seconds is below this for 3,000 years; in milliseconds, it is above
-CLOCKS = ("unix_s", "t_s")  # time on this machine's clock, or on the clock of the source
+TIME_MAX_s = 1e11  # unix time in seconds stays below this value for 3,000 years; unix time in milliseconds is above it
+CLOCKS = ("unix_s", "t_s")  # column names of the time: on this machine's clock, or on the clock of the label source
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
 CONTACT_N = 0.05  # assumed: a force of this or more is a contact; it is above the noise of a gauge
-NOLOAD_N = 0.025  # below this, there is no contact; from this to CONTACT_N, a contact may be beginning or ending
-# Assumed limits of a dwell. A longer contact is split into several dwells, and each dwell has a separate mean force.
+# below this force, there is no contact; between it and CONTACT_N, a contact may be beginning or ending
+NOLOAD_N = 0.025
+# Assumed limits of a dwell. A longer contact is split into several dwells, each with its own mean force.
 DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5
-DWELL_SAMPLES_MAX_N = 10_000  # limits the memory if the clock of the source has stopped
+DWELL_SAMPLES_MAX_N = 10_000  # limits the memory if the clock of the label source has stopped
 LINE_BYTES_MAX_N = 4096
 GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # number of values in a gauge's line -> their names
 
 
 class Label(NamedTuple):
-    """The label of a dwell, during which nothing moves; unknown numbers are NaN.
+    """The label of a dwell, a time in which nothing moves; unknown numbers are NaN.
 
-    Forces have the signs of `reskin.schema`: forces on the skin, `Fz_N` positive in compression.
+    Forces have the signs of `reskin.schema`: they are forces on the skin, and `Fz_N` is positive in compression.
     """
 
     contact: bool
@@ -58,10 +59,10 @@ class Dwell(NamedTuple):
 
 
 class ProbeLogWriter:
-    """Write the probe log of a recording as labels arrive, each contact together with the no-load dwell before it.
+    """Write the probe log of a recording as labels arrive; write a contact together with the no-load dwell before it.
 
-    Therefore, even a killed recorder leaves a log that `probe.parse` accepts. Contacts that `probe.parse` would refuse
-    are not written, but counted.
+    Therefore, `probe.parse` accepts the log even if the recorder is killed. Contacts that `probe.parse` would refuse
+    are counted and not written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -88,7 +89,7 @@ class ProbeLogWriter:
     def write(self, dwell: Dwell) -> None:
         """Write a dwell with contact; store a dwell without contact until the next contact.
 
-        A contact may continue over several dwells at one place. A contact at another place must follow a no-load dwell.
+        A contact may consist of several dwells at one place. A no-load dwell must precede a contact at another place.
         """
         _check(dwell)
         with self.locked() as is_open:
@@ -108,7 +109,7 @@ class ProbeLogWriter:
             self.write(dwell)
 
     def _append(self, touch: Dwell) -> None:
-        is_new = self._noload is not None  # otherwise, the dwell continues a touch
+        is_new = self._noload is not None  # if not, the dwell continues the latest touch
         self._touch = touch.label if is_new else self._touch
         indentation = self._indentation + is_new
         pass_i = touch.label.pass_i
@@ -119,7 +120,7 @@ class ProbeLogWriter:
 
 
 def same_place(a: Label, b: Label) -> bool:
-    """Return whether two labels have the same place; a coordinate that is unknown in both counts as equal."""
+    """Return whether two labels have the same place; a coordinate that is unknown in both labels counts as equal."""
     return all(
         abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
         for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))
@@ -249,7 +250,7 @@ class DwellBuilder:
 
     def __init__(self) -> None:
         self._run: list[Sample] = []
-        self._cut: Sample | None = None  # last sample before a contact was cut, if the contact may continue
+        self._cut: Sample | None = None  # last sample of the dwell that was cut off last, if its contact may continue
         self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
@@ -259,7 +260,8 @@ class DwellBuilder:
             if run and not _continues(run[0], run[-1], sample):
                 yield from self.close()
             if sample.label is not None:
-                if len(self._run) > 1 and not sample.label.contact:  # without contact, keep only first and last sample
+                # without contact, keep only the first and the last sample
+                if len(self._run) > 1 and not sample.label.contact:
                     self._run.pop()
                 self._run.append(sample)
                 if sample.label.contact and (self._lasts_s() >= DWELL_MAX_s or len(self._run) >= DWELL_SAMPLES_MAX_N):
@@ -267,7 +269,7 @@ class DwellBuilder:
                     self._cut = sample
 
     def close(self) -> Iterator[Dwell]:
-        """Yield the dwell of the samples since the last dwell, if they span at least `DWELL_MIN_s`."""
+        """Yield a dwell of the samples since the last dwell, if these samples span at least `DWELL_MIN_s`."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
         is_remainder = bool(run) and self._cut is not None and _continues(self._cut, self._cut, run[0])
         self._cut = None
@@ -279,7 +281,7 @@ class DwellBuilder:
     def summary(self) -> str:
         """Describe how many contacts were too short for a dwell; return "" if there are none.
 
-        In a table with rows only at the start and end of contacts, all contacts are too short.
+        If a table has rows only at the start and the end of contacts, all contacts are too short.
         """
         if not self.short_n:
             return ""

@@ -39,7 +39,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
 
 
 def _read_capture(folder: Path) -> sd_card.Log:
-    """Read the frames of a capture; drop frames after the last recorded arrival time, because they have no time."""
+    """Read the frames of a capture; drop frames after the last recorded arrival, because their times are unknown."""
     header = read_header(folder)
     if header.layout == "sd-card":
         return sd_card.read_log(folder / LOG_FILE)
@@ -72,7 +72,7 @@ def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
 
 
 def _hint(path: Path, *, frames: bool) -> str:
-    """Return advice for a recording that cannot be loaded; "" if there is none."""
+    """Return advice for a recording that cannot be loaded; "" if there is no advice."""
     layouts = [layout for layout in layouts_of(path) if layout != "table"]
     if layouts == ["capture"]:
         return "" if frames else "To load the frames without labels, try: frames=True"
@@ -82,7 +82,7 @@ def _hint(path: Path, *, frames: bool) -> str:
 
 
 def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
-    names_of: Mapping[str, str] = {}  # column -> the name that all rows have
+    names_of: Mapping[str, str] = {}  # text column -> the value that all its rows have
     if path.is_dir():
         header = read_header(path)
         is_log = header.layout == "sd-card" or (header.layout == "native" and not (path / PROBE_FILE).is_file())
@@ -102,7 +102,7 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
 
 
 def _kind_of(file: Path) -> str:
-    """Return the kind of a file by its column names: `table`, `ingested`, or `log` for all others."""
+    """Return the kind of a file by its column names: `table`, `ingested`, or `log` for all other names."""
     if not file.is_file():
         raise CaptureError(f"{file}: file not found. Check the path.")
     with file.open("rb") as stream:

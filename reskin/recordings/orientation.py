@@ -2,8 +2,8 @@
 
 Boards of one scene give similar readings for similar presses, so the place of a press can be estimated from the most
 similar presses of other captures. If these estimates agree with the labels only after the labels are rotated or
-mirrored, the labels of this capture or of the others are probably wrong. Nothing is assumed about the board, so a
-single capture cannot be checked.
+mirrored, the labels of this capture or of the other captures are probably wrong. This method assumes nothing about the
+board, so it cannot check a single capture.
 """
 
 from collections.abc import Iterable
@@ -15,8 +15,8 @@ from jaxtyping import Float
 from reskin.schema import Readings
 
 PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
-EXPLAINED_MIN = 0.5  # fraction of the looked-up places' variance that another orientation must explain
-GAIN_MIN = 0.5  # by how much this fraction must exceed the fraction that the unchanged labels explain
+EXPLAINED_MIN = 0.5  # minimum fraction of the variance of the estimated places that another orientation must explain
+GAIN_MIN = 0.5  # minimum difference between this fraction and the fraction that the unchanged labels explain
 ORIENTATIONS = {
     "as they are": [[1, 0], [0, 1]],
     "with x and y swapped": [[0, 1], [1, 0]],
@@ -38,7 +38,7 @@ class Presses:
 
 
 def presses_of(blocks: Iterable[Readings]) -> Presses:
-    """Average the readings of each press of a capture whose place is known."""
+    """Average the readings of each press with a known place, in the blocks of one capture."""
     place_mm, change_uT = [], []
     for block in blocks:
         known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
@@ -56,11 +56,12 @@ def presses_of(blocks: Iterable[Readings]) -> Presses:
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
-    """Return how the labels of `own` must be changed to agree with those of `others`; None if no change is needed.
+    """Return the change after which the labels of `own` agree with those of `others`; None if no change is needed.
 
-    For each press of `own`, the mean place of the three presses of `others` with the nearest directions is looked up. A
-    change of the labels is reported if it explains at least `EXPLAINED_MIN` of the variance of the looked-up places,
-    and `GAIN_MIN` more than the unchanged labels.
+    The place of each press of `own` is estimated as the mean place of those three presses of `others` whose field
+    changes have the most similar directions. A change of the labels is reported if the changed labels explain at least
+    the fraction `EXPLAINED_MIN` of the variance of these estimates, and at least `GAIN_MIN` more than the unchanged
+    labels.
     """
     comparable = own.direction.shape[1:] == others.direction.shape[1:]
     if not comparable or min(len(own.place_mm), len(others.place_mm)) < PRESSES_MIN_N:

@@ -1,7 +1,7 @@
-"""Convert an .npz archive of pickled samples, written by the rig of layout `lab`, to a CSV file of this layout.
+"""Convert an .npz archive of pickled samples, as the rig of layout `lab` writes it, to a CSV file of layout `lab`.
 
-Pickles are not loaded with `pickle`: their opcodes are interpreted as data, so nothing is imported or executed. Pickles
-with anything but plain values and NumPy numbers are refused.
+Pickles are not loaded with `pickle`. Instead, this module interprets their opcodes as data, so nothing is imported or
+executed. A pickle with anything but plain values and NumPy numbers is refused.
 """
 
 import pickletools
@@ -25,7 +25,7 @@ MARK = object()
 
 
 def to_lab_csv(archive: bytes, where: str) -> bytes:
-    """Return the samples of an archive as CSV, sorted by indentation; an indentation begins with its no-load samples.
+    """Return the samples of an archive as CSV, sorted by indentation, with the no-load samples of an indentation first.
 
     Values are rounded to 1e-4 degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
     """
@@ -39,12 +39,13 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
-    except Exception as error:  # an archive may contain anything; the message gives the reason
+    # an archive may contain anything, so any exception is possible; the error message gives the reason
+    except Exception as error:
         samples_of = " and ".join(PHASES.values())
         raise CaptureError(
             f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
         ) from None
-    rows.sort(key=lambda row: row[0])  # stable: no-load rows stay before contact rows
+    rows.sort(key=lambda row: row[0])  # the sort is stable, so no-load rows stay before contact rows
     return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
 
 
@@ -85,13 +86,13 @@ def decode(pickled: bytes, where: str) -> Any:
         return plain(stack.values.pop())
     except CaptureError:
         raise
-    except Exception as error:  # arbitrary bytes may fail anywhere: in pickletools, on an empty stack, in NumPy
+    except Exception as error:  # arbitrary bytes may cause any exception: in pickletools, on an empty stack, in NumPy
         raise CaptureError(f"{where}: the pickle cannot be read: {_describe(error)}. {REMEDY}") from None
 
 
 @dataclass
 class Call:
-    """A function call in a pickle: the function's name, which is never looked up, and the arguments."""
+    """A function call in a pickle: the arguments, and the function's name, which is never used to find a function."""
 
     name: str
     args: Any
@@ -103,7 +104,7 @@ NESTED = (list, tuple, dict, Call)
 
 @dataclass
 class _Stack:
-    """The stack and the memo that a pickle's opcodes work on."""
+    """The stack and the memo of a pickle machine, on which opcodes work."""
 
     values: list[Any]
     memo: dict[int, Any]
@@ -118,7 +119,7 @@ class _Stack:
         return taken
 
     def since_mark(self) -> list[Any]:
-        """Pop the values since the last mark, and the mark; return the values."""
+        """Pop the values since the last mark and the mark itself; return the values."""
         mark_i = max(i for i, value in enumerate(self.values) if value is MARK)
         taken = self.values[mark_i + 1 :]
         del self.values[mark_i:]
@@ -173,8 +174,8 @@ STEPS: Mapping[str, Step] = {
 def plain(value: Any, converted: dict[int, Any] | None = None) -> Any:
     """Convert calls of NumPy functions in a value to lists and numbers; raise `ValueError` for any other call.
 
-    A value that a pickle uses several times is converted only once; `converted` maps its `id` to the result. Otherwise,
-    nested references could take exponential time.
+    A value that a pickle uses several times is converted only once, because nested references could otherwise take
+    exponential time. `converted` maps the `id` of a value to the result.
     """
     converted = {} if converted is None else converted
     if not isinstance(value, NESTED):
@@ -186,7 +187,8 @@ def plain(value: Any, converted: dict[int, Any] | None = None) -> Any:
 
 def _plain(value: Any, converted: dict[int, Any]) -> Any:
     match value:
-        case list() | tuple():  # for speed, do not call `plain` for numbers: a list may have a million
+        # for speed, `plain` is not called for numbers, because a list may have a million of them
+        case list() | tuple():
             return type(value)(plain(item, converted) if isinstance(item, NESTED) else item for item in value)
         case dict():
             return {plain(key, converted): plain(item, converted) for key, item in value.items()}

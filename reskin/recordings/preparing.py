@@ -1,4 +1,4 @@
-"""Prepare a recording of any layout for `reskin add`: make the header of its capture and collect its files.
+"""Prepare a recording of any layout for `reskin add`: make the header of the new capture, and collect the files.
 
 This module writes no capture; see `header.write_capture`.
 """
@@ -23,7 +23,7 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-UNNAMED = "unnamed"  # name of board and skin in a recording that was made without names
+UNNAMED = "unnamed"  # name of the board and of the skin in a recording that was made without names
 
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
@@ -33,7 +33,7 @@ Prepared = tuple[Header, Mapping[str, bytes | Path]]
 class CaptureNames:
     """The names of a board, a skin and a capture.
 
-    If the capture's name is None, it is made from the names of the board, the skin and the file.
+    If the capture's name is None, a name is made from the names of the board, the skin and the file.
     """
 
     board: str
@@ -43,7 +43,7 @@ class CaptureNames:
 
 @dataclass(frozen=True)
 class Dump:
-    """What a serial dump does not contain: wire format, number of chips, frame rate, probe log and clock marks."""
+    """The data that a serial dump lacks: wire format, number of chips, frame rate, probe log and clock marks."""
 
     wire: Wire
     chips_n: int
@@ -69,10 +69,10 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Extend the errors of a `with` block by the layouts in which the recording can be read.
+    """Add to the errors of a `with` block the layouts in which the recording can be read.
 
-    An error is unchanged if the recording can be read in `layout`, or if the error is a `ParamsError`, which is about
-    names or options.
+    An error is not changed if the recording can be read in `layout`, or if it is a `ParamsError`, because such an error
+    is about names or options.
     """
     try:
         yield
@@ -92,8 +92,8 @@ def layouts_of(recording: Path) -> list[str]:
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
     if layouts := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
-        # If a recording of another layout is read as a table, labels may be lost, so suggest `table` only if it is the
-        # only one.
+        # Layout `table` may also accept a recording of another layout, but lose its labels. Therefore, suggest `table`
+        # only if no other layout is possible.
         return [layout for layout in layouts if layout != "table"] or layouts
     formats = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in formats})
@@ -146,12 +146,12 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
                 f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct the option or the "
                 "header."
             )
-    # If the recorder was killed, the header does not list the files.
+    # If the recorder was killed, the header does not list the files, so also collect the files that exist.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in header.files}
     marks_before = header.clock.marks
     if probe is not None:
         _check_exists(probe)
-        # The marks in the header are for the folder's probe log, which `probe` replaces.
+        # The marks in the header belong to the folder's own probe log, if it has one, which `probe` replaces.
         marks_before = () if headers.PROBE_FILE in files else marks_before
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:

@@ -1,7 +1,8 @@
 """The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in chronological order. An indentation is one no-load dwell (robot lifted), followed by its contact dwells:
-one dwell, or several if the robot drags the indenter.
+Rows are in chronological order. A dwell is a time in which the robot does not move. An indentation consists of one
+no-load dwell, with the robot lifted, and the contact dwells after it. There are several contact dwells if the robot
+drags the indenter, or else one.
 """
 
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ TYPES = {
 
 @dataclass(frozen=True)
 class ProbeLog:
-    """The dwells of one capture, one array element per dwell; NaN where a label is unknown.
+    """The dwells of one capture, one array element per dwell; unknown labels are NaN.
 
     `contact` is True for phase `contact`, and False for phase `noload`, when the robot is lifted. Forces have the signs
     of `reskin.schema`.

@@ -1,7 +1,7 @@
-"""Record a board to a capture folder for `reskin add`, with labels if a source provides them during the recording.
+"""Record a board to a capture folder for `reskin add`, with labels if a label source provides them meanwhile.
 
-The capture is written to `<folder>.part`, beginning with the header, and renamed when the recording has ended. A killed
-recorder leaves a `.part` folder that can still be added, with the labels received until then.
+The capture is written to `<folder>.part`, beginning with the header, and renamed when the recording has ended. If the
+recorder is killed, the `.part` folder remains. It can still be added, with the labels that were received before.
 """
 
 import sys
@@ -65,15 +65,16 @@ def record_capture(
     except CaptureError as error:
         if label_thread is not None:
             label_thread.end()
-        io.remove(part)  # no frame arrived, so there is nothing to keep
-        if label_thread is not None and label_thread.failed is not None:  # the failed labels ended the recording
+        io.remove(part)  # no frame arrived, so the folder has nothing to keep
+        # the failure of the label source ended the recording
+        if label_thread is not None and label_thread.failed is not None:
             raise label_thread.failed from error
         raise
     summary = label_thread.end() if label_thread is not None else ""
     failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         recording = replace(recording, ended="not written")
-    if recording.ended != "not written":  # if the disk is full, the .part folder can be added as it is
+    if recording.ended != "not written":  # if the disk is full, keep the .part folder, which can be added as it is
         end_capture(folder, headers[-1], recording.rate)
     return CaptureResult(recording, summary, failed)
 
@@ -81,9 +82,9 @@ def record_capture(
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
     """Make the context of a source of labels.
 
-    Until the source calls `mark`, the clock mark states that labels and arrivals are on the same clock.
+    Unless the source calls `mark`, the clock mark states that labels and arrivals have times of the same clock.
     """
-    # Determined once, because the system's clock may be adjusted during the recording.
+    # The offset is determined only once, because the system's clock may be adjusted during the recording.
     offset_s = time.time() - time.monotonic()
     writer = ProbeLogWriter(part)
 
@@ -103,7 +104,7 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
 
 def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
-    """Create `<folder>.part` and its header; return its path, to write the stream to, and the header.
+    """Create `<folder>.part` and its header; return the path of this folder, for the stream, and the header.
 
     `by` is the name of the recording program, for the header's note.
     """

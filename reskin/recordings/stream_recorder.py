@@ -22,7 +22,7 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # number of first bytes that are stored, to suggest a wire format if no frame arrives
+HEAD_BYTES_N = 16384  # number of bytes from the start that are stored, to suggest a wire format if no frame arrives
 
 Report = Callable[[Mapping[str, int]], None]  # called many times a second with the counts of `FrameStream.account`
 Watch = Callable[[Frames], object]  # called with frames as they arrive
@@ -81,8 +81,8 @@ def record(
 class CaptureWriter:
     """Write the files `stream.bin` and `arrivals.csv` of a recording: each chunk of bytes, then its time of arrival.
 
-    In this order, no arrival refers to bytes that are missing. If the disk is full, a partly written chunk is removed.
-    The frames of the written bytes are decoded, to count them and to measure their rate.
+    Because of this order, no arrival refers to missing bytes. If the disk is full, a partly written chunk is removed.
+    The written bytes are also decoded, to count the frames and to measure their rate.
     """
 
     def __init__(self, folder: Path, wire: Wire, chips_n: int) -> None:
@@ -91,7 +91,8 @@ class CaptureWriter:
         self._chips_n = chips_n
         self._meter: RateMeter | None = None  # None before the first bytes
         self._in_partial_line = wire in TEXT_WIRES
-        # Unbuffered, so that no written data is lost if the process is killed, and closing the file cannot fail.
+        # The files are unbuffered, so that no written data is lost if the process is killed, and closing them cannot
+        # fail.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
         self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
         self._arrivals.write(b"byte_end,t_s\n")
@@ -114,7 +115,7 @@ class CaptureWriter:
     def write(self, chunk: bytes, unix_s: float) -> Frames:
         """Write a chunk; return the frames that are now complete.
 
-        In text formats, the first line is left out, because the recording may have begun inside a number.
+        In text formats, the first line is not written, because the recording may have begun inside a number.
         """
         if self._meter is None:
             self._meter = RateMeter(self._chips_n, unix_s)

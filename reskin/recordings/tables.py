@@ -26,14 +26,14 @@ COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
-    """Read CSV text, or the file at a path, that has exactly the columns of `types`, in any order.
+    """Read CSV text, or the CSV file at a path, with exactly the columns of `types`, in any order.
 
     Row numbers in errors are line numbers in the file; the column names are in row 1.
     """
     try:
         table = pacsv.read_csv(
             pa.py_buffer(source.encode()) if isinstance(source, str) else source,
-            # One thread, because only then do Arrow's messages name the row.
+            # Use one thread, because with several threads, Arrow's messages do not name the row.
             read_options=pacsv.ReadOptions(use_threads=False),
             parse_options=pacsv.ParseOptions(ignore_empty_lines=False),
             convert_options=pacsv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True),
@@ -66,7 +66,7 @@ def _column_names(source: str | Path) -> list[str]:
 def render_csv(table: pa.Table) -> str:
     """Return a table as CSV text; null is an empty field.
 
-    A number is written with the fewest digits from which the same number is read.
+    A number is written with as few digits as possible such that reading them gives the same number.
     """
     sink = pa.BufferOutputStream()
     pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
@@ -76,8 +76,8 @@ def render_csv(table: pa.Table) -> str:
 def refuse_row(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str, values: Any, remedy: str) -> None:
     """Raise `CaptureError` for the first row that `bad` marks, if any.
 
-    `what` is the name of the wrong value, `rule` the rule that it violates, and `values` the values of all rows, or a
-    text that describes the wrong value.
+    `what` is the name of the wrong value, and `rule` is the rule that it violates. `values` contains the values of all
+    rows, or is a text that describes the wrong value.
     """
     if bad.any():
         row_i = int(bad.argmax())
@@ -97,12 +97,13 @@ def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
     return ",".join(names) or "none"
 
 
-# Limit for numbers in files: all readings, places and unix times are far below, and float32 can represent it.
+# Limit for numbers in files. All readings, places and unix times are far below this limit, and float32 can represent
+# it.
 MAGNITUDE_MAX = 1e10
 
 
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into cells: one list per line, all of the same length; separator None is any white space."""
+    """Split a text file into one list of cells per line, all of equal length; separator None is any white space."""
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""Check that fields, places, depths and forces of a recording are in uT, mm and N, by their plausible values."""
+"""Check that fields, places, depths and forces of a recording have plausible values in uT, mm and N."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,21 +10,22 @@ from reskin.recordings.tables import FIRST_ROW
 
 # Full scale of an MLX90393 at its coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3): 2^15 steps (data sheet, table 17).
 FULL_SCALE_uT = 32768 * 9.680
-# If the median field is below this number, it is not in uT: the earth's field alone is 25 to 65 uT, and a chip under a
-# skin reads 200 to 9000 uT. In mT or T, these fields are smaller numbers.
+# If the median field is below this number, it is not in uT, because the earth's field alone is 25 to 65 uT, and a chip
+# under a skin reads 200 to 9000 uT. In mT or T, the numbers are smaller.
 WEAKEST_uT = 20.0
 # The field of the strongest known skin, 13000 uT, is 130 G. If the median field is below this number, and the steps
 # between values are finer than those of any chip in uT, the values are in gauss.
 GAUSS_MAX = 200.0
-# If the steps between values are larger than this number, they are in nT: the chip has steps of 0.150 uT = 150 nT to
-# 9.68 uT.
+# If the steps between values are larger than this number, the values are in nT, because the steps of the chip are 0.150
+# uT (150 nT) to 9.68 uT.
 NANO_STEP_MIN = 100.0
-# Skins are a few mm thick, and forces on them are smaller than this. A force of 1 N in grams would be 102.
+# Forces on skins, which are a few mm thick, are smaller than this number. In grams, a force of 1 N would be 102.
 FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # every recording has a touch with a larger force; 0.4 N in kg would be 0.04
+FORCE_MIN_N = 0.05  # every recording has a touch with a larger force; in kg, 0.4 N would be 0.04
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-# If at most this fraction of the places is far from the others, these places are wrong; otherwise, the unit is wrong.
+# If some places are far from the others, but at most this fraction of all places, these places are wrong. If they are
+# more, the unit is wrong.
 FAR_SHARE_MAX = 0.1
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
@@ -32,9 +33,9 @@ DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
     """Raise if raw fields are probably not in uT.
 
-    Fields are in another unit if they exceed the chip's full scale, if they are weaker than the earth's field, or if
-    the steps between their values are not those of any chip in uT. The steps are visible only if the values were
-    neither averaged nor rounded to decimals.
+    Fields are probably in another unit if they exceed the chip's full scale, if they are weaker than the earth's field,
+    or if the steps between their values are not possible for the chip in uT. The steps are visible only if the values
+    were neither averaged nor rounded to decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
@@ -49,7 +50,7 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
 
 
 def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if field changes are probably not in uT: they exceed the chip's full scale, or have steps that no chip has.
+    """Raise if field changes are probably not in uT: they exceed the chip's full scale or have impossible steps.
 
     Unlike raw fields, field changes may be weak.
     """
@@ -69,7 +70,7 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if all known forces are below `FORCE_MIN_N`, as forces in kg or kN are; all 0 or all unknown is allowed."""
+    """Raise if all known forces are below `FORCE_MIN_N`, as in kg or kN. Forces may be all 0 or all unknown (NaN)."""
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
@@ -78,7 +79,7 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
-    """Raise if the spread of the places is too small or too large for a skin: they are probably in m or um, not in mm.
+    """Raise if the spread of the places is too small or too large for a skin in mm, as for places in m or um.
 
     A single place and NaN (unknown) are allowed.
     """
@@ -137,7 +138,7 @@ def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n:
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Return the median step of the chips along x and y; NaN if no step is visible, or if rounding caused it."""
+    """Return the median step of the chips along x and y; NaN if there is no step, or if rounding caused it."""
     steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
     steps_uT = steps_uT[np.isfinite(steps_uT)]
     if not len(steps_uT):

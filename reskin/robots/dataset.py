@@ -9,8 +9,9 @@ The package lerobot is not needed. The dataset is a folder:
     meta/reskin.json                            recording, board, skin and source of each episode (not read by LeRobot)
     data/chunk-000/file-000.parquet, ...        one row per frame
 
-Features of sensors begin with `observation.`, so that policies use them as inputs. Features that a rig measured (place,
-depth, force) begin with `label.`; LeRobot loads them, but policies do not use them.
+The names of sensor features begin with `observation.`, so that policies use these features as inputs. The names of
+features that a rig measured (place, depth, force) begin with `label.`; LeRobot loads these features, but policies do
+not use them.
 """
 
 import json
@@ -35,9 +36,10 @@ from reskin.schema import from_table
 
 VERSION = "v3.0"
 FPS_MAX = 10_000
-RATE_TOLERANCE = 0.05  # largest relative difference between rates of recordings that are treated as equal
+RATE_TOLERANCE = 0.05  # rates of recordings are treated as equal if their relative difference is at most this
 ROUNDING = 1e-6  # tolerance of times, as a fraction of the time between frames
-GAP_S = 0.3  # an episode ends at a longer gap between readings; the last reading is then outdated
+# an episode ends if the gap between two readings is longer than this, because the last reading is then outdated
+GAP_S = 0.3
 FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
 PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 QUANTILES = {f"q{percent:02d}": percent / 100 for percent in (1, 10, 50, 90, 99)}
@@ -54,10 +56,10 @@ INDICES = {name: "float32" if name == "timestamp" else "int64" for name in (
 
 @dataclass(frozen=True)
 class Recording:
-    """The readings of one file. values: feature -> values, NaN if unknown. t_s: None if the times are unknown.
+    """The readings of one file. values: values by feature, NaN if unknown. t_s: None if the times are unknown.
 
-    part: number of the part of the recording (such as the indentation) to which a reading belongs; each part becomes
-    an episode or, if it has gaps, several episodes. dropped_n: number of faulty frames, which are left out.
+    part: for each reading, the number of its part of the recording, such as its indentation. Each part becomes an
+    episode or, if it has gaps, several episodes. dropped_n: number of faulty frames, which are left out.
     """
 
     where: str
@@ -82,7 +84,7 @@ class Episode:
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
 ) -> dict[str, float]:
-    """Write recordings as a LeRobot dataset; return its size, rate, largest timestamp error and omitted frames.
+    """Write recordings as a LeRobot dataset; return size, rate, largest timestamp error and number of omitted frames.
 
     Parameters
     ----------
@@ -91,14 +93,14 @@ def export_lerobot(
         one episode per indentation. A gap of more than `GAP_S` ends an episode.
     out : folder to create
     task : what the robot does, in natural language
-    fps : frames per second of the dataset; each frame is then the latest reading at its time. By default, each reading
-        is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 / fps; the
-        result has their largest difference from the times of the readings.
+    fps : frames per second of the dataset. If given, each frame is the latest reading at the frame's time. By default,
+        each reading is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 /
+        fps; the result contains their largest difference from the times of the readings.
     rate_hz : rate of the readings of files without times
 
     Raises
     ------
-    ReskinError : a file cannot be read; the files differ in chips, in the kind of labels or in the kind of source; or
+    ReskinError : a file cannot be read; the files differ in their number of chips, kind of labels or kind of source; or
         times or the rate are missing
     """
     if out.exists():
@@ -167,7 +169,7 @@ def _about(header: Any) -> dict[str, str]:
 
 
 def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[str, Float32[np.ndarray, "f _"]]:
-    """Return the labels of each reading of a capture: those of the dwell in which it was taken, NaN between dwells."""
+    """Return for each reading of a capture the labels of the dwell in which it was taken; NaN between dwells."""
     file = folder / PROBE_FILE
     if not file.is_file():
         return {}
@@ -205,7 +207,7 @@ def _all_finite(column: pa.ChunkedArray) -> bool:
 
 
 def find_features(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Return the features with the names of their components; values that are unknown everywhere are omitted."""
+    """Return the features with the names of their components; omit values that are unknown in all readings."""
     first, *others = recordings
     features = _known(first)
     for other in others:
@@ -251,7 +253,7 @@ def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
 
 
 def _rate_hz(recording: Recording) -> float | None:
-    """Return the reciprocal of the median time between readings of the same part; None if there is no such time."""
+    """Return 1 / the median time between readings of the same part; None if no part has readings at two times."""
     assert recording.t_s is not None
     step_s = np.diff(recording.t_s)[np.diff(recording.part) == 0]
     return float(1 / np.median(step_s[step_s > 0])) if (step_s > 0).any() else None
@@ -260,7 +262,10 @@ def _rate_hz(recording: Recording) -> float | None:
 def split(
     recording: Recording, features: Mapping[str, Sequence[str]], fps: int, *, resample: bool
 ) -> Iterator[Episode]:
-    """Divide a recording into episodes. Frames are readings or, if `resample`, the latest readings at their times."""
+    """Divide a recording into episodes.
+
+    A frame is a reading or, with `resample`, the latest reading at the frame's time.
+    """
     known = {feature: np.isfinite(recording.values[feature]).any(axis=0) for feature in features}
     values = {feature: recording.values[feature][:, mask].astype(np.float32) for feature, mask in known.items()}
     ends = np.diff(recording.part) != 0
@@ -286,7 +291,7 @@ def split(
 # --- Writing ---
 
 
-Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]  # values of a feature in the frames
+Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]  # feature -> its values in the frames
 
 
 def write_dataset(
@@ -347,7 +352,7 @@ def _table(columns: Columns) -> pa.Table:
 
 
 def _file_numbers(bytes_n: Sequence[int]) -> list[int]:
-    """Return the number of the data file of each episode; a file has several episodes, up to `FILE_MB` in total."""
+    """Return for each episode the number of its data file; a file has several episodes, up to `FILE_MB` in total."""
     numbers, size_n, number = [], 0, 0
     for episode_bytes_n in bytes_n:
         if size_n and size_n + episode_bytes_n > FILE_MB * 2**20:
@@ -362,7 +367,7 @@ def _location(number: int) -> dict[str, int]:
 
 
 def statistics(values: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"]) -> dict[str, list[float] | list[int]]:
-    """Return LeRobot's statistics of each component of a feature: over its known values, or NaN if there are none."""
+    """Return LeRobot's statistics of the known values of each component of a feature; NaN if a component has none."""
     known, count = np.isfinite(values), {"count": [len(values)]}
     if known.all():
         return count | {key: value.tolist() for key, value in _statistics(values).items()}

@@ -11,7 +11,7 @@ Nothing may touch the skin in the first second.
 | `~/contact`      | std_msgs/Bool                             | whether the skin is touched                          |
 | `~/place`        | geometry_msgs/PoseWithCovarianceStamped   | place in m; published only in contact                |
 | `~/force`        | geometry_msgs/WrenchStamped               | force on the skin in N; zero without contact         |
-| `~/force_sd`     | geometry_msgs/WrenchStamped               | its standard deviation; published only in contact    |
+| `~/force_sd`     | geometry_msgs/WrenchStamped               | standard deviation of the force; only in contact     |
 | `/diagnostics`   | diagnostic_msgs/DiagnosticArray           | alarms, once a second and whenever they change       |
 
 Service `~/zero` (std_srvs/Trigger) takes a new no-load reading.
@@ -20,17 +20,19 @@ Parameters: `port` (default: the only connected board); `model` and `calibration
 default: the universal model without calibration); `external_uT` (for a board that a robot moves); `baud`; `frame_id`;
 `rate_hz` (largest number of messages of a topic per second).
 
-Decisions:
+Design decisions:
 
-* The field of each chip is a MagneticField, with stamp, frame and SI units; Float32MultiArray has none of these.
-  Its covariance is 0, which means unknown. The frame of chip K is `<frame_id>_chipK`.
+* The field of each chip is a MagneticField message, because it has a stamp, a frame and SI units; a Float32MultiArray
+  has none of these. Its covariance is 0, which means that it is unknown. The frame of chip K is `<frame_id>_chipK`.
 * Frame `frame_id` has the axes and the origin of the places x and y; its z axis points out of the skin. Only x and y
-  are estimated: z is 0, the surface. The orientation is that of the frame, and its entries in the covariance are 0.
-* The force presses on the skin along -z, because the model estimates normal forces. It acts at the place, and the
-  torque is its moment about the origin. No standard message has a wrench with a covariance, so the standard deviation
-  is a message of its own, with the same stamp. In it, components that are not estimated are NaN.
-* A reading that is not usable is not published. Subscribers notice it by the age of the last message; the reason is in
-  `/diagnostics`. Stamps are times of arrival on the system's clock.
+  are estimated; z is 0, which is the surface. The orientation of a place is that of the frame, and its entries in the
+  covariance are 0.
+* The force presses on the skin along -z, because the model estimates normal forces. The force acts at the place, and
+  the torque is its moment about the origin. No standard message has a wrench with a covariance, so the standard
+  deviation of the force is published as a separate message with the same stamp. In this message, components that are
+  not estimated are NaN.
+* A reading that is not usable is not published. Subscribers notice this by the age of the last message; the reason is
+  in `/diagnostics`. Stamps are times of arrival on the system's clock.
 """
 
 import math
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
 
 T_PER_UT, M_PER_MM = 1e-6, 1e-3
 DIAGNOSTICS_S = 1.0
-QUEUE_N = 10  # messages that a publisher keeps for slow subscribers
+QUEUE_N = 10  # number of messages that a publisher keeps for slow subscribers
 PARAMETERS = {  # name -> default
     "port": "", "model": "", "calibration": "", "external_uT": 0.0, "baud": 115200, "frame_id": "skin",
     "rate_hz": 100.0,
@@ -151,7 +153,7 @@ class SkinPublisher:
 
 
 def limit_rate(contacts: Iterator[Contact], rate_hz: float) -> Iterator[Contact | None]:
-    """Yield contacts at most at a rate, and None for each contact that is omitted."""
+    """Yield at most `rate_hz` contacts per second, and None for each contact that is omitted."""
     next_s, period_s = -math.inf, 1 / rate_hz
     for contact in contacts:
         now_s = time.monotonic()

@@ -1,7 +1,7 @@
 """A skin as a sensor of a robot in LeRobot, with the methods that LeRobot's cameras have.
 
-The package lerobot is not needed. A class of a robot creates the sensor from its configuration, calls `connect` and
-`disconnect` with its motors and cameras, adds `observation_features` to its own features, and adds the values that
+The package lerobot is not needed. A robot class creates the sensor from its configuration, and connects and disconnects
+it together with the motors and cameras. It adds `observation_features` to the robot's own features, and the values that
 `async_read` returns to each observation (docs/robots.md).
 """
 
@@ -20,7 +20,7 @@ from reskin.board import find
 from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates, LiveSkin
 
-WAIT_S = 0.1  # longest time for which the background thread waits for data before it checks whether to stop
+WAIT_S = 0.1  # longest time for which the background thread waits for data before it checks whether it must stop
 READ_MS = 10_000.0  # longest time for which `read` and `zero` wait, as in `read` of LeRobot's cameras
 ESTIMATE = ("x_mm", "y_mm", "F_N", "sd_x_mm", "sd_y_mm", "sd_F_N", "contact")
 
@@ -147,7 +147,7 @@ class SkinSensor:
         return self.async_read(READ_MS)
 
     def async_read(self, timeout_ms: float = 200.0) -> dict[str, float]:
-        """Return the latest reading if it was not returned yet; otherwise wait for the next one.
+        """Return the latest reading if it was not returned before; otherwise, wait for the next reading.
 
         Raises
         ------
@@ -204,7 +204,7 @@ class SkinSensor:
                     continue
                 reading = self._values(estimates, estimated=skin.estimator is not None)
                 with self._changed:
-                    if skin.zeroed:  # otherwise, `zero` was called while this reading was evaluated
+                    if skin.zeroed:  # if not, `zero` was called while this reading was evaluated
                         self._latest, self._latest_s, self._is_new = reading, float(estimates.t_s[-1]), True
                         self._changed.notify_all()
         except Exception as error:  # raised by the reading methods, on the caller's thread

@@ -1,1 +1,1 @@
-"""Simulated captures, in the file formats of recorded ones, from a protocol, a rig and the physics of a skin."""
+"""Simulation of captures from a protocol, a rig and the physics of a skin, in the file formats of recorded captures."""

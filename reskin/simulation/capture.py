@@ -37,7 +37,8 @@ from reskin.simulation.rig import (
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each part of a simulation has its own random generator, so that random numbers of one part do not change the others.
+# Each part of a simulation has its own random generator, so that a change of one part does not change the random
+# numbers of the other parts.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
@@ -148,7 +149,7 @@ def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[H
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
     """Return the true positions of the tip in m in the board's frame.
 
-    If the plan has loads instead of depths, the depths are computed from the skin's stiffness.
+    If the plan has loads instead of depths, the depths are computed from the loads and the skin's stiffness.
     """
     tip_m = (actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
     if plan.weight_N is not None:
@@ -159,7 +160,7 @@ def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[
 def _force_readings(response: Response, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:
     """Return force readings in N at each dwell, and the number of clipped values.
 
-    The first dwell of each indentation is without contact; the others are at its stops.
+    The first dwell of each indentation is without contact. The other dwells are at the stops of the indentation.
     """
     force_N = np.concatenate([np.zeros((len(response.force_N), 1, 3)), response.force_N], axis=1)
     read_N, past_range_n = read_force(force_N.reshape(-1, 3), noise_N=rig.force_noise_N, rng=rng)

@@ -1,7 +1,7 @@
-"""Simulate the response of a skin to a tip: fields at the chips, and forces, at every stop of a protocol.
+"""Simulate the response of a skin to a tip: the fields at the chips and the forces at every stop of a protocol.
 
 Optional effects (friction, ageing, ...) are simulated only if the protocol's settings list them under `terms`.
-Experiment neglected_effects reports the error due to effects that are not listed.
+The experiment `neglected_effects` reports the error that results if an effect is not simulated.
 """
 
 from collections.abc import Collection
@@ -127,11 +127,11 @@ def drag_tip(
 ) -> TangentialResponse:
     """Simulate a dragged or tilted tip at the stops of each indentation, with Coulomb friction.
 
-    The tangential force shears the layer under the tip. If the base is held by springs (`Skin.hold`), the force also
-    moves the whole skin; otherwise the base is assumed to be fixed sideways. The friction limit applies to the sum of
-    the forces due to pressing and dragging. The drag is assumed to exert its full force, and the displacement due to
-    the press is multiplied by the remaining fraction of the limit. If the tip slips, this fraction is zero, and so is
-    the displacement due to the press.
+    The tangential force shears the layer under the tip. If springs hold the skin on its base (`Skin.hold`), the force
+    also moves the whole skin. Otherwise, the underside of the skin is assumed to be fixed sideways. Friction limits the
+    sum of the lateral forces due to pressing and dragging. The drag is assumed to exert its full force. The
+    displacement due to the press is multiplied by the remaining fraction of the friction limit, which is zero if the
+    tip slips.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=friction.coefficient))

@@ -1,4 +1,4 @@
-"""Protocols of simulated captures, which plan the places and depths of the tip in order of time."""
+"""Protocols of simulated captures. A protocol plans the places and depths of the tip in order of time."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -14,7 +14,7 @@ from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
 LIFTED_MM = -1.0  # depth of a tip above the skin, without contact; such stops are not in the robot's log
-DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; equals 1e-8 N for a skin with a stiffness of 10 N/mm
+DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; 1e-8 N for a skin with a stiffness of 10 N/mm
 DEEPEST_SHARE = 0.999  # largest depth under a load, relative to the smaller of thickness and tip radius
 
 
@@ -66,7 +66,7 @@ class ProtocolSettings(Strict):
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
     ]  # physical effects to simulate
-    rate_hz: Rate_hz | None = None  # frame rate; default: the rate of the rig; lower for boards with more chips
+    rate_hz: Rate_hz | None = None  # frame rate (lower for boards with more chips); default: the rate of the rig
 
 
 class _RandomDepth(ProtocolSettings):
@@ -80,8 +80,8 @@ class _RandomDepth(ProtocolSettings):
 
 
 class _OnlyTemperature(ProtocolSettings):
-    # The other effects are not allowed: ageing and relaxation would change the force between stops, which is not
-    # modelled, and the tip does not move sideways, so friction has no effect.
+    # The other effects are not allowed. Ageing and relaxation would change the force between stops, which is not
+    # modelled. Friction has no effect, because the tip does not move sideways.
     terms: tuple[Literal["temperature"], ...]
 
     @model_validator(mode="after")
@@ -125,7 +125,7 @@ class Drag(ProtocolSettings):
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
         x_mm = np.tile(np.concatenate([alternating_mm, across_mm]), (depths_n, 1))
         y_mm = np.tile(np.concatenate([across_mm, alternating_mm]), (depths_n, 1))
-        # In every second pass, all lines are reversed, so that the direction of the force does not follow from the
+        # In every second pass, all lines are reversed, so that the direction of the force cannot be inferred from the
         # place.
         directions = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
@@ -219,7 +219,7 @@ class Load(_OnlyTemperature):
 class Press(_OnlyTemperature):
     """Presses at grid places, whose depth is half a sine over time; each frame is a stop.
 
-    They represent the dynamic data of section 7 of the paper.
+    These presses represent the dynamic data in section 7 of the paper.
     """
 
     kind: Literal["press"]
@@ -229,7 +229,7 @@ class Press(_OnlyTemperature):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw places, durations and depths. After shorter presses, the tip is lifted until the longest press ends."""
+        """Draw places, durations and depths. After a short press, the tip stays lifted until the longest would end."""
         least_s, most_s = self.duration_s
         long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
         long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)

@@ -42,7 +42,8 @@ class Rig(Strict):
 class Timeline:
     """The frames of one indentation (t frames).
 
-    `stop_i` is the stop to which a frame belongs, and `share` is the fraction of the stop's field change at the frame.
+    `stop_i` is the stop to which a frame belongs. `share` is the fraction of this stop's field change that is reached
+    at the frame.
     """
 
     stop_i: Int64[np.ndarray, " t"]
@@ -93,8 +94,8 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
 def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
     """Return the true positions of the tip (x, y, depth in mm): planned positions plus the robot's error.
 
-    The error is the same for all stops of an indentation. Plans without labels are not executed by a robot, so their
-    positions are the true ones.
+    The error is the same for all stops of an indentation. Plans without labels are not executed by a robot, so the
+    planned positions are the true positions.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -106,7 +107,7 @@ def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[
 def draw_arrivals(
     frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
-    """Draw chunks of frames; return the cumulative number of frames after each chunk, and its arrival time in s."""
+    """Draw chunks of frames; return the number of frames up to each chunk's end, and each chunk's arrival time in s."""
     frames_n = len(frame_s)
     sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
     ends = np.cumsum(sizes)
@@ -122,10 +123,10 @@ def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
-    """Create the log of robot and force sensor, with d = 1 + p dwells per indentation: without contact, then p stops.
+    """Create the log of robot and force sensor: for each indentation, one dwell without contact, then p stops.
 
-    A dwell lasts from half a frame before its first frame to half a frame after its last frame. Stops above the skin
-    are not logged.
+    Each indentation therefore has d = 1 + p dwells. A dwell lasts from half a frame before its first frame to half a
+    frame after its last frame. Stops above the skin are not logged.
     """
     stops_n = plan.x_mm.shape[1]
     frames = timeline(rig, stops_n)
@@ -234,7 +235,8 @@ def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
     # Return the field in T and the temperature in degC at the conversion of each chip, for one block of indentations.
-    # The first frames of the block may contain conversions from the previous indentation, so its field is computed too.
+    # The first frames of the block may contain conversions from the previous indentation. Therefore, the field of that
+    # indentation is computed too.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]

@@ -1,7 +1,8 @@
 """Skins on which networks of the universal model are trained, and random batches of their presses.
 
-Each batch has presses on some skins and, for each skin, an error of the law and a number of presses for conditioning.
-`reskin.universal.training` trains on these batches. This module does not import PyTorch, which takes a second.
+A batch has presses on some skins. For each skin, an error of the law (`reskin.universal.law`) is drawn at random, and
+so are the presses on which the network is conditioned. `reskin.universal.training` trains on these batches. This module
+does not import PyTorch, because that import takes a second.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,14 +19,14 @@ from reskin.universal.map import Residual
 from reskin.universal.network import LOG_N, PLACE_MM
 from reskin.universal.population import DEFAULT_FORCES, PLACES_N, PRESSES_N, Forces, Population
 
-SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins per step; recorded ones among them, if any
-NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; else 1 to 65 presses
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # number of skins per step, and of recorded skins among them, if any
+NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; for others, on 1 to 65
 NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading's noise along x, y and z
 RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor between 0 and this value
 # Ranges from which the law's relative rms error is drawn: for simulated skins of a prior made with known boards, for
 # simulated skins of the nominal prior, and for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
-ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales in place and log F; number of cosines
+ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # the error's scales in place and log F; number of cosines
 NOMINAL_NAME = "nominal"  # name of the prior that uses no recorded board
 
 
@@ -52,8 +53,9 @@ class SkinPrior:
     """Distribution of the skins that networks are trained on.
 
     Skins are simulated with parameters around those of a central law. If boards of the rig were recorded, `recorded`
-    has their readings and `residual` predicts the law's errors from those on these boards. follows_law: True if skins
-    follow the law exactly, as in a simulated scene, so that no errors are added. forces: distribution of the forces.
+    has their readings, and `residual` predicts the law's errors on a new skin from its errors on these boards.
+    follows_law: True if skins follow the law exactly, as in a simulated scene; no errors of the law are then added.
+    forces: distribution of the forces.
     """
 
     name: str
@@ -71,7 +73,7 @@ class Batch:
     """Skins of one training step, with the presses on each skin.
 
     The first `PLACES_N` presses of a skin serve for conditioning: the network is conditioned on those for which `kept`
-    is 1. It is trained to predict `target` (scaled x, y and log F) for the other presses.
+    is 1. The network is trained to predict `target` (scaled x, y and log F) for the other presses.
     """
 
     db_uT: Float32[np.ndarray, "b m ch"]
@@ -117,7 +119,7 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw 130 presses of a recorded board (some repeatedly if it has fewer), and one reading of each."""
+    """Draw 130 presses of a recorded board (some repeatedly if the board has fewer), and one reading of each press."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
@@ -143,7 +145,7 @@ def add_error(
     """Add a random error of the law that is smooth in place and log F.
 
     Half of a channel's error is proportional to |dB| at its chip, half to |dB| over all chips. size: bounds between
-    which the relative rms error of each skin is drawn.
+    which the relative rms error of each skin is drawn uniformly.
     """
     skins_n, _, channels_n = db_uT.shape
     rms = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)

@@ -1,4 +1,7 @@
-"""Calibration data of one skin (validation, file format), and likelihood powers with cross-validation over labels."""
+"""Calibration data of one skin (validation, file format), and likelihood powers with cross-validation over labels.
+
+A likelihood power is an exponent of the likelihood. A power below 1 increases the standard deviations of estimates.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -87,9 +90,11 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
         raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or omit the press.")
 
 
-# Values are refused as field changes passed for readings, or the reverse, if their distance to the wrong origin (0 or
-# the no-load reading) is below this fraction of the distance to the right one. On the boards of scene lab, the median
-# ratio is 0.15 to 0.22 for values of the wrong kind, and 4 or more for values of the right kind.
+# Limit for the detection of field changes that are passed instead of readings, and of readings that are passed instead
+# of field changes. Readings of presses should be near the no-load reading, and field changes near 0. Values are refused
+# if the distance to the wrong one of these two points, divided by the distance to the right one, is below this limit.
+# On the boards of scene lab, the median ratio is 0.15 to 0.22 for values of the wrong kind, and 4 or more for values of
+# the right kind.
 NEAR_MAX = 0.5
 
 
@@ -127,23 +132,23 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-# Files of the first format do not state which forces are known. Those of the first two do not state how the skin is
-# mounted; it is then not turned. Files of the first three have the data of one day.
+# Formats of files, newest first. Format 1 does not state which forces are known. Formats 1 and 2 do not state how the
+# skin is mounted; the skin is then assumed not to be turned. Formats 1 to 3 have the data of only one day.
 FORMAT, FORMAT_3, FORMAT_2, FORMAT_1 = "reskin-skin-4", "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
-EARLIER_DAY = "earlier_{}_"  # prefix of names of arrays of earlier days; the first of these days has number 0
+EARLIER_DAY = "earlier_{}_"  # prefix of the names of an earlier day's arrays; the oldest day has the number 0
 DAYS_MAX_N = 5  # a saved skin has at most this number of days
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
 FILE_BYTES_MAX_N = 2**23  # five full days with all labels on a board with 64 chips take 4.1 MB
 REMEDY = "Use a file that `save` wrote."
-BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in the file; name that files without the key have
+BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in a file; the board if there is no key
 
 
 @dataclass(frozen=True)
 class LabelledPresses:
     """Presses with known places (relative to the board's centre), their forces and their field changes.
 
-    force_known: which forces are true; the others are estimates. The default is that all are true.
+    force_known: which forces are true values; the other forces are estimates. By default, all forces are true values.
     """
 
     place_mm: Float[np.ndarray, "m 2"]
@@ -156,7 +161,7 @@ class LabelledPresses:
 
     @property
     def known(self) -> Bool[np.ndarray, " m"]:
-        """Which forces are true."""
+        """Which forces are true values, not estimates."""
         return np.ones(len(self), bool) if self.force_known is None else self.force_known
 
     def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
@@ -166,7 +171,7 @@ class LabelledPresses:
 
 
 def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses:
-    """Append labelled presses to others."""
+    """Append the labelled presses `other` to `one`."""
     return LabelledPresses(
         np.concatenate([one.place_mm, other.place_mm]), np.concatenate([one.force_N, other.force_N]),
         np.concatenate([one.db_uT, other.db_uT]), np.concatenate([one.known, other.known]),
@@ -187,9 +192,10 @@ class CalibrationData:
 
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
     changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
-    the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter; the sign of
-    all fields here is then opposite to that of the board's fields, as if the skin were not turned. earlier: the
-    earlier days in order of time, each with its own data only. By default, there are no presses on the paper's board.
+    the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter. All fields
+    here then have the opposite sign of the fields on the board, as if the skin were not turned. earlier: the data of
+    earlier days in order of time, each with the presses of only this day. By default, there are no presses, and the
+    board is the paper's board.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -217,9 +223,9 @@ class CalibrationData:
         return len(self.labels) + sum(day.labels_n for day in self.earlier)
 
     def next_day(self) -> "CalibrationData":
-        """Return the data at the beginning of a new day; the previous day is kept as an earlier day if it has presses.
+        """Return the data at the beginning of a new day, with these data as an earlier day if they have presses.
 
-        At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the first one is omitted.
+        At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the oldest day is dropped.
         """
         pressed = len(self.presses_uT) + len(self.labels) > 0
         earlier = (*self.earlier, replace(self, earlier=())) if pressed else self.earlier
@@ -227,9 +233,10 @@ class CalibrationData:
         return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
 
     def joined_to(self, last: "CalibrationData") -> "CalibrationData":
-        """Return the data preceded by the presses of the last day, on which the skin slid in the same way.
+        """Return these data and those of the last day as one day, for a skin that slid in the same way on both days.
 
-        As on a single day, presses spread all over the area are then used only if no other presses followed them.
+        The presses of the last day come first. The `area_uT` of the last day is kept only if no presses at unknown
+        places followed on this day. Within a day, `Universal.see` also drops `area_uT` if other presses follow.
         """
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
         even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
@@ -239,7 +246,7 @@ class CalibrationData:
 
 
 def write_calibration(data: CalibrationData, file: Path, board: str) -> None:
-    """Write calibration data to a safetensors file, which does not contain the model, but the name of its board."""
+    """Write calibration data and the name of the model's board to a safetensors file, without the model itself."""
     tensors = _arrays(data)
     for i, day in enumerate(data.earlier):
         tensors |= {EARLIER_DAY.format(i) + name: values for name, values in _arrays(day).items()}
@@ -257,7 +264,7 @@ def _arrays(day: CalibrationData) -> dict[str, np.ndarray]:
 def is_calibration(file: Path) -> bool:
     """Return whether `write_calibration` wrote this file.
 
-    Raises SchemaError if the file is damaged, unless it is too large for a file of calibration data.
+    A file that is too large for calibration data is not read. Raises SchemaError if a smaller file is damaged.
     """
     formats = FORMAT, FORMAT_3, FORMAT_2, FORMAT_1
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in formats
@@ -336,7 +343,7 @@ def _read_day(
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels
-PRIOR_N = 40.0  # the prior, an inflation of 1, counts like this number of labelled coordinates (docs/learning.md)
+PRIOR_N = 40.0  # weight of the prior (an inflation of 1), as a number of labelled coordinates (docs/learning.md)
 NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| of a standard normal z
 
 # Held-out labels: estimates with each power, and true places in mm.
@@ -348,8 +355,8 @@ class LikelihoodPowers:
     """Likelihood powers for a misfit of 1, tabulated by numbers of presses and labels; determined on simulated skins.
 
     anywhere: powers by number of presses at unknown places, then by number of labels. even: powers by number of labels,
-    for presses that are evenly spread over the skin. The logarithm of the power is interpolated linearly between
-    tabulated numbers of labels. A number of presses that is not tabulated is rounded down to a tabulated one.
+    for presses that are evenly spread over the skin. Between tabulated numbers of labels, the logarithm of the power is
+    interpolated linearly. A number of presses that is not tabulated is rounded down to the next tabulated number.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
@@ -414,7 +421,7 @@ def variance_inflation(errors_sd: Float[np.ndarray, "m 2"]) -> float:
     """Return the variance inflation for errors that are divided by their estimated standard deviations.
 
     The inflation is the square of (mean absolute error / mean absolute value of a standard normal variable). Absolute
-    errors are used because they are less sensitive to outliers than squared errors. The prior of weight `PRIOR_N` pulls
-    the inflation towards 1.
+    errors are used because they are less sensitive to outliers than squared errors. The prior, which has the weight
+    `PRIOR_N`, moves the inflation towards 1.
     """
     return ((PRIOR_N + float(errors_sd.sum()) / NORMAL_MEAN) / (PRIOR_N + errors_sd.size)) ** 2

@@ -1,9 +1,9 @@
 """Export the estimate of a calibrated skin for programs without Python: as an ONNX file or as C code.
 
 After calibration, the estimate is a fixed function of the field changes. `SkinFunction` contains all numbers of this
-function. `build_onnx` expresses it with ONNX operators, and `estimate.h` in C99. Both follow `Evaluation.combined` and
-`reskin.universal.kernels`. They use the same numbers as Python, but compute in double precision where Python uses
-single precision; the C code can also be compiled with single precision.
+function. `build_onnx` expresses the function with ONNX operators, and `estimate.h` implements it in C99. Both follow
+`Evaluation.combined` and `reskin.universal.kernels`, and use the same numbers as the Python code. However, they compute
+in double precision where the Python code uses single precision. The C code can also be compiled for single precision.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 OPSET, IR = 17, 8  # ONNX versions from 2022, which current runtimes support
 C_CODE = Path(__file__).with_name("estimate.h")
 NUMBERS_PER_LINE = 8
-REAL, SINGLE = "%.16e", "%.8ef"  # formats that represent numbers exactly in double and in single precision
+REAL, SINGLE = "%.16e", "%.8ef"  # formats that preserve all digits of double and single precision
 OUTPUTS = {  # output -> shape after the axis of readings
     "place_mm": [2], "sd_mm": [2], "force_N": [], "sd_log_N": [], "misfit": [], "change_uT": [], "contact": [],
 }  # fmt: skip
@@ -42,10 +42,11 @@ OUTPUTS = {  # output -> shape after the axis of readings
 class SkinFunction:
     """All numbers of the function from field changes (along the chips' axes) to the estimate of one skin.
 
-    turn: rotation of readings to the board's axes; negative if the skin is turned by a quarter. noload_uT: the field
-    to which changes are relative. hypotheses, unlabelled: Gaussians of the map, and of the map that is not conditioned
-    on few known forces (`Evaluation.unlabelled`). few_mm, few_log_N: the presses with these forces. contact_uT: least
-    |dB| of a contact, after multiplication by `suppressor`; None if unknown.
+    turn: matrix that rotates readings to the board's axes, with the opposite sign if the skin is turned by a quarter.
+    noload_uT: no-load field that is subtracted from readings. hypotheses, unlabelled: Gaussians of the map, and, if
+    only few forces are known, of the map that is not conditioned on these forces (`Evaluation.unlabelled`). few_mm,
+    few_log_N: places and log forces of the presses with these forces. contact_uT: least |dB| of a contact, after
+    multiplication by `suppressor`; None if unknown.
     """
 
     about: Mapping[str, str]
@@ -176,7 +177,7 @@ def write_onnx(of: SkinFunction, file: Path) -> None:
 
 
 def build_onnx(of: SkinFunction) -> "ModelProto":
-    """Build the ONNX model of a skin's estimate; its input `db_uT` are field changes along the chips' axes [f, ch]."""
+    """Build the ONNX model of a skin's estimate; the input `db_uT` has field changes along the chips' axes [f, ch]."""
     try:
         from onnx import TensorProto, checker, helper
     except ImportError:
@@ -413,7 +414,7 @@ def _c_numbers(of: SkinFunction) -> Iterator[str]:
 
 
 def _c_array(kind: str, name: str, values: np.ndarray, form: str) -> Iterator[str]:
-    """Yield the lines of an array of numbers, in this format."""
+    """Yield the lines that define an array of numbers, each number in the format `form`."""
     texts = [form % value for value in values.ravel().tolist()]
     yield f"static const {kind} reskin_{name}[{len(texts)}] = {{"
     for i in range(0, len(texts), NUMBERS_PER_LINE):

@@ -1,8 +1,9 @@
 """Calibration of a skin's force: a line from estimated to true log forces, fitted to presses with known forces.
 
-The field change of a press grows slowly with its force, about as F^0.2 to F^0.3 on recorded boards. An error of the
-law therefore changes the estimated force several times as much, and by a similar factor all over one skin. The
-line corrects that factor and its growth with force.
+The field change of a press grows slowly with its force, about as F^0.2 to F^0.3 on recorded boards. If the field change
+according to the law (`reskin.universal.law`) has an error, it therefore causes a relative error of the estimated force
+that is several times as large. This error is a similar factor all over one skin. The line corrects this factor and its
+growth with force.
 """
 
 import math
@@ -26,29 +27,32 @@ class LinePrior(NamedTuple):
     scatter_sd: float
 
 
-# Estimators of the log force, with priors of their lines. Lines that are fitted to simulated skins have these means and
-# standard deviations, for errors of the law as in training (in brackets: twice as large).
+# Estimators of the log force, and priors of their lines. "combined" uses map and networks, "map" the map alone.
+# Lines that are fitted to simulated skins have the following means and standard deviations if the errors of the law are
+# as large as in training (in brackets: twice as large).
 # "combined": intercept -0.1 +- 0.35 (-0.7 +- 0.6), slope 1.0 +- 0.1 (1.0 +- 0.15), scatter 0.36 (0.55).
 # "map": intercept -0.3 +- 0.5 (-1.4 +- 1.1), slope 1.15 +- 0.15 (1.5 +- 0.5).
-# The priors are between both. That of "combined" has the mean (0, 1), which leaves forces as they are without a label.
+# Each prior is between the two cases. The prior mean of "combined" is (0, 1), so that forces are not changed if none is
+# known.
 PRIORS = {
     "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
     "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
 }
 ESTIMATORS = tuple(PRIORS)
 # With `FEW_N` or more known forces, "map" is used unless the labels clearly favour another estimator. With fewer,
-# "combined" is used: it is better on simulated skins with one known force.
+# "combined" is used, because it is more accurate on simulated skins with one known force.
 FEW_N = 5
 FEW_ESTIMATOR, DEFAULT = "combined", "map"
-MARGIN = 3.0  # log likelihood of the labels by which another estimator must exceed the default; assumed
+MARGIN = 3.0  # difference of the labels' log likelihoods by which an estimator must exceed the default; assumed
 
 
 @dataclass(frozen=True)
 class ForceLine:
-    """Gaussian belief about a skin's line from an estimated log force to the true one, and the scatter about it.
+    """Distribution of a skin's line, which converts estimated log forces to true ones, and the scatter about the line.
 
-    estimator: which estimate of the log force is calibrated, one of `ESTIMATORS`. mean, cov: of intercept (at
-    `LOG_CENTRE_N`, minus that value) and slope. scatter_var: variance of single log forces about the line.
+    estimator: which estimate of the log force is calibrated, one of `ESTIMATORS`. mean, cov: mean and covariance of the
+    line's intercept and slope, which have a normal distribution. With c = `LOG_CENTRE_N`, the line is true log force -
+    c = intercept + slope (estimated log force - c). scatter_var: variance of single log forces about the line.
     """
 
     estimator: str
@@ -68,7 +72,7 @@ class ForceLine:
         residual = deviation - row @ posterior.mean
         squared = float(
             residual @ residual + ((row @ posterior.cov) * row).sum()
-        )  # expected, given the line's posterior
+        )  # expected value under the line's posterior
         scatter_var = (SCATTER_LABELS_N * self.scatter_var + squared) / (SCATTER_LABELS_N + len(residual))
         return self._update(row, deviation, scatter_var)
 
@@ -87,8 +91,9 @@ def prior_line(estimator: str = FEW_ESTIMATOR) -> ForceLine:
 def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[np.ndarray, " m"]) -> ForceLine:
     """Fit the line to presses with known forces, and select the estimator.
 
-    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With more, it is `DEFAULT`, unless another one
-    makes the labels, each predicted from the others, more likely by a factor of at least exp(MARGIN).
+    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With `FEW_N` labels or more, it is `DEFAULT`,
+    unless the labels are more likely under another estimator by a factor above exp(MARGIN). For this comparison, each
+    label is predicted from the other labels.
 
     Parameters
     ----------
@@ -104,7 +109,7 @@ def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[
 
 
 def _held_out_likelihood(estimator: str, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> float:
-    """Return the sum of the log likelihoods of the labels, each under the line fitted to the others."""
+    """Return the sum of the log likelihoods of the labels, each under the line fitted to the other labels."""
     total = 0.0
     for i in range(len(log_N)):
         others = np.arange(len(log_N)) != i

@@ -1,8 +1,8 @@
-"""Physics inversion, a reference method: fit a law to one skin, then search for the place and force of each reading.
+"""Physics inversion, a reference method: fit the law to one skin, then search for the place and force of each reading.
 
-The law is fitted by least squares to the no-load field and to presses at unknown places, starting from nominal
-parameters. If the law does not describe a skin, the residuals of the search are large. Places are in the board's frame,
-and fields are along its axes.
+The law (`reskin.universal.law`) is fitted by least squares to the no-load field and to presses at unknown places,
+starting from nominal parameters. If the law does not describe a skin, the residuals of the search are large. Places are
+in the board's frame, and fields are along its axes.
 """
 
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from reskin.universal.map import FORCES_N, NOMINAL, lattice_mm
 # Modulus and label offset keep their nominal values, because unlabelled presses do not determine them.
 PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
 LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin must be above its chips and be magnetised
-PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded boards instead
-ROUNDS_N = 3  # each round searches places with the current law, then fits parameters and places together
+PRIOR_WEIGHT = 0.5  # weight of the prior; assumed, whereas that in `law.fit` was chosen on recorded boards
+ROUNDS_N = 3  # each round finds places with the current law, then fits parameters and places together
 EVALUATIONS_MAX_N = 8  # maximum number of least-squares steps per round
 STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in x or y, and in log force
 REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # largest |x| and |y|; smallest and largest force
@@ -66,7 +66,7 @@ def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
 
 
 def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
-    # Squared distances of readings from points, without |dB|^2, which does not change which point is nearest.
+    # Squared distances of readings from points, without the term |dB|^2, which is the same for all points.
     distance_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T
     nearest = distance_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[nearest], known.slope_uT[nearest]
@@ -91,7 +91,7 @@ def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Joint least-squares fit of the law's parameters, followed by x, y and log F of each press."""
+    """Joint least-squares fit of the law's parameters and of x, y and log F of each press (in this order)."""
 
     law: Law
     setup: Setup

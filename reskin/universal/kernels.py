@@ -1,7 +1,7 @@
-"""Compiled loops of the map: likelihoods of hypotheses given readings, and moments over all hypotheses.
+"""Compiled loops of `reskin.universal.map`: likelihoods of hypotheses given readings, and moments over hypotheses.
 
 A hypothesis is a pair of a place and a force; the force index varies fastest. The Gaussian of a hypothesis, with mean m
-and covariance C, is stored as W and W m, where W'W is the inverse of C. For a reading d, chi^2 = |W d - W m|^2.
+and covariance C, is stored as W and W m, where W^T W is the inverse of C. For a reading d, chi^2 = |W d - W m|^2.
 Likelihoods are computed in single precision. The error of chi^2 is below 0.01 for hypotheses under which a reading is
 likely.
 """
@@ -32,8 +32,8 @@ class LinearMeans:
 class Gaussians:
     """Whitened Gaussians, and the log determinants of their covariances.
 
-    row: axis `f` has, for each channel, the channel's element of W m and then its row of W up to the diagonal (W is
-    lower triangular); axis `h` has the Gaussians.
+    row: one column per Gaussian (axis `h`). Along axis `f`, each channel has its element of W m, followed by its row of
+    W up to the diagonal, because W is lower triangular.
     """
 
     row: Float32[np.ndarray, "f h"]
@@ -48,7 +48,7 @@ class Gaussians:
         return chi2, chi2 + self.log_det
 
     def solve(self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n ch"]:
-        """Return C^-1 (d - m) for each reading d, with mean m and covariance C of one Gaussian per reading."""
+        """Return C^-1 (d - m) for each reading d; mean m and covariance C are those of the Gaussian `which`."""
         row, solved, f = self.row[:, which], np.zeros_like(read), 0
         for i in range(read.shape[1]):
             to_mean, white = row[f], row[f + 1 : f + 2 + i].T
@@ -74,7 +74,7 @@ def whiten(
 
     `parameters` has the mean of the parameters and the lower Cholesky factor L of their covariance. With
     M = mean + slope @ (mean of the parameters), a Gaussian has the mean M + |M| residual and the covariance
-    (slope L)(slope L)' + |M|^2 share error_cov + noise_cov.
+    (slope L)(slope L)^T + |M|^2 share error_cov + noise_cov.
     """
     channels_n = len(error_cov)
     row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
@@ -146,7 +146,7 @@ def _spread(slope, root, s):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _cov(s, var, error_cov, noise_cov, a):
-    # Compute the lower triangle of the covariance s s' + var error_cov + noise_var I.
+    # Compute the lower triangle of the covariance s s^T + var error_cov + noise_cov.
     for i in range(len(a)):
         for j in range(i + 1):
             for lane in range(LANES_N):
@@ -174,7 +174,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # Compute the inverse of the Cholesky factor in `a`; the inverse is lower triangular, too.
+    # Compute the inverse of the Cholesky factor in `a`. The inverse is lower triangular, too.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -274,7 +274,7 @@ def products(
 
     The fourth array contains the mean log forces of the map alone, weighted by the power `force_power` of its
     probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
-    likelihoods. power: power of the product; it affects standard deviations only.
+    likelihoods. power: power of the product, which affects only standard deviations.
     """
     moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power, force_power), moments)
@@ -392,8 +392,8 @@ def _most(values):
 @njit(inline="always")
 @no_type_check
 def _exp(x):
-    # Exponential of x <= 0: Taylor series for x / 512, squared nine times, because the library's exp is not vectorised.
-    # The relative error is at most 1e-9 for x >= -100, and 5e-7 at x = -200.
+    # Return exp(x) for x <= 0: the Taylor series of exp(x / 512), squared nine times. The library's exp is not used,
+    # because it is not vectorised. The relative error is at most 1e-9 for x >= -100, and 5e-7 at x = -200.
     p = (-FARTHEST if x < -FARTHEST else x) * (1 / 512)
     y = p * (1 / 24 + p * (1 / 120 + p * (1 / 720 + p * (1 / 5040 + p * (1 / 40320)))))
     y = 1.0 + p * (1.0 + p * (1 / 2 + p * (1 / 6 + y)))

@@ -1,4 +1,4 @@
-"""The law of a skin: eleven fitted parameters that determine the field change for any place and force.
+"""The law of a skin: a simulation with eleven fitted parameters that gives the field change for any place and force.
 
 This module also fits the law to the presses of one board. Units: uT, mm, N.
 """
@@ -24,7 +24,7 @@ HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y| and largest |x| + |y| of th
 
 @dataclass(frozen=True)
 class Area:
-    """The places that are pressed: a rectangle around the board's centre, or the octagon that is left without corners.
+    """The places that are pressed: a rectangle around the board's centre, without its corners if `octagon` is set.
 
     The octagon has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
     """
@@ -55,12 +55,12 @@ def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[
 # Quadrature rule for the skin's field, the same as in scene `quick`: the cheapest rule whose error is below 2 % of the
 # field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
-COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; the law itself has larger errors
+COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; its error is smaller than that of the law
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board; all but the first seven are the same for all boards of a rig."""
+    """Parameters of one skin on its board. The first seven differ between boards; the others are the same for a rig."""
 
     seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
@@ -75,7 +75,7 @@ class Law:
     give_y_um: float
     # The following parameters are not fitted.
     lets_go_N: float = 8.0  # force at which the slide `away_um_mm` vanishes; chosen on both boards of scene lab
-    grip_N_mm: float = 8.75  # lateral stiffness, 7 N/mm, over friction coefficient, 0.8 (nominal.yaml: skin.hold)
+    grip_N_mm: float = 8.75  # lateral stiffness (7 N/mm) / friction coefficient (0.8), from nominal.yaml: skin.hold
     tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
@@ -85,14 +85,14 @@ class Law:
 class Setup:
     """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area.
 
-    start_law: the law at which fits start, which is also the mean of their priors; by default `START`.
+    start_law: the law at which fits start, and the mean of the fits' priors; by default `START`.
     """
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # all fields have the opposite sign, as after a rotation of a checkerboard skin by 90 degrees
+    skin_flipped: bool  # whether all fields have the opposite sign, as if a checkerboard skin is rotated by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
     coarse_rule: Quadrature = COARSE
@@ -113,7 +113,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Dipoles of the magnetised, undeformed skin; its centre is at the origin."""
+        """Dipoles of the magnetised, undeformed skin; the skin's centre is at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -177,7 +177,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes of the nominal skin: without fitted parameters or sliding, with forces from `layer`."""
+    """Return the field changes of the nominal skin, which does not slide, for forces according to `physics.layer`."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -235,7 +235,8 @@ PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-# Parameters that may differ between boards. When only these are fitted, the others come from a fit to another board.
+# Parameters that may differ between boards. If only these are fitted, the other parameters come from a fit to another
+# board.
 SEVEN = (*OF_BOARD, "rotation_deg")
 PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of |dB|^2
 # Weight of the residuals that compare the growth of |dB| with force. Each group of presses has one such residual: the
@@ -258,7 +259,7 @@ class AlignedPresses:
 
 
 def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law | None = None) -> Law:
-    """Fit the named parameters by least squares; the others keep their values in `start` (default: `setup.start`)."""
+    """Fit the named parameters by least squares; other parameters are those of `start` (default: `setup.start`)."""
     start = start or setup.start
     magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)

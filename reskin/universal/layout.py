@@ -1,6 +1,6 @@
 """The layout of a board for which the universal model is made: chips, skin, tip and area of presses.
 
-A user writes a layout as a YAML file like those in the folder `layouts`, which explain each key.
+A user writes a layout as a YAML file. In the folder `layouts`, `reskin.yaml` explains each key.
 """
 
 import math
@@ -26,9 +26,9 @@ from reskin.universal.population import THICKNESSES, TIPS, Forces
 
 FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
 FORCES_N = 9  # number of tabulated forces
-CHIPS_APART_MM = 0.5  # chips are larger than this distance
+CHIPS_APART_MM = 0.5  # smallest distance between two chips; a chip is larger
 EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
-SIDE_MM = 20.0  # side of the paper's skin; the cells of larger skins are larger by the same factor
+SIDE_MM = 20.0  # side of the paper's skin; quadrature cells grow in proportion to larger skins
 
 Coordinate = Annotated[float, Field(ge=-200, le=200)]
 Length = Annotated[float, Field(gt=0, le=200)]
@@ -46,7 +46,7 @@ class ChipPlace(Strict):
 
 
 class SkinStack(Strict):
-    """The nominal skin. The model is also trained on skins that differ from it."""
+    """The nominal skin. The model is also trained on skins that differ from the nominal skin."""
 
     size_mm: tuple[Length, Length]
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
@@ -65,7 +65,7 @@ class PressArea(Strict):
 
 
 class BoardLayout(Strict):
-    """Everything that the universal model must know about a board and its skin before it is trained."""
+    """Everything about a board and its skin that the universal model must know before training."""
 
     name: Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     chips: Annotated[tuple[ChipPlace, ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
@@ -75,7 +75,7 @@ class BoardLayout(Strict):
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     area: PressArea
     force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]  # least, largest
-    # Standard deviations of parameters of the law that replace those in `map.NOMINAL_SPREADS`.
+    # Standard deviations of the law's parameters, which replace the values in `map.NOMINAL_SPREADS`.
     spreads: dict[str, Annotated[float, Field(gt=0, le=100)]]
 
     @model_validator(mode="after")
@@ -145,7 +145,7 @@ class BoardLayout(Strict):
 
     @property
     def forces(self) -> Forces:
-        """Distribution of forces in training; a fifth of the presses is lighter than ten times the smallest force."""
+        """Distribution of forces in training; a fifth of the presses have at most ten times the least force."""
         least_N, largest_N = self.force_N
         between_N = min(10 * least_N, (least_N * largest_N) ** 0.5)
         return Forces(between_N, largest_N / 0.95, light_N=least_N, light_share=0.2)
@@ -187,7 +187,7 @@ class BoardLayout(Strict):
 
 
 def read_layout(file: Path | str) -> BoardLayout:
-    """Read a layout from a YAML file, or one that comes with the project, by name: reskin, anyskin or eflesh.
+    """Read a layout from a YAML file, or a layout of the project by its name: reskin, anyskin or eflesh.
 
     Raises
     ------

@@ -32,8 +32,9 @@ from reskin.universal.law import (
 PITCH_MM, STEPS_MAX_N = 0.8, 28  # lattice of places: pitch, and largest number of places along each axis
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
 LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is the standard deviation of their logarithm
-# Standard deviations of a skin's parameters about the mean of known boards of the same rig, or about nominal parameters
-# if no board is known. Assumed, and larger than the differences between the two recorded boards.
+# Standard deviations of a skin's parameters. RIG_SPREADS: about the mean of known boards of the same rig.
+# NOMINAL_SPREADS: about nominal parameters, if no board is known. The values are assumed. They are larger than the
+# differences between the two recorded boards.
 RIG_SPREADS = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
     "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
@@ -43,10 +44,10 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# Nominal parameters. The form of the law, `away_um_mm` and `lets_go_N` come from the recorded boards of scene lab, as
-# does the pair of gap and amplitude: many such pairs fit a board about equally well, and this one is among them.
-# `away_um_mm` is the slide of the skin towards its centre under a press, in um per mm of distance from the centre. The
-# modulus is that of Dragon Skin 10 with filler (150 to 230 kPa).
+# Nominal parameters. The form of the law, `away_um_mm` and `lets_go_N` come from the recorded boards of scene lab. So
+# does the pair of gap and amplitude, which is one of many pairs that fit a board about equally well. `away_um_mm` is
+# the slide of the skin towards its centre under a press, in um per mm of distance from the centre. The modulus is that
+# of Dragon Skin 10 with filler (150 to 230 kPa).
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
 STEP = 0.4  # step of the finite differences that give the slopes, in units of the parameters' spreads
 
@@ -130,7 +131,7 @@ Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
 NOISE = 0.1  # fraction of the errors' variance that differs between presses at the same place
 SHARED = 0.55  # fraction of the errors' variance that boards have in common
-EVEN = 0.5  # weight of an isotropic matrix in the covariance between channels, which few boards do not determine well
+EVEN = 0.5  # weight of an isotropic matrix in the covariance between channels, which a few boards determine poorly
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ class Residual:
     log_N: Float[np.ndarray, " m"]
     solved: Float[np.ndarray, "m ch"]  # inverse covariance of the known errors times these errors
     channel_cov: Float[np.ndarray, "ch ch"]  # covariance between channels, with a trace of 1
-    noise: float  # variance of the errors that differs between presses at the same place, relative to the total
+    noise: float  # part of the errors' variance that differs between presses at the same place, relative to the total
 
     def at(self, place_mm: Float[np.ndarray, "n 2"], log_N: Float[np.ndarray, " n"]) -> Relative:
         """Return the law's expected relative errors for presses at these places with these log forces."""
@@ -161,9 +162,9 @@ def fit_residual(
 ) -> Residual:
     """Fit a Gaussian process to the law's relative errors on known boards.
 
-    The errors on a board are the sum of a part that all boards have in common and a part of this board alone. The
-    prediction for a new board is `SHARED` times the errors on the known board if there is only one, and close to the
-    mean error if there are many.
+    The errors on a board are the sum of a part that all boards have in common and a part that differs between boards.
+    If there is only one known board, the prediction for a new board is `SHARED` times the errors on the known board. If
+    there are many, it is close to the mean of their errors.
     """
     board_i = np.repeat(np.arange(len(errors)), [len(board) for board in errors])
     at_mm, log_N, error = np.concatenate(place_mm), np.log(np.concatenate(force_N)), np.concatenate(errors)
@@ -194,7 +195,7 @@ class Information:
     """Information about the parameters from one unlabelled press, under each hypothesis about its place and force."""
 
     matrix: Float32[np.ndarray, "h tt"]  # information matrix, flattened
-    per_uT: Float32[np.ndarray, "h ch t"]  # information vector per uT by which a channel deviates from its mean
+    per_uT: Float32[np.ndarray, "h ch t"]  # information vector, per uT of a channel's deviation from its mean
 
 
 @dataclass(frozen=True)
@@ -261,9 +262,10 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
     return Hypotheses(place_mm, log_N, mean_uT, slope_uT, expected, error_cov, external_cov)
 
 
-# How a skin slides under a press can change from day to day. These parameters describe it; the others are constant.
-# Correlations between two days if the slide has changed: the first of each parameter of the slide, the second of the
-# law's errors. Both were chosen on simulated skins (tests/benchmarks/test_days_benchmark.py).
+# How a skin slides under a press can change from day to day. SLIDE: the parameters that describe the slide; all other
+# parameters are constant. SLIDE_CORRELATION and ERROR_CORRELATION: correlations between two days if the slide has
+# changed, of each parameter of the slide and of the law's errors. Both were chosen on simulated skins
+# (tests/benchmarks/test_days_benchmark.py).
 SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
@@ -273,14 +275,14 @@ ROUNDS_N = 3  # default number of rounds of expectation maximisation
 LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
 # Lattice on which the shift of presses onto the area is computed: width beyond the area, step, and largest shift.
 AREA_BEYOND_MM, AREA_STEP_MM, SHIFT_MAX_MM = 4.0, 0.2, 2.0
-DENSITY_MIN = 1e-3  # smallest density of a place relative to that inside the area, so that outliers are tolerated
-EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
+DENSITY_MIN = 1e-3  # density far outside the area, relative to that inside; above 0, so that outliers are tolerated
+EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses about the centre of the labels' frame
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates for readings: places and forces with standard deviations, and misfits of the most likely hypotheses.
+    """Estimates for readings: places and forces with standard deviations, and misfit of the most likely hypothesis.
 
     sd_log_N: standard deviation of the logarithm of the force; NaN if forces are not calibrated.
     """
@@ -326,7 +328,7 @@ class LabelledErrors:
     log_N: Float[np.ndarray, " m"]
     solved: Float[np.ndarray, "m ch"]  # inverse of the correlation matrix times the errors at these presses
     inverse: Float[np.ndarray, "m m"]  # inverse of the errors' correlation matrix
-    by_day: Float[np.ndarray, " m"]  # correlation of the errors on the day of each press with those on the current day
+    by_day: Float[np.ndarray, " m"]  # correlation of the errors between each press's day and the current day
 
 
 @dataclass(frozen=True)
@@ -334,7 +336,8 @@ class SkinMap:
     """Posterior distribution of one skin's parameters and of the law's errors on this skin.
 
     mean, cov: mean and covariance of the parameters' deviations from the central law, in units of their spreads. The
-    parameters on the current day come first; those of the slide on earlier days follow, last day first (`begin_day`).
+    parameters of the current day come first. The parameters of the slide on earlier days follow, latest day first (see
+    `begin_day`).
     """
 
     tables: Tables
@@ -380,9 +383,9 @@ class MapEvaluator:
             raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
-        """Return, for each hypothesis, the law's expected relative error, and how much of its variance remains.
+        """Return, for each hypothesis, the law's expected relative error, and the remaining fraction of its variance.
 
-        The second value is the fraction of the error's variance that remains after conditioning on the labels.
+        This fraction remains after conditioning on the labels; without labels, it is 1.
         """
         expected, labelled = skin.hypotheses.residual, skin.labelled
         if labelled is None:
@@ -399,7 +402,7 @@ class MapEvaluator:
         return Likelihoods(chi2, deviance, deviance.argmin(axis=1), db_uT.shape[1])
 
     def without_external(self, db_uT: Float[np.ndarray, "n ch"], likelihoods: Likelihoods) -> Float[np.ndarray, "n ch"]:
-        """Subtract the external field, as expected under the most likely hypothesis about each press."""
+        """Subtract the external field that is expected under the most likely hypothesis about each press."""
         external_cov = self._hypotheses.external_cov
         if external_cov is None:
             return db_uT
@@ -422,7 +425,8 @@ def new_map(
     """Return the prior map.
 
     residual: predicts the law's errors from its errors on other boards of the rig. external_cov: covariance of an
-    unknown external field that each reading may contain; without it, readings contain only the press and noise.
+    unknown external field that each reading may contain; if it is None, readings are assumed to contain only the field
+    change of the press and noise.
     """
     t, expected = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
     return SkinMap(tables, expected, lattice(tables, expected, external_cov), np.zeros(t), np.eye(t))
@@ -471,7 +475,7 @@ def move_places(skin: SkinMap, by_mm: Float[np.ndarray, "2"]) -> SkinMap:
 
 
 def shift_onto_area(estimate: Estimate, sd_mm: float, area: Area = PAPER_AREA) -> Float[np.ndarray, "2"]:
-    """Return the shift that moves places of presses onto the area, as a posterior mean.
+    """Return the shift that moves estimated places of presses onto the area, as a posterior mean.
 
     The true places are assumed to be uniformly distributed over the area. sd_mm: standard deviation of the shift's
     prior, a normal distribution with mean zero.
@@ -499,7 +503,7 @@ def condition_on_labels(
 ) -> SkinMap:
     """Condition on labelled presses: first the skin's parameters, then the law's errors near these presses.
 
-    days_ago: for each press, how often `begin_day` was called since; by default, all presses are of the current day.
+    days_ago: number of calls of `begin_day` since each press. By default, all presses are of the current day.
     """
     if not len(place_mm):
         return skin
@@ -511,7 +515,8 @@ def condition_on_labels(
     root = np.linalg.cholesky(k)
     deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
     slope = _slopes_by_day(skin, slope_uT / magnitude_uT[:, None, None], days_ago)
-    # The law's errors are correlated between presses (k) and between channels (error_cov): whiten over both.
+    # The law's errors are correlated between presses (k) and between channels (error_cov). Whiten over presses and
+    # channels.
     white = solve_triangular(
         root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
     )
@@ -527,9 +532,9 @@ def condition_on_labels(
 def begin_day(skin: SkinMap) -> SkinMap:
     """Return the map for a day on which the skin slides differently; `skin` must not be conditioned on labels.
 
-    The parameters of the slide get new values, which have a correlation of `SLIDE_CORRELATION` with those of the day
-    before; their prior is the same on all days. Their values on earlier days are appended to the parameters, because
-    labelled presses of these days depend on them.
+    The parameters of the slide get new values, which have the correlation `SLIDE_CORRELATION` with the values of the
+    day before. Their prior is the same on all days. The values of earlier days are appended to the parameters, because
+    the labelled presses of these days depend on these values.
     """
     slide_i, t, p = _slide_indices(skin), len(skin.tables.names), len(skin.mean)
     transition = np.zeros((p + len(slide_i), p))
@@ -549,7 +554,7 @@ def _slide_indices(skin: SkinMap) -> list[int]:
 def _slopes_by_day(
     skin: SkinMap, slope: Float[np.ndarray, "m ch t"], days_ago: Int64[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m ch p"]:
-    """Return slopes with respect to all parameters of a map; each press depends on the slide of its own day."""
+    """Return slopes with respect to all parameters of a map; each press depends on the slide of only its own day."""
     t, slide_i = slope.shape[2], _slide_indices(skin)
     if len(skin.mean) == t:
         return slope
@@ -572,7 +577,7 @@ def _condition(
 def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
     """Condition the Gaussian of the parameters on observations, given as information matrix and information vector.
 
-    Both may cover only the first parameters.
+    Matrix and vector may have only the first parameters of the map, if they have no information about the others.
     """
     if more_n := len(skin.mean) - len(vector):
         matrix, vector = np.pad(matrix, (0, more_n)), np.pad(vector, (0, more_n))
@@ -608,8 +613,8 @@ def expected_gain(
 ) -> Float[np.ndarray, " c"]:
     """Return how much a labelled press at each place would reduce the variance of the field changes over the skin.
 
-    The variance is that of field changes divided by |dB|, given earlier labels. It is summed over channels and averaged
-    over all places of the map, each with the median of the tabulated forces.
+    The variance is that of field changes divided by |dB|, given earlier labels. This variance is summed over channels
+    and averaged over all places of the map, for presses with the median of the tabulated forces.
     """
     hypotheses, error_cov, gains = skin.hypotheses, skin.error_cov, []
     median_force = slice(len(hypotheses.log_N) // 2, None, len(hypotheses.log_N))

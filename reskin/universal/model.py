@@ -74,32 +74,35 @@ from reskin.universal.mounting import LABELS_MIN_N, LabelFrame, Mounting, find_l
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
 # Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
-# of channels are correlated, and is not fitted to any board.
+# of channels are correlated. It is not fitted to any board.
 MAP_POWER = 0.6
-# Power of the map's probabilities of forces if the map alone estimates forces; it is below 1, because the map
-# underestimates the uncertainty of forces. It is the best of four values on simulated skins
+# Power of the map's probabilities of forces if the map alone estimates forces. It is below 1, because the map
+# underestimates the uncertainty of forces. The value is the best of four values on simulated skins
 # (tests/benchmarks/test_force_benchmark.py).
 FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networks' estimates
-FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
+FADES_PER_LABEL = 0.15  # the first correction of `network_offsets_mm` is divided by 1 + this value * labels
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
-MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+MISFIT_MAX = 4.0  # assumed chi^2 per channel above which a warning is given; about 1 for skins like in training
 # If the no-load field differs from that of the saved calibration by more than this fraction, a warning says that this
-# may be another skin. In scene lab, recordings of one board differ by at most 5 %, those of the two boards by 65 %.
+# may be another skin. In scene lab, recordings of one board differ by at most 5 %, and recordings of different boards
+# by 65 %.
 OTHER_SKIN_MIN = 0.25
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
-# With external fields, the errors of map and networks are more strongly correlated. The power is divided by 1 +
-# external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Chosen so that intervals on simulated skins cover 90 %.
+# With external fields, the errors of map and networks are more strongly correlated. The likelihood power is therefore
+# divided by 1 + external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Both values were chosen so that 90 % intervals
+# contain 90 % of the true values on simulated skins.
 POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
-EXTERNAL_MAX_uT = 1000.0  # largest external field; with a much larger one, single precision is not sufficient
+EXTERNAL_MAX_uT = 1000.0  # largest external field; for a much larger field, single precision is not sufficient
 
-FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
+FILE = Path(__file__).with_name("universal.safetensors")  # the model's card is universal.json
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
-OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
-# Least log odds, from presses of a new day, with which the skin is assumed to slide as on the last day. Below, a change
-# is assumed, because an unnoticed change costs more accuracy than a wrongly assumed one. Chosen on simulated skins.
+OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # the spreads of these parameters give the prior of a shift of all places
+# The skin is assumed to slide as on the last day if the log odds for this, from presses of the new day, are at least
+# this value. Otherwise, a change is assumed, because an unnoticed change costs more accuracy than a wrongly assumed
+# change. The value was chosen on simulated skins.
 SAME_SLIDE_LOG_ODDS_MIN = 2.0
-UNSTORED = ("names", "area")  # fields of `Tables` that follow from the card
+UNSTORED = ("names", "area")  # fields of `Tables` that are not stored, because they follow from the card
 CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
 
@@ -107,8 +110,9 @@ CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for t
 class Evaluation:
     """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The likelihood power affects standard deviations and, in `by_map`, also places and forces. few, unlabelled: if few
-    forces are known, these presses, and likelihoods of the map without them.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces. If only few forces are
+    known, `few` has the presses with these forces, and `unlabelled` has the likelihoods of the map that is not
+    conditioned on them.
     """
 
     evaluator: MapEvaluator
@@ -121,11 +125,11 @@ class Evaluation:
     __repr__ = one_line
 
     def by_map(self, power: float) -> Estimate:
-        """Estimate with the map alone, as means over its hypotheses."""
+        """Estimate with the map alone, as means over the map's hypotheses."""
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
-        """Estimate with the networks alone; their misfit is NaN."""
+        """Estimate with the networks alone; the misfit is NaN."""
         own, unknown = self.network, np.full(len(self.network.log_N), np.nan)
         return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), unknown, unknown)
 
@@ -133,8 +137,9 @@ class Evaluation:
         """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
 
         The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
-        are computed from a power of the product. Forces are calibrated by the skin's line. If few forces are known,
-        this is so far away from these presses; close to them, the map that is conditioned on them estimates the force.
+        are computed from a power of the product. Forces are calibrated by the skin's line. If only few forces are
+        known, the line is used far from the presses with known forces. Close to these presses, the force is estimated
+        by the map that is conditioned on them.
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
         selected = ESTIMATORS.index(self.line.estimator)
@@ -150,7 +155,7 @@ class Evaluation:
 
     @cached_property
     def other_log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
-        """Log forces of the map without known forces, if this map estimates the forces; otherwise empty."""
+        """Log forces from the map that is not conditioned on few known forces, if there is one; otherwise empty."""
         return () if self.unlabelled is None else self._products(self.unlabelled, 1.0)[2]
 
     def _products(
@@ -194,7 +199,7 @@ class CalibratedModel:
     __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
-        """Return the model with its offsets added to the networks' last biases: faster, but in single precision."""
+        """Return the model with its offsets in the networks' last biases: faster, but in single precision."""
         offset_mm = sum(self.offsets_mm, np.zeros(2))
         return replace(self, networks=[shift_places(layers, offset_mm) for layers in self.networks], offsets_mm=())
 
@@ -211,7 +216,7 @@ class CalibratedModel:
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
-        """Evaluate map and networks on a block of readings; networks receive them without the external field."""
+        """Evaluate map and networks on a block of readings; the external field is subtracted for the networks."""
         evaluator, few = self.skin.evaluator, self.few
         likelihoods = evaluator.evaluate(db_uT)
         networks = self.evaluate_networks(evaluator.without_external(db_uT, likelihoods))
@@ -234,7 +239,7 @@ class HeldOutLabels(NamedTuple):
 
 
 def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
-    """Fit the calibration of forces to the labels whose force is known."""
+    """Fit the line that calibrates forces to the labels whose force is known."""
     if not any(fold.labels.known.any() for fold in folds):
         return prior_line()
     log_forces = [[log_N[fold.labels.known] for log_N in fold.evaluation.log_forces()] for fold in folds]
@@ -246,8 +251,9 @@ def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
 class PressCalibration:
     """Map and networks, conditioned on a skin's no-load field and its presses at unknown places.
 
-    earlier: the calibration to the last day on which the skin slid in another way, if any. `skin` is then conditioned
-    also on the unlabelled presses of that day and the days before, but the networks only on presses of `data`.
+    earlier: the calibration to the last day on which the skin slid in another way, if any. In this case, `skin` is also
+    conditioned on the unlabelled presses of that day and of the days before it. The networks are conditioned only on
+    presses of `data`.
     """
 
     skin: SkinMap
@@ -281,7 +287,7 @@ class PressCalibration:
 
     @cached_property
     def moved(self) -> SkinMap:
-        """The map, with its places moved onto the area of the grid if the presses are spread over it."""
+        """The map; if presses are at random places all over the area of presses, places are moved onto this area."""
         return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
 
     @property
@@ -293,9 +299,10 @@ class PressCalibration:
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        labels: those since the slide changed; labels of the days before are added. few: whether the line corrects
-        the forces of another map, which is not conditioned on presses with known forces; by default, with 1 to
-        `FEW_N` - 1 known forces, which the map and the line would otherwise use twice.
+        labels: labelled presses since the last change of the slide; labels from before this change are added. few:
+        whether the line of forces corrects the forces of a second map, which is not conditioned on presses with known
+        forces. By default, this is so if 1 to `FEW_N` - 1 forces are known, because these forces would otherwise be
+        used twice: for the map and for the line.
         """
         by_day = self.labels_by_day(labels)
         days_ago = np.repeat(np.arange(len(by_day)), [len(day) for day, _ in by_day])
@@ -313,7 +320,7 @@ class PressCalibration:
         return CalibratedModel(skin, self.layers, offsets_mm, few=few_forces)
 
     def labels_by_day(self, labels: LabelledPresses) -> list[tuple[LabelledPresses, Sequence[Layers]]]:
-        """Return groups of labels between changes of the slide, latest first, each with its networks."""
+        """Return one group of labels for each period without a change of the slide, latest first, with its networks."""
         earlier = self.earlier
         return [(labels, self.layers), *([] if earlier is None else earlier.labels_by_day(earlier.data.labels))]
 
@@ -333,8 +340,9 @@ class PressCalibration:
     def same_slide_log_odds(self, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
         """Return the log odds, for each press of a later day, that the skin slides in the same way as on this day.
 
-        These are the press's log likelihoods (summed over places and forces) under the map of this day, minus those
-        under the map for another slide. Both maps are conditioned on the labels of this day.
+        The log odds are the log likelihood of the press under the map of this day, minus its log likelihood under the
+        map for a changed slide. Likelihoods are summed over all places and forces. Both maps are conditioned on the
+        labels of this day.
         """
         same, changed = (
             logsumexp(-0.5 * skin.evaluator.evaluate(db_uT).deviance.astype(float), axis=1)
@@ -381,7 +389,7 @@ def is_same_slide(log_odds: Float[np.ndarray, " n"]) -> bool:
 
 
 class Slide(NamedTuple):
-    """Whether the skin slides under presses as on the last day of the calibration, and the log odds that it does."""
+    """Whether the skin slides under presses as on the last day of the calibration, and the log odds for this."""
 
     same: bool
     log_odds: float
@@ -422,9 +430,9 @@ def network_offsets_mm(
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return two corrections to add to the places that the networks estimate.
 
-    The first correction is `centre_mm`, which follows from unlabelled presses; its size decreases with the number of
-    labels. The second correction is the mean error that then remains for labelled presses (estimated at `estimated_mm`,
-    truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
+    The first correction is `centre_mm`, which follows from unlabelled presses, divided by a number that grows with the
+    number of labels. The second correction is the mean error that then remains for labelled presses, shrunk by a
+    Gaussian prior with mean zero. These presses are estimated at `estimated_mm` and are truly at `place_mm`.
     """
     centre_mm = centre_mm / (1 + FADES_PER_LABEL * len(place_mm))
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -445,7 +453,7 @@ class Universal:
     networks : weights of the networks
     powers : likelihood powers by numbers of presses and labels
     layout : the board and the skin that the model was made for
-    card : how the model was trained, and what it must not be used for
+    card : how the model was trained, and what the model must not be used for
     external_uT : expected size of external fields (see `load_universal`)
     """
 
@@ -468,7 +476,8 @@ class Universal:
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
-        # Calibration to the earlier days, log odds of the same slide for each press of the current day, and decision
+        # Calibration to the earlier days; log odds, for each press of the current day, that the slide is the same as on
+        # the last day; and whether it is assumed to be the same.
         self._last: PressCalibration | None
         self._press_odds: np.ndarray
         self._label_odds: np.ndarray
@@ -476,7 +485,7 @@ class Universal:
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        self._folds: list[HeldOutLabels] | None  # of the labels; None: not computed yet
+        self._folds: list[HeldOutLabels] | None  # held-out labels; None until they are computed
         self._power: float | None
         self._line: ForceLine | None
         self._restart(self._prior_map, CalibrationData.at_rest(self.tables.rest_uT))
@@ -514,10 +523,10 @@ class Universal:
         return external.covariance(self.layout.chips_mm, self.external_uT) if self.external_uT else None
 
     def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
-        """Return a matrix that shrinks external fields in readings to the size of their noise; None without the option.
+        """Return a matrix that shrinks external fields in readings to the size of noise; None if `external_uT` is 0.
 
         Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result
-        distinguishes contacts from external fields, which |dB| does not.
+        distinguishes contacts from external fields; |dB| does not.
         """
         cov = self.external_cov
         return (
@@ -538,35 +547,40 @@ class Universal:
 
     @property
     def turnable(self) -> bool:
-        """Whether a quarter turn of the skin reverses the sign of its fields, as on a checkerboard with even sides."""
+        """Whether a quarter turn of the skin reverses the sign of its fields.
+
+        This is so for a square skin that is magnetised as a checkerboard with an even number of cubes along each side.
+        """
         side_x_mm, side_y_mm = self.layout.skin.size_mm
         even = side_x_mm == side_y_mm and cubes_along(side_x_mm * milli) % 2 == 0
         return self.layout.skin.polarity == "checkerboard" and even
 
     @property
     def mounting(self) -> Mounting:
-        """Orientation of the skin on the board, with the odds for it; raises SchemaError before `zero`."""
+        """Orientation of the skin on the board, and its log odds; raises SchemaError before `zero`."""
         if not self.zeroed:
             raise SchemaError("mounting: the model has no no-load reading. First call zero.")
         return find_mounting(self.tables, self._sign * self._data.rest_uT, turned=self._data.turned)
 
     @property
     def label_frame(self) -> LabelFrame | None:
-        """Most probable orientation of the axes of the current day's labels, unless it is the given one.
+        """Most probable orientation of the axes of the current day's labels other than the given one, and its log odds.
 
-        None if there are few labels on the current day. Labels of earlier days are assumed to be right.
+        None if there are fewer than `LABELS_MIN_N` labels on the current day. The axes of earlier days' labels are
+        assumed to be right.
         """
         labels, data = self._data.labels, self._calibration.data
         if len(labels) < LABELS_MIN_N:
             return None
-        earlier = data.labels[: len(data.labels) - len(labels)]  # if the slide is the same; the current labels are last
+        # If the slide is the same, `data` has labels of earlier days, followed by those of the current day.
+        earlier = data.labels[: len(data.labels) - len(labels)]
         power = self.powers.power_for(len(data.presses_uT), len(earlier), even=len(data.even_uT) > 0)
         without_current = self._calibration.with_labels(earlier)
         return find_label_frame(without_current.estimate(labels.db_uT, [power])[0], labels.place_mm)
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences for the user about a wrong unit, another skin, and a wrong orientation of the skin or of labels."""
+        """Warnings about a wrong unit, another skin, or a wrong orientation of the skin or of the labels."""
         if not self.zeroed:
             return []
         usual_uT = float(np.median(np.linalg.norm(self.noload_uT.reshape(-1, 3), axis=1)))
@@ -648,12 +662,12 @@ class Universal:
 
         Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
         already calibrated to. The no-load field also shows whether the skin is turned by 90° (see `mounting`);
-        set `turned` if you know it. The model is changed in place and returned.
+        set `turned` if you know the orientation. The model is changed in place and returned.
 
         Raises
         ------
-        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; a quarter
-            turn does not reverse the fields of the layout's skin, but `turned` is set; or `keep` is set, and `turned`
+        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; `turned` is
+            set, but a quarter turn does not reverse the fields of the layout's skin; or `keep` is set, and `turned`
             contradicts the earlier calibration
         """
         noload_uT = check_readings(b_uT, self.channels_n)
@@ -684,10 +698,10 @@ class Universal:
 
         The readings are fields as the board sends them, not field changes: the no-load reading is subtracted here.
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
-        expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
+        expectation maximisation with its presses. Each later call makes one round. Set `even` if these and all earlier
         presses together are evenly spread over the skin (for example a grid with one press per place), so that their
-        mean place is the skin's centre. Set `area` if they all are at random places all over the layout's area of
-        presses (paper's board: an octagon 16 mm wide): places are then moved onto this area.
+        mean place is the skin's centre. Set `area` if these and all earlier presses are at random places all over the
+        layout's area of presses (paper's board: an octagon 16 mm wide). Estimated places are then moved onto this area.
         """
         if even and area:
             raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
@@ -780,7 +794,7 @@ class Universal:
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return the result of `estimate` for each likelihood power; only the places' standard deviations differ."""
+        """Return the estimates for each likelihood power; they differ only in the standard deviations of places."""
         estimates = self.calibrated.estimate(self._change(b_uT), powers)
         return [replace(estimate, place_mm=estimate.place_mm + self._centre_mm) for estimate in estimates]
 
@@ -881,7 +895,7 @@ class Universal:
         return self._last is not None and is_same_slide(np.concatenate([press_odds, label_odds]))
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Replace the calibration: `press_map` is conditioned on the unlabelled presses, and now on the labels."""
+        """Replace the calibration; `press_map` is conditioned on all data except the labels, which are added here."""
         joined, earlier = join_day(data, self._last, same=self._same_slide)
         missing = np.isnan(self._misfits)
         if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
@@ -903,9 +917,9 @@ def load_universal(
     """Load a universal model, calibrated to a skin if `calibration` is a file from `save`.
 
     new_day: set it if the skin may slide under presses in another way than when the file was saved, for example a day
-    later. The presses in the file are then those of an earlier day, with which further presses are compared (see
-    `Universal.slide`). Either the skin slides in the same way, and all presses are used together; or it does not, and
-    those of the earlier day are used only for the skin's constant properties. Until there are presses, a change is
+    later. The presses in the file are then presses of an earlier day, and new presses are compared with them (see
+    `Universal.slide`). If the skin slides in the same way, all presses are used together. If it does not, the presses
+    of the earlier day are used only for the skin's constant properties. Until there are new presses, a change is
     assumed.
     file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
     external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change

@@ -1,10 +1,10 @@
-"""Find the orientation of a skin from its no-load field, and that of its labels from presses at known places.
+"""Find the orientation of a skin from the no-load field, and that of the labels' axes from presses at known places.
 
-The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after a quarter turn
-(or three), every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
+The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after one or three
+quarter turns, every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
 down, fields have the same sign and are about 1.3 times as large. Without a check, the universal model would estimate
-wrong places on a turned skin, and without a warning: the field change of a press resembles that of a press on the
-opposite side of a skin that is not turned.
+wrong places on a turned skin, without a warning. The reason is that the field change of a press on a turned skin
+resembles that of a press on the opposite side of a skin that is not turned.
 """
 
 from collections.abc import Mapping
@@ -18,14 +18,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from reskin.universal.map import Estimate, OFFSET_uT, Tables
 
-LOG_ODDS_MIN = 2.0  # a smaller log odds of the found orientation is reported as uncertain (odds of 7 to 1)
+LOG_ODDS_MIN = 2.0  # an orientation with smaller log odds is reported as uncertain (odds of 7 to 1)
 NOLOAD_MISFIT_MAX = (
     12.0  # a no-load field with a larger chi^2 per channel is reported as unusual; few skins exceed this
 )
 LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
-FRAME_LOG_ODDS_MIN = 5.0  # other axes of the labels are reported if their log odds are at least this (odds of 150 to 1)
+FRAME_LOG_ODDS_MIN = 5.0  # another orientation of the labels' axes is reported if its log odds are at least this
 FRAME_SD_MM = 1.0  # standard deviation of place errors that the estimated uncertainty does not include
-OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0  # share of presses whose estimates are useless; they may be anywhere on this area
+OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0  # share of presses whose estimates are useless: anywhere on an area of this size
 
 TURNED = "turned by a quarter"
 
@@ -35,8 +35,8 @@ class Mounting:
     """Orientation of a skin on its board.
 
     turned: whether the signs of all fields are opposite to those on the recorded boards. log_odds: logarithm of the
-    probability of this orientation divided by that of the other one; negative if the other one fits better. misfit:
-    chi^2 per channel of the no-load field.
+    probability of this orientation divided by that of the other orientation; negative if the other orientation fits
+    better. misfit: chi^2 per channel of the no-load field.
     """
 
     turned: bool
@@ -77,8 +77,8 @@ class Mounting:
 def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
     """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
 
-    A skin is taken as turned only if the log odds for it are at least `LOG_ODDS_MIN`. The no-load field has a normal
-    distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
+    A skin is taken as turned only if the log odds for this orientation are at least `LOG_ODDS_MIN`. The no-load field
+    has a normal distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
     """
     covariance = _noload_covariance(tables)
     chi2 = {}
@@ -99,9 +99,9 @@ def _noload_covariance(tables: Tables) -> tuple[Float[np.ndarray, "ch ch"], bool
 
 @cache
 def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
-    """Return the eight possible orientations of the labels' axes, by name: four turns, each also mirrored.
+    """Return the eight possible orientations of the labels' axes by name: four turns, each with and without mirroring.
 
-    A matrix converts labelled places to those places that they would be in the given orientation.
+    The matrix of an orientation converts labelled places to true places, if the labels' axes have this orientation.
     """
     quarter, mirror_x = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
@@ -117,7 +117,8 @@ def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
 class LabelFrame:
     """Most probable orientation of the labels' axes other than the given one.
 
-    log_odds: logarithm of its probability divided by that of the axes as given; above 0 if it fits better.
+    log_odds: logarithm of the probability of this orientation divided by that of the given one; above 0 if this one
+    fits better.
     """
 
     name: str
@@ -134,9 +135,11 @@ class LabelFrame:
 
 
 def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame:
-    """Find the most probable other axes of labelled places, by estimates of these places without the labels.
+    """Find the most probable orientation of the labels' axes other than the given one.
 
-    Both are relative to the board's centre. Errors are normally distributed, with a share of outliers.
+    `estimate` has the estimates of the labelled places by a model that is not calibrated to these labels. Estimated and
+    labelled places are relative to the board's centre. Errors are assumed to be normally distributed, with a share of
+    outliers.
     """
     log_p = {name: _log_likelihood(estimate, place_mm @ matrix.T) for name, matrix in frames().items()}
     as_given = log_p.pop("as given")

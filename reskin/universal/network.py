@@ -1,7 +1,7 @@
 """The network of the universal model, evaluated in NumPy.
 
-A set encoder computes a code of the skin, which conditions a regressor. `reskin.universal.training` trains the weights
-with PyTorch.
+A set encoder computes a code from a skin's no-load field and unlabelled presses. This code conditions a regressor,
+which estimates the place and the force of readings. `reskin.universal.training` trains the weights with PyTorch.
 """
 
 import math
@@ -21,7 +21,7 @@ LENGTH_MIN_uT = 1.0  # if |dB| is smaller, dB is divided by this value instead, 
 PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
 LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
 OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
-FILM_SD = 0.02  # standard deviation of initial FiLM weights; it is small so that the code has little effect at first
+FILM_SD = 0.02  # standard deviation of initial FiLM weights; small, so that the code has little effect at first
 FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled presses
 
 

@@ -1,7 +1,7 @@
 """Simulated skins with random parameters around those of a central law, and presses on each skin.
 
-Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here: each training
-step draws them again, so that a skin never has the same field changes twice.
+Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here, because each
+training step draws new errors. A skin therefore never has the same field changes twice.
 """
 
 from collections.abc import Mapping
@@ -17,17 +17,19 @@ from reskin.universal.map import LOGARITHMIC, perturb
 
 PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most this number of presses
 PRESSES_N = 2 * PLACES_N  # presses per skin: half for conditioning, half for training
-PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press from its grid place
+PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of presses about grid places, along each axis
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
 # Variation of boards and skins in addition to that of the law's parameters. These values and the parameters' spreads
 # are assumed. Thickness and tip radius are relative to those of the setup.
 THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: probability
 TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: probability
-# In fits to the boards of scene lab, a larger gap comes with a larger amplitude, because their effects compensate.
+# In fits to the boards of scene lab, a larger gap comes with a larger amplitude, because the effects of both compensate
+# each other.
 LOG_AMPLITUDE_PER_MM = 0.95
 # Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
+# Standard deviations over chips: relative gain, cross-talk, rotation about each axis, and offset.
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
 # Least values of drawn parameters: chips must not be inside the skin, and the skin must not slide away from its centre.
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}
@@ -143,7 +145,7 @@ def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.n
 def grid(area: Area = PAPER_AREA) -> Float[np.ndarray, "65 2"]:
     """Return the places of the paper's grid, scaled to an area, in mm from its centre.
 
-    The grid has 9 x 9 places without four in each corner.
+    The grid has 9 x 9 places, except four places in each corner.
     """
     step = np.arange(-4, 5)
     steps = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)

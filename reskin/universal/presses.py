@@ -17,13 +17,14 @@ from reskin.schema import AXES_PER_CHIP_N, Readings
 # with degree 12, because the polynomial then also fits the memory.
 DRIFT_DEGREE = 4
 SERIES_MIN_N = 20  # captures with fewer presses are not used to estimate the memory
-DEPTHS_MAX_N = 10  # captures with more depths have been pressed to arbitrary depths, so few presses share a depth
-SPREAD_MIN = 0.2  # places with a smaller range of log F are not used to estimate the growth
+DEPTHS_MAX_N = 10  # in captures with more depths, depths are arbitrary, so that few presses have the same depth
+SPREAD_MIN = 0.2  # places with a smaller range of log F (F: force) are not used to estimate the growth
 
 
 @dataclass(frozen=True)
 class RecordedPresses:
-    """Presses of one skin on its board; values are means over the readings of a press, and fields are in chip axes.
+    """Presses of one skin on its board; values are means over the readings of a press, and fields are along the chips'
+    axes.
 
     group_i: index of the press's group. A group is a capture or, if depths are known, one depth of a capture. If a
         capture has more than `DEPTHS_MAX_N` depths, its groups are the thirds of its presses by depth.
@@ -125,7 +126,7 @@ def explained(simulated_uT: Float[np.ndarray, "n k 3"], recorded_uT: Float[np.nd
 
 
 def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Return the median over places of d log|dB| / d log F; None if the force varies too little at every place."""
+    """Return the median over places of d log|dB| / d log F, or None if the force F varies too little at all places."""
     log_F, log_uT = np.log(presses.force_N), np.log(magnitudes_uT(db_uT))
     slopes = []
     for place in np.unique(presses.place_mm.round(2), axis=0):
@@ -141,9 +142,10 @@ def memory(
 ) -> float | None:
     """Return the fraction of a press's field change that remains in the next no-load reading.
 
-    For each capture, no-load readings are regressed on the previous press's field change, the next press's field change
-    and a polynomial for drift; the result is the mean of the first coefficient. Captures are skipped if they are too
-    short or if successive presses have the same no-load reading. Returns None if no capture is left.
+    For each capture, no-load readings are regressed on the field change of the previous press, the field change of the
+    next press, and a polynomial for drift. The result is the mean over captures of the first coefficient. Captures are
+    skipped if they are too short or if successive presses have the same no-load reading. The result is None if all
+    captures are skipped.
     """
     coefficients = []
     for capture_i in np.unique(presses.capture_i):

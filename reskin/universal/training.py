@@ -22,7 +22,9 @@ from reskin.universal.network import (
 )
 from reskin.universal.population import Population, draw_population
 
+# AdamW with a one-cycle schedule: largest rate, weight decay, share of steps with a rising rate, limit of the gradient.
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
+# Loss: threshold and weight of the Huber loss, and weight of the likelihood that trains the standard deviations.
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
 
 
@@ -109,6 +111,6 @@ def loss_of(network: Network, batch: Batch) -> torch.Tensor:
     mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
     # The likelihood trains only the standard deviations. If it also trained the means, presses with large errors would
-    # have little influence on them, because the network would predict large standard deviations there.
+    # have little influence on the means, because the network would predict large standard deviations for these presses.
     deviation = (mean - target).detach()
     return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * exp(-2 * log_sd)).mean()

@@ -349,7 +349,7 @@ def test_report_publishes_runs_that_last_as_long_as_their_training(story):
         name = training.info.run_name
         assert (training.info.end_time - training.info.start_time) / 1e3 == pytest.approx(seconds[name], abs=0.002)
         card = json.loads((story / f"data/models/ci/train_multi/{name}.json").read_text())
-        curve = client.get_metric_history(training.info.run_id, "train_loss")
+        curve = client.get_metric_history(training.info.run_id, "loss")
         assert [point.step for point in curve] == card["curve_steps"]
     assert client.get_model_version_by_alias("reskin-ci", "champion")
     assert client.get_model_version_by_alias("reskin-universal", "champion")

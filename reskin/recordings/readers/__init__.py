@@ -17,7 +17,7 @@ class Reader(Protocol):
     """The functions that each reader module defines."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
-        """Find the files of a recording; return the path of each by its file name in the capture folder."""
+        """Find the files of a recording; return a mapping from each file's name in the capture folder to its path."""
 
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips from the columns of the collected files."""

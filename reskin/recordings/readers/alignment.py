@@ -7,15 +7,16 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 
 LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in rows
 ROWS_MIN_N = 300  # in a shorter recording, a change of the lag cannot be detected
-BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is removed
-ROUNDS_N = 4  # how many times `find_change` fits the lines and splits the rows
+BLOCK_ROWS_N = 500  # length of the blocks whose median field is subtracted, to remove slow drift
+ROUNDS_N = 4  # number of iterations in which `find_change` fits the lines and splits the rows
 OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
-# A change of the lag is reported if it reduces the sum of distances by at least the cost of this many misaligned rows.
-# In the two public recordings and in windows of them, this number is at most 12 if the lag does not change, and 40 or
-# more if a row is lost 100 rows before the end.
+# A change of the lag reduces the sum of the distances between fields and fitted lines. The change is reported if the
+# reduction is at least the mean cost of this many misaligned rows. In the two public recordings and in parts of them,
+# the reduction is that of at most 12 rows if the lag does not change, and that of 40 or more rows if a row is lost 100
+# rows before the end.
 EVIDENCE_ROWS_MIN_N = 30
-# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300
-# rows.
+# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. In 300 rows, noise alone gives
+# up to 0.17.
 CONTRAST_MIN = 0.3
 
 
@@ -36,9 +37,9 @@ def find_change(
 ) -> Change | None:  # fmt: skip
     """Return the change of the lag; None if a single lag explains the rows as well.
 
-    For each place, a line of field against force is fitted to all rows, with the current estimate of the lags. Then the
-    rows are split into two parts with different lags, such that the fields are nearest to these lines. Both steps are
-    repeated. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
+    With the current estimate of the lags, a line of field against force is fitted for each place. Then the rows are
+    split into two parts with different lags, such that the fields are as near as possible to these lines. Both steps
+    are repeated. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None
@@ -51,7 +52,7 @@ def find_change(
         lag = np.where(row < change_row, LAGS[before_i], LAGS[after_i])
     gain = distance.sum(axis=1).min() - distance[before_i, :change_row].sum() - distance[after_i, change_row:].sum()
     extra_cost = distance[after_i] - distance[before_i]
-    # Mean increase of a row's distance if it has the lag of the other part.
+    # Mean cost of a misaligned row: how much the distance of a row increases with the lag of the other part.
     misaligned = float(np.where(row < change_row, extra_cost, -extra_cost).mean())
     if misaligned <= CONTRAST_MIN * extra_cost.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
@@ -68,7 +69,7 @@ def _best_lag(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"],
 ) -> Int64[np.ndarray, " f"]:  # fmt: skip
-    """Find the single lag that fits all rows best; return it as an array with one element per row."""
+    """Find the single lag that fits all rows best; return an array with this lag for each row."""
     costs = []
     for lag_i, lag in enumerate(LAGS):
         lags = np.full(len(place), lag)
@@ -101,7 +102,7 @@ def _fit_lines(
 def _distances(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], expected_uT: Float64[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, "l f"]:
-    """Return for each lag and label row the distance in uT of the field from the expected field; 0 if unknown."""
+    """Return for each lag and label row the distance in uT of the field from the expected field; 0 if it is unknown."""
     distance = np.zeros((len(LAGS), len(field_uT)))
     row = np.arange(len(field_uT))
     known = (row + LAGS[0] >= 0) & (row + LAGS[-1] < len(row))
@@ -112,7 +113,7 @@ def _distances(
 
 
 def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
-    """Find the two different lags and the row of the change with the smallest sum of distances.
+    """Find the row of the change and the two different lags for which the sum of distances is smallest.
 
     Returns the indices of the lags before and after the change, and the row.
     """
@@ -126,18 +127,19 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
 
 
 # A move is a change of place between two contacts. A move can be compared if the rows one period later are in contact
-# too. A period of the passes is accepted if at least this fraction of these moves has the same places one period later.
+# too. A period, the number of rows of a pass, is accepted if at least this fraction of the moves that can be compared
+# has the same places one period later.
 AGREEMENT_MIN = 0.95
 # Minimum fraction of the moves that can be compared. If the period is half the recording, only half of the moves have
 # a move one period later, and in some of them the rows may be without contact.
 COMPARED_MIN = 0.25
-PROBES_N = 256  # number of moves in the sample that excludes most periods
-PROBES_MIN_N = 8  # if fewer of these moves can be compared, a period is not excluded
+PROBES_N = 256  # number of moves in the sample with which most periods are excluded
+PROBES_MIN_N = 8  # if fewer of these moves can be compared for a period, the period is not excluded
 GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
-    """Return the number of the pass of each row, from 0: a new pass begins when the sequence of places repeats.
+    """Return the pass number of each row, from 0; a new pass begins when the sequence of places repeats.
 
     If the sequence does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass
     may be incomplete.
@@ -157,7 +159,7 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
 def _likely_periods(
     place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
 ) -> Int64[np.ndarray, " p"]:
-    """Return the periods in rows that fit a sample of the moves in the first half of the recording.
+    """Return the periods, in rows, that fit a sample of the moves in the first half of the recording.
 
     Testing all moves for all periods would take quadratic time.
     """
@@ -165,7 +167,8 @@ def _likely_periods(
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Multiples of the golden ratio modulo 1 are spread evenly, but do not repeat with the period of a grid.
+    # Choose moves at multiples of the golden ratio modulo 1, which are spread evenly but do not repeat with the period
+    # of a grid.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:

@@ -1,10 +1,10 @@
-"""Read layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file per recording.
+"""Read layout `eflash7`: an eFlesh pad on a six-axis force sensor is pressed; a recording is one CSV file.
 
-One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the
-rows of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from
-0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel. The
-no-load field is the mean field of the untouched rows at the start of a recording, and forces are relative to the mean
-force of these rows.
+In a recording, one or two places of a 3 x 3 grid are touched. The pitch of the grid is unknown, so `x_mm` and `y_mm`
+are NaN. The account contains the number of rows of the place with number n as `place_<n>_rows_n`; n is 1 + column + 3
+row, with columns and rows counted from 0. The recorder subtracted a baseline that the file does not contain, so `b_uT`
+lacks a constant in each channel. The no-load field is the mean field of the untouched rows at the start of a recording.
+Forces are relative to the mean force of these rows.
 """
 
 import re
@@ -29,12 +29,12 @@ FIRST_LINE_N = 2  # line number of the first row of numbers in the file
 SIDE_N = 3  # places per side of the grid
 ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
 FORCES = ("fx", "fy", "fz")
-ON_SKIN = -1.0  # sign of the force on the skin relative to that in the file, where compression is negative fz
-TOUCH_N = 0.5  # assumed: the file does not mark touches; one begins when the force rises above this
-# The chips measure about ten times a second, and the recorder writes a row of zeros when it polls too early. In 19
-# recordings, these are 4 to 10 % of the rows.
+ON_SKIN = -1.0  # factor from fz in the file, which is negative in compression, to the force on the skin
+TOUCH_N = 0.5  # assumed: a touch begins when the force rises above this value, because the file does not mark touches
+# The chips measure about ten times a second, and the recorder writes a row of zeros if it polls before the next
+# reading. In 19 recordings, 4 to 10 % of the rows are such rows.
 ZERO_FRACTION_MAX = 0.25
-GAP_s = 0.5  # a longer time between two rows is counted as a gap
+GAP_s = 0.5  # a time between two rows that is longer than this is counted as a gap
 # 19 recordings begin with 1.4 to 17 s without contact. Before the first touch, the field varies by 3 to 6 uT (noise); a
 # touch changes it by 500 uT or more.
 STILL_uT = 40.0
@@ -47,7 +47,7 @@ Account = dict[str, int]
 class _Table:
     """The columns of one file.
 
-    `places` are the numbers of the touched places. `force_N` is the force on the gauge.
+    `places` are the numbers of the touched places. `force_N` is the force on the gauge, as in the file.
     """
 
     time_s: Float64[np.ndarray, " f"]
@@ -75,7 +75,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return all rows from the first touch on as readings, in contact or not; earlier rows give the no-load field."""
+    """Return all rows from the first touch on as readings; the rows before give the no-load field."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
@@ -86,7 +86,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    # Zeros on all chips are recorded here; `rows` counts zeros on some chips.
+    # Rows with zeros on all chips are recorded here. Rows with zeros on only some chips are counted by `check_rows`
+    # below.
     written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
@@ -172,7 +173,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows with zeros for all chips, written when there was no new reading; raise if there are too many."""
+    """Mark the rows with zeros for all chips, which mean that there was no new reading; raise if there are too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         problem = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
@@ -181,7 +182,7 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
 
 
 def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the first rows, until any channel changes by more than `STILL_uT`; raise if there are too few."""
+    """Mark the rows before any channel has changed by more than `STILL_uT`; raise if there are too few such rows."""
     first_uT = np.median(b_uT[whole][:STILL_ROWS_MIN_N], axis=0)
     moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
     untouched = whole & ~np.logical_or.accumulate(moved)

@@ -1,9 +1,9 @@
-"""Read layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder.
+"""Read layout `eflesh`: a robot arm presses an eFlesh skin; a recording is a folder with three CSV files.
 
-Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is measured downwards from the
-highest z of the recording, which may be above the skin, so the depth has an unknown offset. The force is known along
-one axis. If this is x or y, the sign of the force is unknown, because the recorder does not state whether it is the
-force on the skin or on the gauge; the account counts these rows.
+Places are robot coordinates minus their minimum, so the smallest x and y are 0 mm. The depth is measured downwards from
+the highest z of the recording. This z may be above the skin, so the depth has an unknown offset. The force is known
+along one axis only. If this axis is x or y, the sign of the force is unknown, because the recorder does not state
+whether it is the force on the skin or on the gauge. The account contains the number of these rows.
 """
 
 from collections.abc import Mapping
@@ -35,16 +35,19 @@ FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
 NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
-WEIGHT_COLUMN = 4  # column of states.csv after time, x, y and z; missing if only places were recorded
+# index of the column of states.csv after time, x, y and z; there is no such column if only places were recorded
+WEIGHT_COLUMN = 4
 NO_NEW_WEIGHT = -1.0
-CLOCKS_APART_MAX_s = 0.05  # the recorder writes a row to both files in one step of its loop, milliseconds apart
+# the recorder writes a row to each of two files in one step of its loop, only milliseconds apart
+CLOCKS_APART_MAX_s = 0.05
 PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
-# No-load fields that differ by less are the same. Rounding errors of (raw field - field change) in float32 are below
-# 0.004 uT; in a new no-load reading, at least one channel changes by an LSB, 0.15 uT or more.
+# Two no-load fields are the same if they differ by less than this. They are computed as raw field minus field change,
+# whose rounding errors in float32 are below 0.004 uT. In a new no-load reading, at least one channel changes by an LSB,
+# which is 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# If z varies by less than this fraction of its largest value, the robot kept a constant height. The fraction is 1e-4
-# for a robot at constant height, and some hundredths for presses whose z is in m instead of mm.
+# If z varies by less than this fraction of its largest value, the robot kept a constant height. For a robot at constant
+# height, z varies by a fraction of 1e-4; for presses whose z is in m instead of mm, by some hundredths.
 HELD_FRACTION = 1e-3
 
 Account = dict[str, int]
@@ -168,9 +171,9 @@ def _number_passes(
 ) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
     """Return for each row its pass number and the number of earlier touches.
 
-    With many places, each row is a touch, and a new pass begins when the places repeat. With a single place, the robot
-    strokes up and down, and the recorder takes a new baseline before each stroke. Each new no-load field therefore
-    begins a new pass, which has one touch.
+    In a recording of many places, each row is a touch, and a new pass begins when the sequence of places repeats. In a
+    recording of a single place, the robot strokes up and down, and the recorder takes a new baseline before each
+    stroke. Therefore, each new no-load field begins a new pass, which has one touch.
     """
     if place_mm.any():
         everywhere = np.ones(len(place_mm), bool)
@@ -181,7 +184,7 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the force column by name, with NaN in rows without a new value; no column if there was no gauge."""
+    """Return the force by its column name, with NaN in rows without a new value; {} if there was no gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:

@@ -1,12 +1,14 @@
-"""Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
+"""Read layout `ini`: a 3-D printer with a force gauge presses the skin; two text files have one row per indentation.
 
-The truths are places and forces. Rows with a force below 0.02 N count as no contact, whatever their place in the
-truths; their place becomes NaN and their force 0. The first rows of a pass, with the indenter at a corner of the grid,
-give the no-load field of the pass. `t_s` and `depth_mm` are unknown (NaN).
+One file contains the readings, the other the truths: places and forces. Rows with a force below 0.02 N count as rows
+without contact, whatever their place in the truths is. Their place becomes NaN, and their force 0. In the first rows of
+a pass, the indenter is at a corner of the grid; these rows give the no-load field of the pass. `t_s` and `depth_mm` are
+unknown (NaN).
 
-The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
-(`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a
-recording, a row is missing in one of the files, and the recording is refused.
+The fields may lag behind the truths: row i of the truths then belongs to a later row of the readings. The header may
+state the lag in rows (option `rows_late`). Otherwise, the lag is that at which the norm |dB| of the field change
+correlates best with the force. If the lag changes within a recording, a row is missing in one of the files, and the
+recording is refused.
 """
 
 from collections.abc import Mapping
@@ -26,18 +28,20 @@ from reskin.schema import Readings
 READINGS = "readings.txt"
 TRUTHS = "truths.txt"
 FILES = (READINGS, TRUTHS)
-CONTACT_MIN_N = 0.02  # below this force, the recorder writes (x, y, F) = (10, 10, 0), but (10, 10) is also a real place
+# below this force, the recorder writes (x, y, F) = (10, 10, 0), although (10, 10) is also a real place
+CONTACT_MIN_N = 0.02
 VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
-# An estimated lag is used only if the recording has at least this many rows, and the lag increases the correlation by
-# at least this much. In the public recording of 23300 rows, the lag increases the correlation from 0.45 to 0.65.
+# An estimated lag is used only if the recording has at least LATE_ROWS_MIN_N rows, and the correlation exceeds that
+# without a lag by at least LATE_GAIN_MIN. In the public recording of 23300 rows, the lag increases the correlation from
+# 0.45 to 0.65.
 LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
 
 Account = dict[str, int]
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
+    """Find the file of readings, `b20_NAME.txt`, and its truths, `truths_NAME.txt`, in the same folder."""
     if not recording.is_file() or recording.name.startswith("truths_"):
         raise CaptureError(f"{recording}: not the text file of readings. Add b20_NAME.txt, not truths_NAME.txt.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
@@ -57,7 +61,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return all fault-free rows as readings; the no-load field of a row is the mean over the corner rows of its pass.
+    """Return all fault-free rows as readings; the no-load field of a pass is the mean field of its corner rows.
 
     The corner rows are the first rows of a pass, before the first contact.
     """
@@ -186,7 +190,7 @@ def _check_lateness(
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark the rows of each pass before its first contact, while the indenter is at the first corner, off the skin."""
+    """Mark the rows of each pass before its first contact; the indenter is then at the first corner, off the skin."""
     touches_before_n = np.cumsum(contact)
     begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
     before_pass_n = (touches_before_n - contact)[begins]

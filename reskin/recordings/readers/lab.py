@@ -1,8 +1,8 @@
-"""Read layout `lab`: a robot and a six-axis gauge, one CSV file per depth, about 100 readings per indentation.
+"""Read layout `lab`: a robot with a six-axis gauge; one CSV file per depth, about 100 readings per indentation.
 
-The file contains the force on the gauge (Fz is negative in compression), so all three components are negated; see
-`reskin.schema` and `ON_SKIN`. `depth_mm` is NaN, because the file's name contains only an index of the depth; `t_s` is
-NaN, because there is no clock.
+The file contains the force on the gauge (Fz is negative in compression). The force on the skin has the opposite sign,
+so all three components are negated; see `reskin.schema` and `ON_SKIN`. `depth_mm` is NaN, because the file's name
+contains only an index of the depth. `t_s` is NaN, because the file contains no times.
 """
 
 from collections.abc import Mapping
@@ -31,11 +31,11 @@ from reskin.schema import Readings
 READINGS = "readings.csv"
 FILES = (READINGS,)
 FIRST_LINE_N = 2  # line number of the first row of numbers in the file
-# Factor from the force in the file (on the gauge) to the force on the skin. For x, the evidence is that pokes shift the
-# skin by 48 um along +x on both public boards (experiment `compare` fits this shift to the fields alone), while the
-# mean Fx is negative in all six files. For y, the shift and the mean force are too small for a decision. However, the
-# sign of Fz implies that the gauge's z axis points into the skin. If the gauge's axes are right-handed, its y axis then
-# has the direction of the y axis of the places.
+# Factor from the force in the file (on the gauge) to the force on the skin. For z, the sign follows from compression
+# being negative. For x, there are two pieces of evidence: on both public boards, pokes shift the skin by 48 um along +x
+# (experiment `compare` fits this shift to the fields alone), and the mean Fx is negative in all six files. For y, the
+# shift and the mean force are too small for a decision. However, the sign of Fz implies that the gauge's z axis points
+# into the skin. If the gauge's axes are right-handed, its y axis then has the direction of the y axis of the places.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
@@ -69,7 +69,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the contact rows as readings; the no-load field is the mean over the `noload` rows of the same press."""
+    """Return the contact rows as readings; the no-load field of a press is the mean field of its `noload` rows."""
     where = f"{header.capture}/{READINGS}"
     table, rows = _read_checked(folder, header, policy, where)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
@@ -110,7 +110,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 def read_noload(
     folder: Path, header: Header, policy: FaultPolicy
 ) -> tuple[Int[np.ndarray, " a"], Float64[np.ndarray, "a ch"]]:
-    """Return the fields of the single `noload` rows without faults, and the press of each, numbered as in `read`."""
+    """Return the press number (as in `read`) and the field of each single fault-free `noload` row."""
     table, rows = _read_checked(folder, header, policy, f"{header.capture}/{READINGS}")
     noload = ~table.contact & rows.keep
     return table.press[noload], table.b_uT[noload]

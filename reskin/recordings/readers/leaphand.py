@@ -1,12 +1,12 @@
 """Read layout `leaphand`: magnetic pads on the fingers of a robot hand that moves without touching anything.
 
-The text file has one row per pose of the hand: the fields of all pads, then the positions of all joints. A capture is
-one pad, a board of five chips; option `pad` selects it. The file contains neither times, temperatures nor labels. By
-choosing this layout, the user states that nothing touches the pads, so places are NaN and the normal force is 0. The
-recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
+The text file has one row per pose of the hand: the fields of all pads, then the positions of all joints. A capture
+contains one pad, a board of five chips, which option `pad` selects. The file contains no times, temperatures or labels.
+By choosing this layout, the user states that nothing touches the pads. Therefore, places are NaN and the normal force
+is 0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
 
-The no-load field is the mean over the first successive rows in which the hand hardly moves. Joint positions are not
-part of `Readings`; `read_motion` returns them.
+The no-load field is the mean over the first `NOLOAD_ROWS_N` successive rows in which the hand hardly moves. Joint
+positions are not part of `Readings`; `read_motion` returns them.
 """
 
 from collections.abc import Mapping
@@ -29,11 +29,12 @@ CHIPS_N = 5  # chips of a pad
 CHANNELS_N = AXES_PER_CHIP_N * CHIPS_N
 JOINTS_N = 4  # joints of a finger; each finger has one pad
 PADS_MAX_N = 4
-COUNTS_PER_TURN = 4096  # joint positions of the hand's servos are whole numbers from 0 to 4095
+COUNTS_PER_TURN = 4096  # the hand's servos give joint positions as whole numbers (counts) from 0 to 4095
 NOLOAD_ROWS_N = 5
 # In the no-load rows, each joint moves by at most this many counts: 4.4 degrees. In recordings of four pads, the hand
-# rests in the first five rows. In recordings of two pads, the first row is in another pose, and the next five rows span
-# 39 counts. Turning by 4.4 degrees changes the earth's field along an axis by at most 5 uT, which is about the noise.
+# rests in the first five rows. In recordings of two pads, the hand has another pose in the first row, and the joints
+# move by up to 39 counts in the next five rows. A rotation by 4.4 degrees changes the earth's field along an axis by at
+# most 5 uT, which is about the noise.
 STILL_COUNTS = 50
 
 Account = dict[str, int]
@@ -41,7 +42,7 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of all joints in the rows of `read`, and the fields of the no-load rows."""
+    """Positions of all joints in the readings that `read` returns, and the fields of the no-load rows."""
 
     joint_counts: Int64[np.ndarray, "f j"]
     noload_uT: Float64[np.ndarray, "n ch"]
@@ -77,7 +78,7 @@ def collect(recording: Path) -> dict[str, Path]:
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
-    """Check the number of columns; a capture is one pad, whose number of chips is fixed."""
+    """Check the number of columns, and return the number of chips of one pad, because a capture has one pad."""
     where = str(files[READINGS])
     _count_pads(read_cells(files[READINGS], where, separator=None), where)
     return CHIPS_N
@@ -111,7 +112,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 
 
 def read_motion(folder: Path, header: Header, policy: FaultPolicy) -> Motion:
-    """Return the joint positions of the readings that `read` returns, and the fields of the single no-load rows."""
+    """Return the joint positions in the readings that `read` returns, and the field of each no-load row."""
     pad = _read_pad(folder, header, policy)
     return Motion(pad.joint_counts[pad.is_reading], pad.b_uT[pad.is_noload])
 
@@ -162,9 +163,10 @@ def _pad_number(header: Header, pads_n: int) -> int:
 
 
 def _find_rest(joint_counts: Float64[np.ndarray, "f j"], where: str) -> int:
-    """Return the index of the first of `NOLOAD_ROWS_N` rows between which no joint moves by more than `STILL_COUNTS`.
+    """Return the index of the first no-load row: the first of `NOLOAD_ROWS_N` rows within which the hand is at rest.
 
-    Raises CaptureError if there are no such rows, or no row after them.
+    The hand is at rest if no joint moves by more than `STILL_COUNTS`. Raises CaptureError if there are no such rows, or
+    no row after them.
     """
     for first_i in range(len(joint_counts) - NOLOAD_ROWS_N):
         if np.ptp(joint_counts[first_i : first_i + NOLOAD_ROWS_N], axis=0).max() <= STILL_COUNTS:

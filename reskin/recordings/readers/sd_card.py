@@ -1,7 +1,7 @@
 """Read and write the log that a board writes to an SD card (paper section 6): one CSV line per frame, without labels.
 
 A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as in wire format `text-txyz`.
-All columns T may be missing; temperatures are then unknown (NaN).
+If all columns T are missing, temperatures are unknown (NaN).
 """
 
 from codecs import BOM_UTF8
@@ -19,14 +19,15 @@ from reskin.recordings.units import check_fields
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500
-RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs more slowly, and no chip measures faster
+HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
+# assumed: no board logs at a lower rate, and no chip measures at a higher rate
+RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
 SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long to be quoted in an error message
-KEPT_SHARE_MIN = 0.5  # assumed: with a smaller fraction of fault-free frames, contacts would be missed
+KEPT_SHARE_MIN = 0.5  # assumed: if a smaller fraction of the frames is fault-free, contacts would be missed
 Log = tuple[
     Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
 ]  # times in s, fields in uT, temperatures in degC, account
-GAP_FRAMES = 1.5  # frames are missing in a time step that exceeds the median step by this factor
+GAP_FRAMES = 1.5  # frames are missing if the time between two frames exceeds the median time by this factor
 
 
 def column_names(chips_n: int, *, temperatures: bool = True) -> list[str]:
@@ -38,7 +39,7 @@ def column_names(chips_n: int, *, temperatures: bool = True) -> list[str]:
 def render(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"]
 ) -> str:
-    """Return a log as CSV text: times to 0.1 ms, readings with two decimals as in the text firmware."""
+    """Return a log as CSV text, with times to 0.1 ms, and with two decimals for readings, as in the text firmware."""
     frames_n, chips_n = temperature_degC.shape
     chips = np.concatenate([temperature_degC[:, :, None], b_uT.reshape(frames_n, chips_n, 3)], axis=2)
     line = ",".join(["%.4f", *["%.2f"] * (4 * chips_n)])
@@ -51,7 +52,8 @@ def read_log(path: Path) -> Log:
 
     Temperatures are NaN if the log has none. Frames with failed reads or stuck chips are dropped and counted. Raises
     `CaptureError` if fewer than half of the frames remain, or if a chip lost its settings. In the account, `gaps_n` is
-    the number of overlong time steps, and `gap_frames_n` the number of frames that are missing in them.
+    the number of overlong times between two frames, and `gap_frames_n` is the number of frames that are missing in
+    them.
     """
     where = str(path)
     names = _read_names(path, where)
@@ -75,7 +77,7 @@ def keep_whole(
     *,
     first_row: int = 1,
 ) -> Log:
-    """Return the fault-free frames, and count the others; in errors, the number of the first row is `first_row`."""
+    """Return the fault-free frames, and count the faulty ones; errors count the rows from `first_row`."""
     _check_time(t_s, where, first_row)
     check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
@@ -195,7 +197,7 @@ def _faults(
 
 
 def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
-    """Count the overlong time steps, and the frames that are missing in them."""
+    """Count the overlong times between two frames, and the frames that are missing in them."""
     steps = np.diff(t_s) / np.median(np.diff(t_s))
     wide = steps > GAP_FRAMES
     return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}

@@ -39,10 +39,11 @@ NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
 FIRST_LINE_N = 2  # line number of the first row of numbers in a CSV file
 EMPTY = ("", "nan", "NaN")
-# A column whose name begins with one of these words, but is not known, is probably a known column with a wrong name.
+# If an unknown column name begins with one of these words, it is probably the misspelt name of a known column.
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
-# assumed: if weak fields without contact are below this fraction of the fields in contact, a baseline was subtracted
+# assumed: a baseline was subtracted if fields are weak, and fields without contact are below this fraction of those in
+# contact
 SUBTRACTED_RATIO = 0.5
 
 Account = dict[str, int]
@@ -68,7 +69,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the contact rows as readings; the no-load field is the mean over the block of no-load rows before them."""
+    """Return the contact rows as readings; their no-load field is the mean over the no-load rows before them."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     names, cells = _read_cells(folder / name, where)
@@ -135,7 +136,7 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
-    """Raise if the name of an unknown column, which would be ignored, resembles a known name: `Fz` for `Fz_N`."""
+    """Raise if the name of an unknown column, which would be ignored, resembles a known name, as `Fz` does `Fz_N`."""
     for name in names:
         if name not in columns and name.lower().split("_")[0] in STEMS:
             known = ", ".join((*NEEDED, *OPTIONAL))
@@ -188,10 +189,10 @@ def _check(
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
-    """Raise if fields are weak, and much weaker without contact than in contact: a baseline was subtracted.
+    """Raise if fields are weak, and much weaker without contact than in contact, as after subtracting a baseline.
 
-    In raw fields, the field without contact exceeds its change in contact. Wrong units also make fields weak, but do
-    not change the ratio of the two fields.
+    A raw field without contact is larger than its change in contact. Wrong units also make fields weak, but do not
+    change the ratio of the fields with and without contact.
     """
     chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
     if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
@@ -209,8 +210,8 @@ def _number_presses(
 ) -> Int[np.ndarray, " f"]:
     """Return the number of each row's press, from 0.
 
-    A press is a block of rows with equal `indentation`. Without this column, each touch begins a press, and so does
-    each new place within a touch.
+    A press is a block of rows with equal `indentation`. Without column `indentation`, a new press begins with each
+    touch and with each new place within a touch.
     """
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
