@@ -1,11 +1,11 @@
 """Print digests of the weights after three tiny training runs, on this processor or on emulated processors.
 
-The three runs train: the paper's networks in one stack, with all terms of the loss; the adversarial network; and the
-network of the universal model. `python -m tests.arithmetic` prints one digest per run; test_numerics.py calls this
-command with several environment variables. `python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs on these two
-processors, emulated by QEMU (package qemu-user; about two minutes per processor; `qemu-x86_64 -cpu help` lists the
-processors), and fails if the digests differ. MKL and PyTorch select code by the maker and the instruction sets of the
-processor, so emulation finds differences that environment variables alone cannot cause.
+The runs train three models: the paper's networks (several at once, as a stack, with all terms of the loss), the
+adversarial network, and the network of the universal model. `python -m tests.arithmetic` prints one digest per run;
+test_numerics.py calls this command with several environment variables. `python -m tests.arithmetic Haswell-v2 EPYC-v1`
+also runs on these two processors, emulated by QEMU (package qemu-user; about two minutes per processor; `qemu-x86_64
+-cpu help` lists the processors), and fails if the digests differ. MKL and PyTorch select code by the maker and the
+instruction sets of the processor, so emulation finds differences that environment variables alone cannot cause.
 """
 
 import pipeline  # isort: skip  # noqa: F401  (must be first: `pipeline` sets variables that NumPy reads when imported)

@@ -18,7 +18,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from tests.benchmarks import FULL
 
 # No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that
-# tests of unchanged code do not begin to fail; `--hypothesis-profile=thorough` draws many others.
+# tests of unchanged code do not begin to fail; `--hypothesis-profile=thorough` draws many other examples.
 always = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("same", max_examples=50, derandomize=True, **always)
 settings.register_profile("thorough", max_examples=1000, **always)

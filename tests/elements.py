@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solution:
-    """Motion inside the layer, at its base and at its top; mean displacement along the load, weighted by the load."""
+    """Motion inside the layer, at its base and at its top, and the load-weighted mean displacement along the load."""
 
     inside: Motion
     base: Motion
@@ -52,7 +52,7 @@ def along_x_strains(u, r):
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer meshed in the (r, z) plane: uniform cells up to radius `fine_m`, growing cells up to `end_m`."""
+    """A layer meshed in the (r, z) plane, with uniform cells up to radius `fine_m` and growing cells up to `end_m`."""
 
     thickness_m: float
     fine_m: float
@@ -113,8 +113,9 @@ class Layer:
     def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solution:
         """Solve for the pressure load(r) at the top and Coulomb friction at the base, by fixed-point iteration.
 
-        The traction is t = -friction p u / (|u| + u0), with p and u of the previous iteration: the layer sticks where p
-        is large and slides elsewhere.
+        The traction is t = -friction p u / (|u| + u0), where p and u are the pressure and the displacement at the base
+        in the previous iteration, and u0 is a small displacement. The layer sticks where p is large and slides
+        elsewhere.
         """
         solution = self.solve(1, load, edges["held"], edges["drag"])
         small_m = SLIP_SHARE * np.abs(solution.base.parts_m[0]).max()
@@ -131,7 +132,7 @@ def _motion(basis: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Mot
 
 
 def plate(sides_m, place_m, patch_motion_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
-    """Solve for a plate in plane stress on a uniform bed of springs, a patch of which is displaced.
+    """Solve for a plate in plane stress on a uniform bed of springs, in which one patch is displaced.
 
     `stiffness` is Young's modulus times thickness, divided by the spring stiffness per area and by the area of the
     plate. Returns the centre of the patch, and the mean displacement and the mean rotation of the plate.

@@ -1,4 +1,4 @@
-"""Tests of `reskin add`: the added recording, or a one-line error that leaves no files."""
+"""Tests of `reskin add`: it adds a recording, or prints an error of one line and leaves no files."""
 
 import shutil
 from pathlib import Path
@@ -125,7 +125,7 @@ def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypat
 
 
 def test_repeated_readings_are_a_warning(root, tmp_path, capsys):
-    """A recorder that reads faster than the chips convert writes each reading twice."""
+    """If a recorder reads faster than the chips convert, it writes each reading twice."""
     press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
     add_lab(root, write(tmp_path, *press) / "readings.csv")
     assert "board1_skin1_readings: 50% of readings repeat the one before." in capsys.readouterr().err

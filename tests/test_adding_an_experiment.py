@@ -93,7 +93,7 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def stale_stages(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
-    """Return the stages that DVC would rerun: those that changed, and those that depend on outputs of such stages."""
+    """Return the stages that DVC would rerun: changed stages, and all stages that depend on their outputs."""
     stale: set[str] = set()
     more = {name for name in after if after[name] != before.get(name)}
     while more - stale:
@@ -140,7 +140,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
         after = state(root)
     assert stale_stages(before, after) == {
         "repeat@ci", "table2@ci", "report@ci",  # stages that read the numbers of all experiments
-        "contacts@ci",  # reads the whole scene file
+        "contacts@ci",  # this stage reads the whole scene file
     }  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from reskin import io
 from reskin.config import parse
 from reskin.errors import ReskinError, SchemaError
 
-# SHA-256 of the files of published versions, which never change: add a version instead.
+# SHA-256 of the files of published versions. These files never change; for a correction, add a version.
 PUBLISHED = {
     "v1/eflesh.json": "d7aeb2c6e57811c916b9bfadc59e30d226c6314ec7401d17a9fdd82479e28f6b",
     "v1/lab.json": "b5a0b3cdf9a882aa4ea66765a2ffbc6ec828183af4ff9e7d8468eff973ad71b7",
@@ -117,7 +117,7 @@ def test_example_of_the_page_makes_a_complete_file(tmp_path, monkeypatch):
     assert errors_mm2[1] < errors_mm2[0]
 
 
-# --- A tiny dataset: boards a and b with four presses each, of which two are tested, and board c for training ---
+# --- A tiny dataset: boards a and b have four presses each (two are tested); board c is for training ---
 
 TRUE = {"x_mm": [0.0, 4.0, 8.0, 16.0], "y_mm": [0.0, 4.0, 8.0, 16.0], "F_N": [1.0, 3.0, 2.0, 2.0]}
 HEAD = "fold,press,x_mm,y_mm,F_N,x_low_mm,x_high_mm,y_low_mm,y_high_mm,F_sd_N\n"

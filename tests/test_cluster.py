@@ -125,7 +125,7 @@ def test_workers_with_other_arithmetic_are_an_error(workers, expected):
 def test_lost_scheduler_is_an_error():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
-    submitted.cancel()  # after losing the scheduler, Dask cancels all calls
+    submitted.cancel()  # when Dask loses the scheduler, it cancels all calls
     cluster._copy_outcome(future, "tcp://there", submitted)
     with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished training runs are cached"):
         future.result(0)

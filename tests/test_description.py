@@ -57,7 +57,7 @@ def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
     found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
-    # large tolerance, because there are only 4 x 6 such changes
+    # large tolerance, because there are only 4 x 6 changes over this number of contacts
     assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)
     assert "rest_changes_in_1000_uT" not in found
     assert describe(without_walk)["rest_changes_in_100_uT"] == 0
@@ -110,12 +110,12 @@ def test_growth_with_force_uses_all_captures_of_a_skin():
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
-def test_mean_is_between_minimum_and_maximum(values):
+def test_mean_over_skins_is_between_minimum_and_maximum(values):
     one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 
 
-def test_without_rest_drops_fields_at_rest():
+def test_fields_at_rest_are_dropped():
     description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
     assert without_rest(description) == {"rate_hz": 9.0}
 

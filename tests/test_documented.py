@@ -35,7 +35,7 @@ def code_words(page: str) -> set[str]:
 
 
 def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
-    """Yield the keys of nested settings; the keys of the first `names_depth` levels are names and are omitted."""
+    """Yield the keys of nested settings. Keys of the first `names_depth` levels are names and are omitted."""
     for key, value in settings.items() if isinstance(settings, dict) else ():
         if not names_depth:
             yield key
@@ -100,7 +100,7 @@ def test_scene_and_recipe_of_the_docs_are_valid():
 @pytest.mark.parametrize(
     "page", [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md"], ids=lambda page: page.name
 )
-def test_files_in_docs_exist(page):
+def test_files_named_in_docs_exist(page):
     files = re.findall(r"`((?:reskin|pipeline|tests)/[\w./-]+)`", page.read_text(encoding="utf-8"))
     examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # files of examples, which users create
     assert sorted({name for name in files if not (ROOT / name).exists() and not examples.match(name)}) == []

@@ -28,7 +28,7 @@ def test_every_stage_depends_on_its_code_digests():
     }
 
 
-def test_the_stage_named_code_depends_on_all_modules_that_stages_import():
+def test_stage_code_depends_on_all_modules_that_stages_import():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
     needed = {file_of(name) for stage in all_stages() for name in digests_of(stage)}
     deps = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}

@@ -155,7 +155,7 @@ def pressed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def with_unknown(y: np.ndarray) -> np.ndarray:
-    """Return targets with places and forces for six presses, places for three, and nothing for the other ones."""
+    """Return targets: six presses have place and force, three have only the place, all others are unlabelled."""
     known = y.copy()
     known[6:9, 2] = np.nan
     known[9:] = np.nan
@@ -198,7 +198,7 @@ def test_universal_regressor_follows_conventions(pressed, tmp_path):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
     np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)  # a second fit starts from the prior
     np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
-    assert metrics.score(y, first)["accuracy_pct"] > 90  # on the labelled presses themselves
+    assert metrics.score(y, first)["accuracy_pct"] > 90  # accuracy on the labelled presses themselves
     regressor.model_.save(tmp_path / "skin.safetensors")
     saved = reskin.load_universal(tmp_path / "skin.safetensors")
     np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)  # rounding of the sum

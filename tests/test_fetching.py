@@ -56,7 +56,7 @@ def source_of(files: dict[str, bytes], home: str, commit: str | None, **changes:
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory) -> SimpleNamespace:
-    """Return a checkout without scenes, and a repository of two recordings, one of which a later commit changes."""
+    """Return a checkout without scenes, and a repository of two recordings; a later commit changes one of them."""
     root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
@@ -193,7 +193,7 @@ def test_recordings_can_be_added_to_another_scene(root):
 
 
 def test_wrong_checksum_is_an_error(root, example):
-    # Without a commit, the newest one is fetched, in which one file differs.
+    # If no commit is given, the newest one is fetched. One of its files differs.
     write_source(root, source_of(example.files, example.url, None))
     other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
     assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")

@@ -70,7 +70,7 @@ def test_failed_write_keeps_the_old_file(tmp_path):
 
 def test_os_errors_name_the_right_file(tmp_path):
     def names_in_errors(*names: Path) -> tuple[str, ...]:
-        """Return the file named in our errors if writing a.txt raises EACCES, ENOSPC and EIO with the files `names`."""
+        """Return the file that each error names if writing a.txt raises EACCES, ENOSPC and EIO with files `names`."""
         found = []
         for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
             metadata = (names[0], None, names[1]) if len(names) == 2 else names
@@ -188,7 +188,7 @@ def test_flipped_bits_of_tensors_are_detected(tmp_path):
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
         assert {name: metadata[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
-    assert detected_n > file.stat().st_size - 8  # flips in the name of the digest's key are not detected
+    assert detected_n > file.stat().st_size - 8  # flips in the name of the digest's key remain undetected
 
 
 def test_flipped_bits_of_tables_are_detected(tmp_path):
@@ -201,7 +201,7 @@ def test_flipped_bits_of_tables_are_detected(tmp_path):
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 6  # the other bytes are in page headers, and their bits do not affect the values
+    assert detected_n > end // 6  # other bytes are in page headers, whose bits do not affect the values
 
 
 def test_tensors_without_digest_are_read(tmp_path):

@@ -79,7 +79,7 @@ def test_registry_plan_and_lock_have_both_recordings(root):
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
     assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
-    assert stages["report@shared"] == {"cmd": "with mine"}  # only our entry, so DVC will run the stage again
+    assert stages["report@shared"] == {"cmd": "with mine"}  # only our entry is kept, so DVC will run the stage again
     assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     git(root, "commit", "-qm", "Merge")

@@ -35,7 +35,7 @@ def digests_under(*settings: str) -> str:
 
 @needs_avx2
 def test_training_does_not_depend_on_mkl_or_threads():
-    # The code that MKL and oneDNN use on unknown processors, with three threads instead of one.
+    # These variables select the code of MKL and oneDNN for unknown processors, and three threads instead of one.
     other = "MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41", "OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"
     assert digests_under(*other) == digests_under()
 

@@ -120,7 +120,7 @@ def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     assert generated["calibrated"] == {"mine": SHIPPED}
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
-    (root / SCENES / "mine.yaml").write_text(text)  # this checkout has no library, and so no model
+    (root / SCENES / "mine.yaml").write_text(text)  # this checkout has no library and therefore no model
     with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
         plan.plan_of(root, ["mine"])
 
@@ -229,5 +229,5 @@ def test_dvc_checkout_keeps_outputs_of_other_scenes(tmp_path):
     run(root, "dvc", "repro", "simulate@ci")
     run(root, "reskin", "scenes", "use", "quick")
     run(root, "dvc", "repro", "simulate@quick")
-    run(root, "dvc", "checkout", check=False)  # exits with an error, because other stages of quick never ran
+    run(root, "dvc", "checkout", check=False)  # the command fails, because other stages of quick never ran
     assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]

@@ -290,4 +290,4 @@ def test_summary_counts_misfits_and_forces_at_the_limit(tmp_path, model, capsys)
     output = capsys.readouterr().out
     assert "120 of 120 readings in contact are at a limit of the model's force range" in output
     assert "force_at_limit_readings_n 120" in output
-    assert "unknown_skin_readings_n" not in predict(log, model, out)  # reported for the universal model only
+    assert "unknown_skin_readings_n" not in predict(log, model, out)  # only the universal model reports this count

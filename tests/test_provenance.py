@@ -114,7 +114,7 @@ def test_costs_are_in_seconds_and_megabytes(tmp_path):
     record_cost(tmp_path, "split", 2.345)
     costs = read_costs(tmp_path)
     assert list(costs) == ["split"]
-    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # rounding of 2.345 to two decimals
+    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # 2.345 may be rounded up or down
     assert 0.1 < costs["split"]["cpu_s"] < 100_000  # CPU time of this process, including imports
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # peak memory of this Python process in MB
 
@@ -126,7 +126,7 @@ def test_stage_cost_includes_reused_training(tmp_path):
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # the rest of the stage took 2 s
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # 2 s: the rest of the stage
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)

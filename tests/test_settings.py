@@ -48,7 +48,7 @@ class RecordingMapping(Mapping[str, Any]):
 
 
 def declared_sections(stage: str) -> tuple[set[str], set[str]]:
-    """Return the sections that dvc.yaml lists for a stage: those of the scene, and those of params.yaml."""
+    """Return the sections that dvc.yaml lists for a stage: those of the scene and those of params.yaml."""
     scene_sections: set[str] = set()
     shared: set[str] = set()
     for entry in FLOW[stage]["do"].get("params", []):
@@ -145,7 +145,7 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
-FINGERPRINTED = {"audit", "report"}  # these stages compare the fingerprint of the physics with that of scene tuning
+FINGERPRINTED = {"audit", "report"}  # stages that compare the skin's fingerprint with that of scene tuning
 SIMULATING = {  # experiments that simulate skins themselves
     "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
 }  # fmt: skip

@@ -253,7 +253,7 @@ def current(root: Path) -> set[str]:
     return {run.info.run_id for run in runs(root, "tags.current = 'true'")}
 
 
-def test_restored_state_becomes_current_without_new_runs(tmp_path):
+def test_restored_results_become_current_without_new_runs(tmp_path):
     publish_state(tmp_path, old=True)
     first = current(tmp_path)
     publish_state(tmp_path, old=False)
@@ -356,7 +356,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
 
 
 def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # plus 2 s per run: the time limit for two runs is 0 s
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # plus 2 s per run: the limit for two runs is 0 s
     with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()

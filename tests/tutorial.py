@@ -3,13 +3,13 @@
 `python -m tests.tutorial --write` runs all steps (about ten minutes) and replaces the outputs on the page.
 tests/test_tutorial.py runs the quick steps, or all of them with RESKIN_BENCHMARKS=full, and compares the outputs.
 
-A step is a block of code (sh or python), and the block of text that follows it, its output. An HTML comment before a
-step has options, separated by semicolons:
+A step is a block of code (sh or python). The block of text that follows is the output of the step. An HTML comment
+before a step has options, separated by semicolons:
 
 * `until TEXT`: run in the background; the output ends with the first line that contains TEXT
 * `stop`: with `until`, then press Ctrl-C
 * `from TEXT`, `to TEXT`: show only the lines from the last one that begins with TEXT, and to the first one after it
-* `slow`: a step that trains, or that only such steps need
+* `slow`: this step trains, or is needed only by steps that train
 * `words`: compare only the words of the output, because trainings amplify the differences between recordings
 
 Consecutive Python steps share their variables.
@@ -41,7 +41,7 @@ STEP = re.compile(
 LONG_S = 1800.0
 HTTP_PORT = "8765"  # port on the page; the test uses a free one, because several tests may run at the same time
 # Two numbers are equal if they differ by at most TOLERANCE plus TOLERANCE_PCT % of the number on the page. Outputs
-# depend on times of arrival: each recording begins with another frame, and a press has one frame more or less.
+# depend on times of arrival: a recording may begin at another frame, and the number of frames of a press varies by one.
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
 NUMBER = re.compile(r"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 OPTIONAL = (  # parts of lines that occur only if the machine is busy

@@ -1,8 +1,8 @@
 """Run one sweep of training runs on this machine and on a Dask cluster, also while parts of the cluster fail.
 
-Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root: each machine of the cluster is a network
-namespace, which only root can create. deploy/dask.sh starts the programs, as on SLURM and Kubernetes. Writes
-docs/measured/cluster.md, scaling.md and scaling.svg.
+Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root, because each machine of the cluster is a
+network namespace, which only root can create. deploy/dask.sh starts the programs, as on SLURM and Kubernetes. The
+program writes docs/measured/cluster.md, scaling.md and scaling.svg.
 """
 
 import argparse
@@ -33,7 +33,7 @@ SWEEP = [sys.executable, "-W", "ignore", "-m", "tests.benchmarks.cluster_sweep"]
 
 
 class Sweep:
-    """A running or finished sweep: reads the task log and the results in the sweep's folder."""
+    """A running or finished sweep; its methods read the task log and the results in the sweep's folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -134,7 +134,7 @@ def sweep_locally(steps: Steps, folder: Path) -> dict[str, Sweep]:
 def sweep_on_three_workers(
     steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Path, expected: str
 ) -> Sweep:
-    """Run the sweep on three workers; require the local results, and note the bytes that each worker received."""
+    """Run the sweep on three workers. Require the local results, and note the bytes that each worker received."""
     with steps.step("three workers") as note:
         before = {name: nodes[name].received_bytes() for name in WORKERS}
         sweep = wait_for_sweep(cluster.sweep(folder / "whole", "--empty"), folder / "whole")

@@ -24,7 +24,7 @@ from reskin.models.runner import _read_rows, run_jobs
 from reskin.seeds import rng_for
 
 BOARDS_N, SEEDS_N, ROWS_N, STEPS_N = 6, 6, 20_000, 200
-TASKS_N = SEEDS_N * BOARDS_N // 3  # one task trains a stack of three networks
+TASKS_N = SEEDS_N * BOARDS_N // 3  # one task trains three networks together (a stack)
 EMPTY_N = 300
 
 

@@ -1,7 +1,7 @@
 """A small network on one machine: network namespaces, each with its own address, on one bridge.
 
-Programs in a namespace run as if on a machine of their own. Needs root and the command `ip`; the context manager
-`network` removes all namespaces on exit.
+Programs in a namespace run as if on a separate machine. This module needs root and the command `ip`; the context
+manager `network` removes all namespaces on exit.
 """
 
 import os

@@ -41,7 +41,7 @@ Points = list[tuple[int, float]]
 
 
 def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: str) -> dict[str, Points]:
-    """Return the cost curve of each stage in `row[part]`: for each row, the point (row[count], cost `what`)."""
+    """Return the cost curve of each stage in `row[part]`. Each row gives one point: (row[count], cost `what`)."""
     found: dict[str, Points] = {}
     for row in rows:
         for name, values in row[part].items():

@@ -75,7 +75,7 @@ class Clone:
         return run([sys.executable, "-m", "pipeline", *words], self.folder, self._variables)
 
     def add(self, skin_i: int) -> None:
-        """Add the recording of a simulated skin on a board of its own, in layout `table`."""
+        """Add the recording of a simulated skin on a new board, in layout `table`."""
         file = self.folder.parent / f"skin{skin_i}.csv"
         recording(skin_i).to_csv(file, index=False)
         labels = ["--board", f"board{skin_i}", "--skin", f"skin{skin_i}", "--scene", SCENE]
@@ -167,7 +167,7 @@ def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) ->
 
 
 def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
-    """Let two people each add a skin, run the pipeline and push; the second merges, and the first pulls the merge."""
+    """Let two people each add a skin, run the pipeline and push. The second one merges; the first pulls the merge."""
     for name, clone, skin_i in (("Ana", ana, 3), ("Ben", ben, 4)):
         with steps.step(f"{name}: `reskin add` skin {skin_i}, `dvc repro`, commit, `dvc push`") as note:
             clone.add(skin_i)

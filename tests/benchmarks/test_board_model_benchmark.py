@@ -1,7 +1,7 @@
 """Accuracy of models made for layouts: on simulated skins, on recorded eFlesh pads and boards with fewer chips.
 
 Run it with the folders of the recordings, which are not part of the project (docs/learning.md, "Models for other
-boards"); ten minutes:
+boards"). It takes ten minutes:
 
     RESKIN_BENCHMARKS=full RESKIN_EFLESH=DATASETS RESKIN_EFLASH7=FOLDER RESKIN_LAB=FOLDER \
         pytest -s tests/benchmarks/test_board_model_benchmark.py
@@ -64,7 +64,7 @@ class Presses:
 def by_model(
     model: Universal, pool: Presses, tested: Presses, labels_n: int, *, area: bool = False
 ) -> Float[np.ndarray, "m 3"]:
-    """Calibrate a model to 65 unlabelled presses of a pool, and to labels of the first of them."""
+    """Calibrate a model to 65 unlabelled presses of a pool, and to the labels of the first presses of this pool."""
     noload_uT = pool.noload_uT
     model.zero(noload_uT).see(noload_uT + pool.db_uT[:FULL_SET_N], area=area)
     if labels_n:
@@ -138,7 +138,7 @@ def read(recording: Path, layout: str, options: dict[str, str]) -> tuple[Reading
     reader = READERS[layout]
     files = reader.collect(recording)
     header = make_header(layout=layout, chips_n=reader.count_chips(files), options=options)
-    with TemporaryDirectory() as folder:  # the reader needs the names that files have in a capture
+    with TemporaryDirectory() as folder:  # the reader expects the file names of a capture
         for name, file in files.items():
             shutil.copy(file, Path(folder) / name)
         return reader.read(Path(folder), header, DEFAULT_POLICY)
@@ -242,7 +242,7 @@ def test_forces_on_a_recorded_pad(model: Universal, i: int) -> None:
     recording = sorted((folder_of("RESKIN_EFLESH") / "normal_force").iterdir())[i]
     readings, _ = read(recording, "eflesh", {"force_axis": "z"})
     touched, last = readings.Fz_N >= FORCE_MIN_N, readings.pass_i >= readings.pass_i.max() - 1
-    place_mm = np.array(model.layout.centre_mm)  # the place is not stated; the middle is assumed
+    place_mm = np.array(model.layout.centre_mm)  # the recordings do not state the place; the middle is assumed
     pool, tested = (presses_of(readings, place_mm, touched & kept) for kept in (~last, last))
     compare(f"forces, eflesh {i}", model, pool, tested, "N")
 
@@ -255,7 +255,8 @@ def test_forces_on_a_pad_of_nine_places(model: Universal) -> None:
         readings, _ = read(recording, "eflash7", {})
         place_mm = model.layout.centre_mm + PITCH_MM * (np.array([(n - 1) % 3, (n - 1) // 3]) - 1)
         touched, early = readings.Fz_N >= FORCE_MIN_N, np.arange(len(readings)) < 0.6 * len(readings)
-        # The recorder subtracted an unknown field, so the no-load field of the model's central law replaces it.
+        # The recorder subtracted an unknown no-load field. It is replaced by the no-load field of the model's central
+        # law.
         rest_uT = model.layout.to_chips(model.tables.rest_uT[None])[0]
         pools.append(presses_of(readings, place_mm, touched & early, rest_uT))
         tests.append(presses_of(readings, place_mm, touched & ~early, rest_uT))

@@ -34,7 +34,7 @@ CHOICE_SEED, SEED = 1, 2
 CHOICE_SKINS_N, SKINS_N, COVERAGE_SKINS_N = 24, size(96, 1), 24
 PRESSES_N, LABELS_N = size((0, 5, 12, 65), (5,)), size((0, 10, 40), (10,))
 CHOICE_PRESSES_N, RECORDED_PRESSES_N = (1, 3, 12), (0, 5, 12)
-# correlations between days, of the slide and of the law's errors
+# tried pairs of correlations between days: of the slide, of the law's errors
 CORRELATIONS = (0.0, 0.0), (0.0, 0.5), (0.0, 0.7), (0.0, 0.85), (0.0, 1.0), (0.5, 0.7)
 LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
 WAYS = TOGETHER, ALONE, BY_DAY = "all presses together", "new presses alone", "by day"
@@ -45,7 +45,7 @@ FULL_ONLY = pytest.mark.skipif(not FULL, reason="at a tiny size, this repeats th
 
 @dataclass(frozen=True)
 class SkinOnTwoDays:
-    """Presses on one skin, with the same places and forces on both days; the first `PLACES_N` are for calibration.
+    """Presses on one skin, with equal places and forces on both days. The first `PLACES_N` presses are for calibration.
 
     first_uT: field changes on the first day. later_uT: field changes on the later day, for each kind of change.
     """
@@ -128,7 +128,7 @@ class TwoDays:
 @FULL_ONLY
 @pytest.mark.timeout(3600)
 def test_correlations_and_limit_in_use_are_nearly_the_best(monkeypatch):
-    """Choose the correlations, then the limit; unchanged and changed errors of the law have equal weight."""
+    """Choose the correlations, then the limit. Unchanged and changed errors of the law have equal weight."""
     skins = list(draw_skins(CHOICE_SKINS_N, CHOICE_SEED))
     monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)  # always assume that the slide has changed
     by_pair = {}
@@ -173,7 +173,7 @@ def test_accuracy_on_a_later_day():
             for labels_n, days in by_labels_n.items():
                 together = days.score(change, n, TOGETHER)
                 same = days.log_odds(change, n) >= model.SAME_SLIDE_LOG_ODDS_MIN
-                by_day = together if same else days.score(change, n, BY_DAY)  # with the same slide, both are equal
+                by_day = together if same else days.score(change, n, BY_DAY)  # if `same`, both are equal
                 scores.setdefault((change, labels_n, n), []).append((together, alone, by_day))
     for change, of_skins in cosines.items():
         print(f"cosine of equal presses, slide {change}: 5, 50, 95 % quantiles {np.percentile(of_skins, [5, 50, 95])}")
@@ -245,7 +245,7 @@ def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
 def test_recorded_depths_used_as_days(shared_data, tmp_path):
     """Use recordings at one depth as the first day, and recordings at another depth as the later day.
 
-    They were not recorded on different days, so this does not test the change from day to day. Labels are at tested
+    These recordings are not from different days, so this does not test a change from day to day. Labels are at tested
     places. No setting was chosen on these recordings.
     """
     scores: dict[tuple[int, int, str], list[Score]] = {}
@@ -274,5 +274,5 @@ def test_recorded_depths_used_as_days(shared_data, tmp_path):
     for labels_n, n in product(LABELS_N, RECORDED_PRESSES_N):
         means = [np.mean(scores[labels_n, n, way], axis=0) for way in WAYS]
         print(f"| {labels_n} | {n} | {' | '.join(f'{within:.1f} / {mse:.2f}' for within, mse in means)} |")
-        if labels_n:  # the labels of the other depth help
+        if labels_n:  # labels of the first depth must improve the estimates
             assert means[WAYS.index(BY_DAY)][0] > means[WAYS.index(ALONE)][0]

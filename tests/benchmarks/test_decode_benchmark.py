@@ -1,8 +1,8 @@
 """Compare the time to decode whole blocks of bytes with that of loops over single frames, on the same bytes.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`. The loops decode a tenth of the
-frames, and their times are multiplied by ten. Each time is the smallest of three. The test asserts only that the
-decoded values are equal.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`. The loops decode only a tenth of the
+frames, and their times are multiplied by ten. Each time is the smallest of three measurements. The test asserts only
+that the decoded values are equal.
 """
 
 import io
@@ -77,7 +77,7 @@ def peak_MB(call: Callable[[], Any]) -> float:
 
 
 def bare_copy(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Copy every value to its position in the decoded arrays, without any check: the cost of memory access alone."""
+    """Copy every value to its position in the decoded arrays without any check, to measure memory access alone."""
     frames = np.frombuffer(data, np.dtype([("chips", "<f4", (CHIPS_N, 4)), ("end", "V2")]))["chips"]
     return frames[:, :, 1:].reshape(len(frames), -1).copy(), frames[:, :, 0].copy()
 

@@ -23,5 +23,5 @@ def test_entry_is_reproduced(name: str, tmp_path: Path) -> None:
     write(list(METHODS[name].predict(data.tasks())), tmp_path / "again.csv")
     again = score_predictions(tmp_path / "again.csv", read_predictions(tmp_path / "again.csv"), data, committed.about)
     for task, before in zip(again.tasks, committed.tasks, strict=True):
-        # tolerance: networks differ between processors; the intervals over boards are wider than this
+        # tolerance: trained networks differ between processors; the intervals over boards are wider than the tolerance
         assert task.scores["accuracy_pct"]["mean"] == pytest.approx(before.scores["accuracy_pct"]["mean"], abs=2)

@@ -1,7 +1,7 @@
 """Size, speed and accuracy of the shipped model as C code and as ONNX, calibrated to simulated skins (docs/robots.md).
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_export_benchmark.py`, two minutes. It needs a C compiler and
-extra `onnx`.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_export_benchmark.py`, which takes two minutes. It needs a C
+compiler and extra `onnx`.
 """
 
 import re
@@ -36,7 +36,7 @@ def calibrate(seed: int, labels_n: int, external_uT: float) -> tuple[Universal, 
 
 
 def run_c(folder: Path, b_uT: np.ndarray, *options: str) -> tuple[np.ndarray, float]:
-    """Compile and run the program of docs/robots.md; return its estimates, and its time per reading in ms."""
+    """Compile and run the program of docs/robots.md; return its estimates and the time per reading in ms."""
     command = [COMPILER, "-std=c99", "-O2", *options, "-o", folder / "main", folder / "main.c", "-lm"]
     subprocess.run(command, check=True)
     text = "\n".join(" ".join(map(repr, row)) for row in b_uT.tolist())

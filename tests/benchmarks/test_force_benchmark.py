@@ -1,8 +1,8 @@
 """Choice of the force estimator on simulated skins: power of the map's probabilities of forces, and default estimator.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_force_benchmark.py`, four minutes. On each skin, the shipped
-model is calibrated to 65 presses at unknown places and to labels; 25 other presses are tested. Errors of the law are as
-in training, or twice as large. No recorded press is used.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_force_benchmark.py`, which takes four minutes. On each skin,
+the shipped model is calibrated to 65 presses at unknown places and to labels; 25 other presses are tested. Errors of
+the law are as in training, or twice as large. No recorded press is used.
 """
 
 from statistics import median

@@ -27,7 +27,7 @@ INDENTATIONS_N = size(1_000_000, 800)
 TILE_N = size(4_000, 400)  # indentations in the block of bytes that is written repeatedly
 QUIET_N = 400  # no-load frames before the first indentation and after the last
 SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # fraction of the indentation's full field change, frame by frame
-TRAVEL_N = 8  # largest number of frames between indentations; it is random, because clocks are matched by these gaps
+TRAVEL_N = 8  # most frames between indentations; random, because these gaps serve to match the clocks
 RATE_HZ = 400.0
 ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = (
     size(800, 2000),

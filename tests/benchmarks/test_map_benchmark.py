@@ -25,7 +25,7 @@ def test_time_of_estimates_and_calibration():
     lattice_i = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
     force_i = rng.integers(len(tables.force_N), size=POKES_N)
     db_uT, force_N = tables.mean_uT[*lattice_i, force_i], tables.force_N[force_i]
-    # The fields are not converted to the chips' axes: the time does not depend on that.
+    # The fields are not converted to the chips' axes, because this does not affect the time.
     b_uT = db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))
     rest_uT = b_uT[:1] - db_uT[:1]
     print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")

@@ -1,7 +1,7 @@
 """Design choices of the universal model in external fields, compared on simulated skins.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_moving_benchmark.py`, a minute of processor time. Experiment
-`moving_hand` measures the results of these choices, also on recordings.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_moving_benchmark.py`, which takes a minute of processor
+time. Experiment `moving_hand` measures the results of these choices, also on recordings.
 """
 
 from collections.abc import Callable, Mapping
@@ -87,7 +87,7 @@ def test_networks_and_distance_on_simulated_skins():
             cells = "  ".join(f"{pct:5.1f} / {mse:.2f}" for pct, mse in row)
             name = f"external_uT {sd_uT:3.0f}, magnets at {distance_mm:6.0f} mm, networks: {networks}"
             print(f"{labels_n:2} labels, {name:82} {cells}")
-    if FULL:  # with magnets nearby, the option is better; without external fields, it is worse
+    if FULL:  # the option improves places near magnets, and costs accuracy without external fields
         on = within[140.0, external.DISTANCE_MM, NETWORKS[3], 0]
         off = within[0.0, external.DISTANCE_MM, NETWORKS[0], 0]
         assert on[3] > off[3]

@@ -95,6 +95,6 @@ def test_three_commands_lead_to_scores_and_a_model(tmp_path):
     lifted, touched = table[table.phase == "noload"], table[table.phase == "contact"]
     model = reskin.load_model(root / numbers["final_model"]["file"]).zero(lifted[FIELDS].to_numpy())
     predicted = model.predict(touched[FIELDS].to_numpy())
-    # the board was in training, so the error is small
+    # the model was trained on this board, so the error is small
     assert np.abs(predicted[:, :2] - touched[["x_mm", "y_mm"]].to_numpy()).mean() < 0.5
     assert numbers["final_model"]["file"] in (root / "reports/mine/index.html").read_text()

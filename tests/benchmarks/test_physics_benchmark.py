@@ -42,7 +42,7 @@ def one_pass_m() -> np.ndarray:
 
 def forget_tables() -> None:
     if not FULL:
-        return  # keep the cached tables, which other tests in this process use
+        return  # do not clear the cached tables, because other tests in this process use them
     for cached in (
         deformation._tabulate,
         deformation._displaced,
@@ -68,7 +68,7 @@ def move_everything(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
     moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
     moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
     rest = one.nodes_m, one.moments_A_m2
-    # same memory order as that of the arrays from `deformation.move_dipoles`
+    # the memory order of the arrays that `deformation.move_dipoles` returns
     return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))
 
 

@@ -72,8 +72,9 @@ def flop(triplet_weight: float) -> float:
     """Count the floating-point operations of the matrix products in one training step of one network.
 
     A multiply-add counts as two operations. The forward pass, the weight gradients and the input gradients (not
-    computed for the first layer) take 2 b (3 sum(in out) - in1 out1) operations for a batch of b rows. Triplets add two
-    passes through the first three layers. Bias, ReLU, loss and optimiser are not counted.
+    computed for the first layer) take 2 b (3 sum(in out) - in1 out1) operations. Here, b is the number of rows in the
+    batch, in and out are the widths of a layer, and in1 and out1 are those of the first layer. Triplets add two passes
+    through the first three layers. Bias, ReLU, loss and optimiser are not counted.
     """
 
     def passes(layers: Sequence) -> float:

@@ -99,7 +99,7 @@ def stages_of(scene: str) -> list[dict[str, Any]]:
 
 
 def limits_of(scene: str, row: Mapping[str, Any], rates: Mapping[str, float]) -> dict[str, float] | None:
-    """Return a stage's lower bounds in s, from products, memory and disk alone; None for stages that do not train."""
+    """Return a stage's lower bounds in s for products, memory and disk; None for stages that do not train."""
     settings, stage = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml"), str(row["stage"])
     shared = read_yaml(ROOT / "params.yaml")
     group = NETWORKS_BY_SWEEP.get(stage, {stage: 1} if stage in EXTRA_PASSES_N else None)

@@ -74,8 +74,7 @@ class TestZeroReads:
 class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 1000))
     def test_lsb_is_found(self, name, seed):
-        # Tolerance 2 %: rounding to two decimals changes a step of 0.15 uT by 2 % at most, and the mean of many steps
-        # by less.
+        # Tolerance 2 %: rounding to two decimals changes a step of 0.15 uT by at most 2 %, and a mean of steps by less.
         lsb_uT = faults.find_lsb(readings_on_grid([GRIDS_uT[name]], 400, seed))
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 

@@ -73,7 +73,7 @@ def test_silence_and_buffered_bytes_do_not_change_the_rate():
 @pytest.mark.parametrize(("every_n", "stuck", "frames"), [(1, False, 0.0), (2, False, 0.0), (5, False, 0.0),
                                                          (5, True, 0.2), (10, False, 0.5)])  # fmt: skip
 def test_repeats_are_counted_per_chip(every_n, stuck, frames):
-    """Each chip converts once in n frames; a single stuck chip has no effect on the median."""
+    """Each chip converts once in n frames. A single stuck chip must not affect the median over chips."""
     frame_i, chip_i = np.indices((1000, 5))
     values = rng_for(every_n, "values").normal(size=(1000, 5, 3))
     b_uT = values[frame_i - (frame_i - chip_i) % every_n, chip_i]
@@ -87,7 +87,7 @@ def test_repeats_are_counted_per_chip(every_n, stuck, frames):
 
 
 def test_rate_limits_of_the_papers_board():
-    """Reference: the I2C bits are counted here, 9 per byte plus start, repeated start and stop."""
+    """Reference: count the I2C bits independently (9 per byte, plus start, repeated start and stop)."""
     read = ["address", "RM", "address", "status", *"TTXXYYZZ"]
     start = ["address", "SM", "address", "status"]
     read_s, start_s = ((9 * len(part) + 3) / 400e3 for part in (read, start))
@@ -140,7 +140,7 @@ def test_rate_limits_fall_with_chips_frame_length_and_conversion_time(chips_n, f
     ],
 )  # fmt: skip
 def test_rate_of_an_emulated_board_is_explained(script, sentence):
-    """In fault `torn`, each cut frame is lost together with the frame that follows it: two of ten."""
+    """In fault `torn`, each cut frame is lost together with the next frame, so two of ten frames are lost."""
     board = recognise_at_due_times(script)
     assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=find.BAUD)))
 

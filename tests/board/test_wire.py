@@ -20,7 +20,7 @@ def lines_of(text: bytes, wire: str, chips_n: int):
 
 
 def one_frame(chips_n: int):
-    """Return a frame: chip 0 reads 1.25, -2.5, 56.78 uT and 25 degC; each next chip reads 3 more in every value."""
+    """Return a frame. Chip 0 reads 1.25, -2.5, 56.78 uT and 25 degC; each further chip reads 3 more."""
     b_uT = np.array([[1.25, -2.5, 56.78]]) + 3 * np.arange(chips_n)[:, None]
     return frames_of(b_uT.reshape(1, -1), 25.0 + 3 * np.arange(chips_n)[None])
 

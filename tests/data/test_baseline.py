@@ -25,7 +25,7 @@ runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # number of readi
 
 
 def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return no-load fields and indentation numbers; a field equals the number, and the numbers have gaps."""
+    """Return no-load fields and indentation numbers. Each field equals its number; the numbers have gaps."""
     indentation = np.repeat(7 + 3 * np.arange(len(runs_n), dtype=np.int32), runs_n)
     return np.repeat(indentation[:, None], 3, axis=1).astype(np.float32), indentation
 
@@ -76,7 +76,7 @@ def test_contact_free_policy_follows_the_no_load_drift(rows_n):
     within_uT = alike_within_uT(noload_uT[: 20 * rows_n], indentation[: 20 * rows_n])
     assert within_uT == pytest.approx(2.0, rel=0.2)
     off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
-    # the estimated no-load field lags by less than a touch, occasionally by one or two touches
+    # the estimated no-load field is usually less than one touch old, occasionally one or two touches
     assert np.sqrt((off_uT**2).mean()) < 0.7
     assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
 

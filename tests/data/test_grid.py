@@ -24,7 +24,7 @@ def test_places_are_visited_in_snake_order():
     assert (steps_mm[:, 1] <= 2).all()
     along = steps_mm[:, 1] == 0
     assert (steps_mm[along, 0] == 2).all()
-    # between rows: successive rows of the grid differ by at most two places in length
+    # larger steps occur only between rows, whose lengths differ by at most two places
     assert (steps_mm[~along, 0] <= 4).all()
 
 

@@ -48,7 +48,7 @@ def as_set(lines: Lines, names=None) -> set:
 
 
 def grid_lines_naively(table: Rows, chosen) -> set:
-    """Reference: table rows of a skin with equal y (then equal x) form a line, indexed by the other coordinate."""
+    """Reference: rows with equal y form a line, indexed by x; rows with equal x form a line, indexed by y."""
     found = set()
     place = {int(i): (str(table.skin[i]), *(round(float(v) * 10) for v in table.target[i, :2])) for i in chosen}
     for i in place:

@@ -214,7 +214,7 @@ PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])
 
 
 def poked_rows(boards_n: int = 3, readings_n: int = 2):
-    """Return rows of two skins per board; each skin has ten indentations at the places `PLACES`, in two passes."""
+    """Return rows of two skins per board. Each skin has ten indentations in two passes, at the places `PLACES`."""
     labels = [
         (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
         for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)

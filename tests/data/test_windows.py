@@ -101,13 +101,13 @@ def test_every_window_has_the_change_of_each_policy():
         np.testing.assert_allclose(part.noload_off_uT, np.sqrt(np.mean(off)))
 
 
-def test_first_no_load_reading_may_be_that_of_an_unselected_row():
+def test_first_no_load_reading_may_be_in_an_unselected_row():
     first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
-    # relative to the no-load field of reading 0, which is not selected because its force is too low
+    # the initial no-load field is that of reading 0, which is not selected because its force is too low
     assert (first.rows.db_uT == 100).all()
 
 
-def test_parts_have_the_numbers_of_their_rows():
+def test_parts_contain_the_indices_of_their_rows():
     parts = example_parts("s0", "s1")
     rows = stack(parts)
     assert np.concatenate([part.row_i for part in parts]).tolist() == list(range(len(rows)))

@@ -49,7 +49,8 @@ def test_change_of_readings_equals_that_of_simulated_chips(b_T):
     at_rest, with_field = (
         read_field(uniform(field), REAL.board, design=chip, rng=rng_for(0, "x"))[0] for field in (0 * b_T, b_T)
     )
-    # The difference of two readings, each with a rounding error of half a step, is off by at most one step.
+    # Each reading has a rounding error of at most half a step, so the difference of two readings is off by at most one
+    # step.
     assert np.abs((with_field - at_rest) - readings_uT(REAL.board, uniform(b_T))).max() <= steps_uT(6).max() * 1.001
 
 
@@ -99,7 +100,7 @@ def test_iron_disturbance_falls_with_distance():
     chips_uT = [rms_uT(chips) for chips, _ in disturbances]
     assert chips_uT == sorted(chips_uT, reverse=True)
     assert rms_uT(disturbances[0][1]) < 0.2 * chips_uT[0]
-    # At 80 mm, the ball is magnetised by the earth alone, and its distance to all chips is equal within 10 %.
+    # At 80 mm, the earth alone magnetises the ball, and the distances from the ball to the chips are equal within 10 %.
     dipole_uT = 2 * 50 * (5 / 87) ** 3
     assert 0.4 * dipole_uT < chips_uT[-1] < 1.1 * dipole_uT
 

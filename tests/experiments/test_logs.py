@@ -198,8 +198,8 @@ def test_reference_chip_removes_false_contacts_of_pitch():
     assert [row["pitch_deg"] for row in rows] == list(PITCHES_DEG)
     false_n = [row["false_readings_n"] for row in rows]
     assert false_n == sorted(false_n)
-    # At 45 degrees, the norm of the field changes of five chips swings up to sqrt(5) 38 uT = 86 uT. It is below the
-    # contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
+    # At 45 degrees, the norm of the field changes of five chips swings up to sqrt(5) 38 uT = 86 uT. This norm is below
+    # the contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
     off_n = int((np.isnan(log.true[:, 2]) & (np.arange(len(log.t_s)) >= log.quiet_n)).sum())
     assert 0.6 * off_n < false_n[-1] < off_n
     for row in rows:

@@ -56,9 +56,9 @@ def test_turned_field_is_uniform_and_keeps_its_length():
 
 def test_moved_magnet_has_the_stated_field_at_the_board():
     changes_uT = to_board(hand.move_magnet(140.0, (40.0, 40.0), 20_000, rng_for(0, "magnet"))).reshape(-1, 5, 3)
-    sd_uT = changes_uT.std(axis=0)  # the field before is the same for all, and the mean of the fields is 0
+    sd_uT = changes_uT.std(axis=0)  # all changes start from the same field, and the mean of the later fields is 0
     np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # chip at the centre; the standard error is below 1 %
-    assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()  # outer chips come nearer to the magnet
+    assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()  # outer chips can be nearer to the magnet
 
 
 # --- Contacts ---

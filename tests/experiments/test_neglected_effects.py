@@ -82,8 +82,8 @@ def test_no_load_reading_removes_a_steady_field(rows):
 
 
 def test_included_effects_change_the_field(rows):
-    # Following the deformation in increments changes the field by 16-23 % on a bonded skin at 1.2 mm; on a sliding skin
-    # the linear far field dominates
+    # Computing the deformation in increments changes the field of a bonded skin at 1.2 mm by 16-23 %. On a sliding
+    # skin, the linear far field dominates.
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50

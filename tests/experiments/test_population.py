@@ -200,7 +200,7 @@ def test_weight_is_estimated_last(model, skins):
 
 
 def test_weight_share_is_computed_at_the_calibrated_power(skins, monkeypatch):
-    # In this test, force errors grow with the power, and only one power has intervals that cover 90 %.
+    # In this test, force errors grow with the likelihood power, and only one power has intervals that cover 90 %.
     def fake_estimate(model, skin, size, powers):
         found = []
         for one in powers:

@@ -78,7 +78,7 @@ def test_fitted_rotation_has_the_smallest_squared_distances():
     from_mm, to_mm = rng.uniform(-8, 8, (2, 5, 2))
 
     def error_mm2(turned: np.ndarray) -> float:
-        moved = turned - turned.mean(axis=0) + to_mm.mean(axis=0)  # for a given rotation, this shift is the best
+        moved = turned - turned.mean(axis=0) + to_mm.mean(axis=0)  # for a given rotation, aligned means are best
         return float(((moved - to_mm) ** 2).sum())
 
     searched = min(error_mm2(from_mm @ rotation(angle_deg).T) for angle_deg in np.arange(0, 360, 0.1))
@@ -373,7 +373,7 @@ def test_drift_raises_the_threshold_and_the_smallest_force(detection):
             assert better["power_law_N"] < worse["power_law_N"]
         assert by_rate[0]["detected_pct"] == 100
         assert by_rate[0]["smallest_N"] == pytest.approx(0.7, rel=0.11)  # the smallest force of all
-        # Forces in proportion are larger than those of a power law with an exponent below 1.
+        # Extrapolation in proportion gives larger forces than a power law with an exponent below 1.
         assert by_rate[0]["power_law_N"] < by_rate[0]["proportional_N"] < 0.7
         live = next(row for row in numbers["rows"] if row["board"] == board and row["rule"] == limits.BY_LIVE)
         assert live["false_alarm_pct"] == 0

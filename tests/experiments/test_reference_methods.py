@@ -72,9 +72,9 @@ FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 def test_paired_presses_have_the_same_place_and_force():
     rows = make_rows()
-    rows.target[20:22, 2] = 2.0  # between the two forces of b0
-    rows.target[22:24, 2] = 9.0  # above the largest force of b0
-    rows.target[24:26, :2] = 50.0  # not a place of b0
+    rows.target[20:22, 2] = 2.0  # a force between the two forces of b0
+    rows.target[22:24, 2] = 9.0  # a force above the largest force of b0
+    rows.target[24:26, :2] = 50.0  # a place that b0 does not have
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
     np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)

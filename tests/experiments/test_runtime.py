@@ -132,8 +132,8 @@ def test_boxes_fill_the_volume_of_the_lattice():
 
 
 def test_lifted_box_equals_charged_faces(monkeypatch):
-    # The skin is a single box, for which the dipole approximation would be wrong. The box is magnetised along
-    # z, because it is between equal poles.
+    # The skin is a single box, for which the dipole approximation would be wrong. The box is between equal poles, so
+    # its magnetisation is along z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -189,7 +189,7 @@ def test_path_of_material_follows_the_flow():
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 
 
-def test_error_is_that_of_the_worst_skin():
+def test_error_is_the_largest_error_of_any_skin():
     trials = [trial(), trial(name="s1")]
     truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
     factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]
@@ -457,7 +457,7 @@ def test_solver_failure_is_reported(monkeypatch):
 
 
 def test_error_hardly_depends_on_the_number_of_pokes():
-    # Errors of few and of many pokes agree within a factor of two, which suffices: errors span ten decades.
+    # The tolerance is a factor of two, which suffices because the errors of the methods span ten decades.
     once, thrice = (
         study_integrators(settings(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
     )

@@ -129,7 +129,7 @@ def test_monotonicity_does_not_depend_on_the_step_of_filling():
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
     found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
-    # the mean rise per level is 0.6 uT, with noise of 5 sqrt(2 / 100) = 0.7 uT
+    # the mean rise per level is 0.6 uT; its noise is 5 sqrt(2 / 100) = 0.7 uT
     assert found["neighbours"]["falls_n"] > 0
     assert found["holds"]
     assert coarse["holds"]

@@ -150,7 +150,7 @@ def test_peak_memory_counts_arrays_that_exist_at_once():
     assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # 10 %: overhead of the array object
 
 
-# Each of the following tests disables one guard of the library; a stability case must detect that.
+# Each of the following tests disables one guard of the library. A stability case must detect the missing guard.
 
 
 def test_naive_small_step_quotient_is_detected(monkeypatch):

@@ -39,7 +39,7 @@ def test_cases_are_reproducible(cases):
     assert set(triplet_cases(SEED)) <= set(cases)
 
 
-# Each of the following tests disables one guard of the training code; a case must detect that.
+# Each of the following tests disables one guard of the training code. A case must detect the missing guard.
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")

@@ -92,7 +92,7 @@ def test_wrong_array_field_violates_maxwell(monkeypatch):
 
 def test_wrong_field_constant_is_detected_beyond_its_tolerance(monkeypatch):
     monkeypatch.setattr(change, "MU0_4PI", 1e-7)
-    # relative error 1.3e-10: less than between mu_0 of two CODATA years
+    # relative error 1.3e-10: less than the difference of mu_0 between two CODATA years
     assert failed(check_field(DESIGN.skin, SEED)) == set()
     monkeypatch.setattr(change, "MU0_4PI", 1.001e-7)
     assert failed(check_field(DESIGN.skin, SEED)) == {

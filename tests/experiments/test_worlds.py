@@ -40,7 +40,7 @@ def test_law_error_has_size_and_smoothness_and_is_reproducible():
     assert with_residual(CHANGE_uT, PRESSES, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
 
 
-def test_law_error_shares_variance_between_skins():
+def test_part_of_the_law_error_is_common_to_all_skins():
     fully_shared = RESIDUAL.model_copy(update={"own_share": 0.0})
     np.testing.assert_array_equal(law_error("b0_s0", fully_shared), law_error("b1_s0", fully_shared))
     pairs = [np.corrcoef(law_error(f"b{i}_s0").ravel(), law_error(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]

@@ -47,7 +47,7 @@ def changes_uT(chips_n: int) -> np.ndarray:
 
 
 def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips_n: int = 5) -> Path:
-    """Write a linear network whose predictions for the two pokes are exact, except for an offset `off_mm` along x."""
+    """Write a linear network. Its predictions for the two pokes are exact, except for an offset of `off_mm` along x."""
     # weights of the linear model [3 ch]
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}

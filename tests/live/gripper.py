@@ -1,4 +1,4 @@
-"""A gripper with a simulated skin on its finger that closes on a spring and controls the estimated force.
+"""A simulated gripper with a skin on its finger. It closes on a spring and controls the estimated force.
 
 Frames of the skin are encoded, decoded and evaluated like those of a real board.
 """
@@ -100,7 +100,7 @@ class FingerReader:
 def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
-    """Hold an object whose stiffness varies tenfold; return true and estimated force in N at every time step [f 2]."""
+    """Hold an object whose stiffness varies tenfold. Return true and estimated force in N at each time step: [f 2]."""
     skin, wire, closed_mm, forces_N = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
     skin.reader = wire
     while len(forces_N) < seconds * RATE_HZ:

@@ -46,7 +46,7 @@ DOT = """((x, y) => { const {last, frame, parts: {board}} = boards[0], [px, py] 
   ratio = devicePixelRatio;
   return last.contact ? [...board.getContext("2d").getImageData(ratio * px, ratio * py, 1, 1).data].slice(0, 3).concat(
     strengthColour(last.force).match(/[0-9]+/g).map(Number)) : []; })"""
-# JavaScript: the number of pixels in which a trace differs from the same trace redrawn at once, and of drawn pixels.
+# JavaScript: two numbers of pixels: those in which a trace differs from the same trace redrawn at once, and drawn ones.
 COMPARE_TRACES = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
   const anew = new Trace(shown.canvas, shown.first, shown.least, shown.below);
@@ -159,7 +159,7 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
             "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
         )
         await tab.look("network")
-        for trace_i in range(2):  # a trace that was scrolled and rescaled looks like one that is redrawn at once
+        for trace_i in range(2):  # a scrolled and rescaled trace looks like one that is drawn at once
             differ_n, inked_n = await tab.value(f"{COMPARE_TRACES}(boards[0], {trace_i})")
             assert differ_n < 0.01 * inked_n  # 1 %: Chromium smooths short and long paths differently
             assert inked_n > 1000
@@ -173,7 +173,8 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
         await tab.until("boards[0].state.zeroed")
         await tab.until("boards[0].parts.zeroed.innerText.startsWith('2 times')")
         assert await tab.value("boards[0].parts.adapt.disabled")  # only the universal model can adapt
-        # The true place of a real board is unknown: there is no switch, and nothing is drawn even if it were on.
+        # The true place on a real board is unknown, so there is no switch, and nothing is drawn even if the switch were
+        # on.
         await tab.value("boards[0].parts.truth.checked = true")
         assert await tab.value("boards[0].parts.emulated.offsetHeight") == 0
         assert not await tab.value("boards[0].truthShown()")
@@ -198,7 +199,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     true[np.linalg.norm(quiet.frames.b_uT - quiet.frames.b_uT[0], axis=1) < 100] = np.nan
 
     async def act(tab: Tab) -> None:
-        assert not await tab.value("boards[0].truthShown()")  # only on demand
+        assert not await tab.value("boards[0].truthShown()")  # the true place is shown only on demand
         await tab.value("boards[0].parts.truth.click()")
         await tab.until("boards[0].parts.off.innerText.includes('the estimate is off by')")
         await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
@@ -280,7 +281,7 @@ def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):
 def test_page_draws_several_boards(tmp_path):
     async def act(tab: Tab) -> None:
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
-        for i in range(1, 8):  # the model has five chips, so the sleeve of forty chips has no estimate
+        for i in range(1, 8):  # the model is for five chips, so the sleeve of forty chips has no estimate
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
         for i, rate_hz in enumerate(RATES_HZ[:UNPLUGGED_I]):
             await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")

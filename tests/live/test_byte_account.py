@@ -20,7 +20,7 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Return a random script with faults, its undamaged frames, which of these are finite, and the generator."""
+    """Return a random script with faults, its undamaged frames, the mask of finite frames, and the random generator."""
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
@@ -33,7 +33,7 @@ def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generato
         if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
             script = inject(script, make_fault(name, slot_i, rng))
     pieces = list(script.pieces)
-    # Frames with a terminator in the payload must be finite: otherwise, the decoder does not recognise them as frames.
+    # Frames with a terminator in the payload must be finite, because otherwise the decoder does not recognise them.
     finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])
     for i in np.flatnonzero(~finite):
         pieces[i] = with_nan(pieces[i], wire)

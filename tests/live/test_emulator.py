@@ -53,7 +53,7 @@ class SimulatedClock:
 
 
 class FakeReader:
-    """A reader that records the arrival time of each frame, and once pauses for `late_s`, after frame `late_i`."""
+    """A reader that records the arrival time of each frame. After frame `late_i`, it pauses once, for `late_s`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
@@ -103,7 +103,7 @@ def test_script_restarts_when_the_port_is_reopened(port):
     for _ in range(2):
         with open_port(end.name, 115200) as device:
             data = b""
-            while len(data) < 8 * len(early):  # long enough to differ from a stream that is not restarted
+            while len(data) < 8 * len(early):  # long enough to distinguish a restarted stream from one that continues
                 data += read_waiting(device)
         restarted.append(early in data)
     stop.set()
@@ -260,7 +260,7 @@ def test_script_of_a_simulation_has_contacts(source):
     np.testing.assert_array_equal(np.isfinite(true), np.repeat(contact[:, None], 3, axis=1))
     change_uT = np.linalg.norm(script.frames.b_uT - script.frames.b_uT[~contact].mean(axis=0), axis=1)
     assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])  # uT; the noise of 15 channels is about 15 uT
-    # True forces and field changes are simultaneous: shifted by a frame or more, they are less correlated.
+    # True forces and field changes are simultaneous, so a shift by a frame or more reduces their correlation.
     force_N = np.nan_to_num(true[:, 2])
     correlation = [np.corrcoef(np.roll(force_N, lag), change_uT)[0, 1] for lag in range(-5, 6)]
     assert np.argmax(correlation) == 5
@@ -317,7 +317,7 @@ def robot_script():
 
 class TestRobot:
     @pytest.mark.parametrize("batch_n", [1, 7])
-    def test_rows_of_its_log_give_one_labelled_touch_for_each_place_and_pass(
+    def test_log_of_the_robot_gives_one_labelled_touch_per_place_and_pass(
         self, robot_script, tmp_path, monkeypatch, batch_n
     ):
         clock = SimpleNamespace(s=0.0, time=lambda: clock.s)
@@ -333,7 +333,7 @@ class TestRobot:
         for pass_i in range(2):
             places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
             assert sorted(places) == sorted(map(tuple, points_mm().tolist()))
-        for touch in touches:  # the label is the true contact at any time of the dwell
+        for touch in touches:  # at any time of the dwell, the label is the true contact
             inside = (robot_script.t_s >= touch.t_start_s - 1e9) & (robot_script.t_s <= touch.t_end_s - 1e9)
             true = robot_script.true_contacts[inside]
             assert np.isfinite(true).all()

@@ -30,7 +30,7 @@ def random_pokes():
 
 
 def make_poke_script(pokes, rotated_n: int = 0):
-    """Return a script of all pokes with pauses, after a start without contact; the chips are rotated by `rotated_n`."""
+    """Return a script: no contact, then all pokes with pauses. The order of chips is rotated by `rotated_n`."""
     noload_uT, b_uT, _, _ = pokes
     script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
@@ -169,7 +169,7 @@ def test_new_presses_replace_earlier_ones(random_pokes):
 
 @pytest.fixture(scope="module")
 def guided_pokes():
-    """Like `random_pokes`, for pokes at the places that the page shows, in the order of the page."""
+    """Return data like `random_pokes`, but for pokes at the places that the page shows, in the order of the page."""
     places = np.column_stack([GuidedPresses().place_mm, np.full(GuidedPresses().presses_n, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
     return noload_uT, b_uT, places[:, :2], force_N
@@ -231,7 +231,7 @@ def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
     before, mean = calibrated.predict(b_uT), calibrated.skin.mean
-    (tmp_path / "s3.json").write_text("{}")  # not the card of the model s3: a user's file with that name
+    (tmp_path / "s3.json").write_text("{}")  # a user's file of this name, which is not the card of the model s3
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)
         estimates = np.concatenate([batch.target[batch.contact] for batch in readings])

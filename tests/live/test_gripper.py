@@ -11,7 +11,7 @@ SEEDS = range(3)  # seeds; each draws a skin and trains a network
 def test_controller_holds_half_a_newton():
     """Measured over 12 seeds (mean +- standard deviation): the estimated force is held at 0.512 +- 0.002 N.
 
-    The true force differs from the aim by 15 +- 9 %, the mean of three seeds by 15 +- 5 %; the maximum force is 0.7 N.
+    The true force differs from the aim by 15 +- 9 % (mean of three seeds: 15 +- 5 %). The maximum force is 0.7 N.
     """
     errors = []
     for seed in SEEDS:

@@ -83,7 +83,8 @@ def test_stuck_chip_is_invalid_despite_failed_reads(every_n):
     health, used = Health(5), np.zeros(len(script), bool)
     for i in range(len(script)):
         used[i : i + 1] = health.feed(script.frames.where(np.arange(len(script)) == i), float(script.t_s[i]))
-    # A stuck chip is detected within two batches of frames without failed reads; up to a third of the frames have one.
+    # A stuck chip is detected within two batches of frames without failed reads. Up to a third of the frames have a
+    # failed read.
     found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400
     assert not used[(script.t_s > found_s) & (script.t_s < 2.95)].any()
     assert used[script.t_s < 1.5].any()

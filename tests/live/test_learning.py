@@ -33,7 +33,7 @@ LONG_S = 20.0
 class PausingReader(ScriptReader):
     """A reader that pauses at given times of the script until `resume` is called, and can write a recording.
 
-    Its clock is the script's time plus the unix time at the start, like that of a real reader.
+    As in a real reader, the time is a unix time: that of the start plus the time in the script.
     """
 
     def __init__(self, script, pauses_s=()):
@@ -82,7 +82,7 @@ def running(script, models, *, pauses_s=(), **options):
 
 
 def text_after(session, message, key="adapted"):
-    """Send a message as the page does; return the text that then appears under `key` in the state."""
+    """Send a message as the page does. Return the text that appears under `key` in the state as a result."""
     setattr(session, f"_{key}", "")
     receive(session, json.dumps(message))
     until(lambda: session.state()[key], session)
@@ -218,7 +218,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     log = probe.parse(folder / PROBE_FILE, "log")
     assert np.isnan(log.Fz_N).all()
     changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
-    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # uT; the field changes of the presses are above 600 uT
+    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # in uT; each press changes the field by more than 600 uT
 
 
 def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, monkeypatch):  # noqa: F811

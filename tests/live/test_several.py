@@ -31,7 +31,7 @@ pytestmark = [
 
 
 def plug_in_all(stack: ExitStack, unplugged: ExitStack, folder, boards) -> list[str]:
-    """Emulate eight boards in threads; closing `unplugged` unplugs the last board, closing `stack` the others."""
+    """Emulate eight boards in threads. Closing `unplugged` unplugs the last one; closing `stack` unplugs the rest."""
     names = []
     for i in boards:
         script = make_script(pokes_n=3, chips_n=CHIPS_N[i], rate_hz=RATES_HZ[i])
@@ -71,7 +71,7 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
         for page in pages:
             await page.close()
 
-    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # memory for bins has an upper bound
+    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # the number of stored bins has an upper bound
     assert LATENCIES_N < 1e4
     with ExitStack() as stack, ExitStack() as unplugged:
         serve(plug_in_all(stack, unplugged, tmp_path, range(len(CHIPS_N))), load_universal(), act)

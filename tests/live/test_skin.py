@@ -58,7 +58,7 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # The first touch may be either poke, because a busy machine may miss the first one.
+    # The first detected touch may be either poke, because a busy machine may miss the first poke.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
@@ -73,7 +73,7 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        # excludes readings with alarm "no data" (NaN), which a busy machine may cause
+        # readings with alarm "no data" (NaN), which a busy machine may cause, are excluded
         readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())
         before, before_n = next(readings), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # the caller is slow
@@ -141,7 +141,7 @@ def test_no_load_reading_waits_until_the_skin_is_not_touched():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    # four standard errors of a mean of 100 readings with 3 uT noise
+    # tolerance: four standard errors of a mean of 100 readings with 3 uT of noise
     np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not play_to_skin(moving)[0].zeroed
@@ -233,7 +233,7 @@ def test_port_held_by_another_program_is_not_open():
         skin = LiveSkin(name)
         skin.reader.start(must_exist=False)
         try:
-            while not skin.reader.problem:  # (if there is no problem, the time limit of the suite ends the loop)
+            while not skin.reader.problem:  # if no problem is reported, the time limit of the suite ends the loop
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseud
 
 
 def make_poke_script() -> tuple[Script, ProbeLog]:
-    """Return a script of pokes on a grid with varying pauses, and the robot's log, whose clock is 100 s ahead."""
+    """Return a script of pokes on a grid with varying pauses, and the robot's log. The robot's clock is 100 s ahead."""
     rng = rng_for(0, "poked")
     starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
@@ -100,5 +100,5 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
-    # mm, mm, N; small, because most presses are training data
+    # in mm, mm, N; the errors are small because most presses are training data
     assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()

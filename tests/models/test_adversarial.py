@@ -45,7 +45,7 @@ def test_weight_of_the_reversed_gradient_rises_from_0_to_1():
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_features_of_both_skins_converge():
-    # Over 12 seeds, the ratio is 0.30 with a standard deviation of 0.12: the mean of three seeds is four standard
+    # Over 12 seeds, the ratio is 0.30 with a standard deviation of 0.12, so the mean of three seeds is four standard
     # errors (0.068 each) below 0.6. After only 150 steps, the ratio would be 1.05 +- 0.45, which is inconclusive.
     ratios = [
         feature_distance(train_network(1.0, seed=seed)) / feature_distance(train_network(0.0, seed=seed))

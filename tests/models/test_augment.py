@@ -26,7 +26,7 @@ def test_boards_without_spread_read_the_same():
 def test_tilt_rotates_the_field_of_each_chip():
     copies, _ = virtual_boards(rows(), SKIN, augmentation(lean_sd_deg=20.0), rng_for(1, "draw"))
     before, after = (np.linalg.norm(values.reshape(-1, 2, 3), axis=2) for values in (np.tile(rows(), (3, 1)), copies))
-    np.testing.assert_allclose(after, before, rtol=1e-5)  # rotations in float32
+    np.testing.assert_allclose(after, before, rtol=1e-5)  # tolerance: rotations are computed in float32
     assert np.abs(copies - np.tile(rows(), (3, 1))).max() > 10
 
 
@@ -35,7 +35,7 @@ def test_each_copy_of_a_skin_is_on_one_board():
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
         gain_of_copy = gain[skin == name]
-        # quotients of float32
+        # tolerance: quotients of float32 numbers
         np.testing.assert_allclose(gain_of_copy, np.broadcast_to(gain_of_copy[0], gain_of_copy.shape), rtol=1e-5)
     one_of_each = np.array([gain[skin == name][0] for name in np.unique(skin)])
     assert len(np.unique(np.round(one_of_each, 4), axis=0)) == 6

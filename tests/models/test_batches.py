@@ -90,7 +90,7 @@ def test_batches_do_not_depend_on_the_stack():
 
 
 def test_additional_loss_term_does_not_change_other_batches():
-    """Methods are compared on equal batches; this must hold in every block of steps."""
+    """Methods must be compared on equal batches, in every block of steps."""
     full = some_job(terms=True)
     without = {
         "triplet": PreparedJob(

@@ -166,7 +166,7 @@ def test_predictions_are_better_than_the_mean_target(method):
 @settings(max_examples=10, deadline=None)  # an example fits two models
 @given(st.integers(0, 10_000), st.integers(-20, 20))
 def test_other_units_of_targets_scale_the_predictions(method, seed, power):
-    """The factor (1e-6 to 1e6) is a power of 2: no value is rounded, so trees split at the same values."""
+    """The factor (1e-6 to 1e6) is a power of 2, so no value is rounded, and trees split at the same values."""
     db_uT, target = rows(seed, n=60)
     query_uT, _ = rows(seed + 1, n=20)
     factor = np.float32(2.0**power)
@@ -221,13 +221,13 @@ def test_force_that_is_known_for_some_rows_is_learned(method):
         found[:, 2], fit_to(method, db_uT, target).predict(query_uT)[:, 2], atol=PREDICTION_ATOL_MM
     )
     whole = fit_to(method, np.vstack([db_uT, db_uT]), np.vstack([target, target])).predict(query_uT)
-    if method != "rbf_ridge":  # excluded, because rbf_ridge uses a random 100 of the 160 rows
+    if method != "rbf_ridge":  # rbf_ridge is excluded, because it uses a random selection of 100 of the 160 rows
         np.testing.assert_allclose(found[:, :2], whole[:, :2], atol=PREDICTION_ATOL_MM)
 
 
 @every_method
 def test_rows_of_large_weight_dominate_the_prediction(method):
-    """A tenth of the labels is shifted 8 mm along x; these rows have twice the weight of all others, or almost none."""
+    """A tenth of the rows are shifted by 8 mm along x. Their weight is twice that of all other rows, or nearly 0."""
     db_uT, target = rows(n=400)
     further = np.arange(400) < 40
     target[further, 0] += 8
@@ -253,7 +253,7 @@ def test_rbf_draws_rows_at_random():
 
 
 def test_rbf_keeps_rows_of_greater_weight():
-    """The rows of greater weight are at places of their own, where predictions depend only on these rows."""
+    """The inputs of rows of greater weight are far from all others, so predictions there depend only on these rows."""
     db_uT, target = rows(n=300)
     db_uT[:5] += 1e5 * np.arange(1, 6)[:, None]
     weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)  # together, half the weight of the others

@@ -37,7 +37,7 @@ def train_job(job: TrainingJob, rows: TrainingData) -> TrainingResult:
 
 
 def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
-    """Return whether weights, scaler and loss curve are equal bit for bit."""
+    """Return whether the weights, scalers and loss curves of two results are equal bit for bit."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
     return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
@@ -341,7 +341,7 @@ def test_augmented_copies_keep_targets_and_are_new_skins():
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # With boards without spread, the rows appear three times, with equal fields and targets.
+    # Boards without spread do not change the fields, so the rows appear three times, with equal fields and targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()

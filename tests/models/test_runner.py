@@ -119,7 +119,8 @@ def test_killed_run_keeps_finished_jobs(tmp_path):
 
 
 def test_stack_killed_during_writing_is_retrained(tmp_path):
-    # Many steps with batches of one row amplify differences in the last bits, which depend on the position in a stack.
+    # Last bits depend on the position of a network in its stack. Many steps with batches of one row amplify such
+    # differences.
     selected = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
@@ -230,11 +231,11 @@ def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
         assert all(np.isfinite(one.predicted).all() for one in done)
 
 
-DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # output is constant and has no gradient, because the ReLUs are 0
+DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # the output is constant and has no gradient, because all ReLUs are 0
 
 
 def prepare_dead(attempts: set[int]) -> object:
-    """Return a substitute for `prepare`: in these attempts, fold b0 starts with dead weights."""
+    """Return a substitute for `prepare` with which fold b0 starts with dead weights in these attempts."""
 
     def make(job: TrainingJob, rows: object) -> object:
         prepared, scaler = prepare(job, rows)

@@ -150,7 +150,7 @@ def test_data_of_each_loss_term_changes_the_weights(name):
 
 
 def test_unlabelled_pokes_train_the_feature_layers_only():
-    # one large step without clipping, which would scale the gradients of all layers
+    # one large step; without clipping, because clipping would scale the gradients of all layers
     far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
@@ -207,7 +207,7 @@ def scale_inputs(job: PreparedJob, times: float) -> PreparedJob:
 
 
 def test_nan_weights_of_the_last_step_are_detected():
-    """Pokes of 1e30 uT make the triplet term infinite, although the L2 loss of the same step is finite."""
+    """Pokes of 1e30 uT make the triplet loss infinite, while the L2 loss of the same step stays finite."""
     job = some_job(terms=True)
     job.unlabelled.inputs[:] *= 1e30
     (outcome,) = run([job], recipe(steps_n=1), LossWeights(0.0, unlabelled=1.0))

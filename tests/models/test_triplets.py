@@ -22,7 +22,7 @@ def distances(place: np.ndarray, anchor: int) -> list[float]:
 
 @st.composite
 def placed_points(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
-    """Draw points in up to four groups, at few integer places (many equal distances), each visited twice or more."""
+    """Draw points in up to four groups. Few integer places give many equal distances; each has two or more visits."""
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
     for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):

@@ -93,7 +93,7 @@ def test_force_at_a_reading_follows_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
-    # Force that builds up during the approach relaxes for a shorter time: the decay is averaged over the approach.
+    # Force that builds up during the approach relaxes for a shorter time, so the decay is averaged over the approach.
     x = 5.0 / SKIN_RELAXATION.tau_s
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 
@@ -184,7 +184,7 @@ def test_fading_is_half_a_percent_per_decade():
 
 def test_baseline_walks_with_the_square_root_of_contacts():
     walks_T = baseline_walk(np.array([100, 10_000]), 20_000, step_T=0.2e-6, rng=rng_for(0, "wear"))
-    # 2 %: four standard errors 1 / sqrt(2 n)
+    # tolerance 2 %: four standard errors, 1 / sqrt(2 n) each
     np.testing.assert_allclose(walks_T.std(axis=1), [2e-6, 20e-6], rtol=0.02)
     # the walk to the later contact includes the walk to the earlier one
     np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)

@@ -96,7 +96,7 @@ def test_images_of_a_far_dipole_equal_those_of_its_uniform_field():
     observers_m = on_sphere(2 * RADIUS_M)
     uniform_T = magnet.field(*far, CENTRE_M[None])[0]
     of_uniform_T = field(observers_m, uniform_T, mu_r=1e12)
-    np.testing.assert_allclose(  # tolerance: over 5 mm, the field of a dipole 1 m away varies by 3 * 5 mm / 1 m
+    np.testing.assert_allclose(  # tolerance: over 5 mm, the field of a dipole 1 m away varies by 3 * 5 mm / 1 m = 1.5 %
         images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max()
     )
 
@@ -104,9 +104,9 @@ def test_images_of_a_far_dipole_equal_those_of_its_uniform_field():
 def test_directions_are_uniform_unit_vectors():
     directions = random_directions(20_000, rng_for(0, "directions"))
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-12)
-    # five standard errors of the mean
+    # tolerance: five standard errors of the mean
     np.testing.assert_allclose(directions.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))
-    # five standard errors of 0.3 / sqrt(n)
+    # tolerance: five standard errors of 0.3 / sqrt(n)
     np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.012)
 
 

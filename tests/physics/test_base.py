@@ -12,7 +12,7 @@ DRAG_M = 0.9e-3  # greatest depth of a drag in the scenes
 DEEPEST_RADIUS_H = 0.75  # at least the contact radius of the deepest drag, divided by the thickness of the layer
 DISPLACEMENT_M = np.array([4e-5, 7e-5])
 HELD = {
-    # at the outer edge, u_r falls as 1 / r, which springs of stiffness 2 / r imitate
+    # at the outer edge, u_r falls as 1 / r; springs of stiffness 2 / r have the same effect
     "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},
     "bonded": {"held": {"axis": [0], "base": [0, 1], "far": [0]}, "drag": {}},
 }
@@ -57,7 +57,8 @@ def test_pressed_layer_converges_to_finite_elements(base):
 @pytest.mark.parametrize("base", ["slipping", "bonded"])
 def test_contact_pressure_deforms_the_surface_to_the_tip(base):
     contact = layer.contact_of_depth(DEPTH_M, thickness_m=H_M, tip_radius_m=TIP_M, base=base)
-    # p^(k) / 2G = integral of chi cos(kx) dx, so p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2) dx; x^2 = r^2 + y^2
+    # The Hankel transform of the pressure p is 2 G times the integral of chi(x) cos(kx) dx (G: shear modulus).
+    # Therefore p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2) dx. The code substitutes x^2 = r^2 + y^2.
     chi = Polynomial.fit(contact.x_m**2, contact.weights_m2 / (contact.radius_m * layer.CONTACT_W), 12)
 
     def load(r_m):
@@ -83,7 +84,8 @@ def test_finite_elements_cover_the_deepest_drag():
     assert 0.7 < contact.radius_m / H_M < DEEPEST_RADIUS_H
 
 
-# The deepest drag on the skin, and a contact on a thin layer, which covers many cells. Measured errors: 0.8 %, 0.05 %.
+# Two contacts: that of the deepest drag on the skin, and one on a thin layer, which covers many cells. Measured errors:
+# 0.8 % and 0.05 %.
 @pytest.mark.parametrize(("radius_h", "tolerance"), [(DEEPEST_RADIUS_H, 0.012), (2.5, 1e-3)])
 def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
@@ -104,7 +106,7 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     assert max(errors[3:]) < 4 * tolerance  # the order of convergence of gradients is lower by one
     assert 1 / solved.under_load_m == pytest.approx(table.stiffness_m, rel=5e-4)
     d, e, s = half_curl(solved.top)
-    # 5 %: beside the edge of the contact, finite elements give 4 % and 0.4 % less for the two contacts
+    # tolerance 5 %: beside the edge of the contact, finite elements give 4 % and 0.4 % less for the two contacts
     assert max(np.abs(d + e).max(), np.hypot(d - e, s).max()) == pytest.approx(table.steepest_per_m2, rel=0.05)
 
 

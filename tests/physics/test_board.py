@@ -83,13 +83,13 @@ def test_boards_depend_on_name_and_seed():
 def test_draws_have_the_given_spreads():
     boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
     gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
-    # 10 %: the standard error of a standard deviation is 1 / sqrt(2 n): 3.5 % for 400 boards, less for chips.
+    # 10 %: the standard error of a standard deviation of n draws is 1 / sqrt(2 n), which is 3.5 % for 400 boards.
     assert np.std([board.chips_m[0, 2] for board in boards]) == pytest.approx(0.1e-3, rel=0.1)
     assert np.std([board.offset_T for board in boards]) == pytest.approx(200e-6, rel=0.1)
     assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
     cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
     assert np.std(cross) == pytest.approx(0.01, rel=0.1)
-    # angle of two tilts, about x and about y, of 2 degrees each
+    # total angle of two tilts with an sd of 2 degrees each, about x and about y
     tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])
     assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
 
@@ -136,8 +136,8 @@ def test_gaps_are_positive_and_tilt_and_bow_need_a_single_board():
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
     assert (gaps_m > 0).all()
-    # log gap = log(middle) + 0.5 (a x + b y + c r^2), with r = 1 at outer chips: opposite chips give the tilt, all the
-    # bow.
+    # log gap = log(middle) + 0.5 (a x + b y + c r^2), with r = 1 at the outer chips. The difference of opposite chips
+    # gives the tilt (a, b), and the mean of all outer chips gives the bow (c).
     log = np.log(gaps_m / gaps_m[:, :1])
     tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
     assert 0.35 < tilt.std() < 0.7

@@ -29,7 +29,7 @@ def naive(rest, moved, observers_m):
 
 
 def scene(seed, nodes_n=200):
-    """Return dipoles before and after moving 0.1 mm (moments change by 10 %), and observers, all off the origin."""
+    """Return dipoles before and after a move (0.1 mm; moments change by 10 %), and observers; none is at the origin."""
     rng = rng_for(seed, "change")
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), size=(nodes_n, 3))
     moments = 1e-5 * rng.normal(size=(nodes_n, 3))

@@ -62,7 +62,7 @@ def test_single_linear_step_would_lose_volume():
 def test_material_under_the_dent_flows_outward_on_a_slipping_base():
     press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_field(press, 1.2e-3))
-    # The volume of the dent is between the volumes of a cone and of a cylinder.
+    # The volume of the dent is between those of a cone and of a cylinder.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
     assert (
         press.contact(1.2e-3).radius_m ** 2 * 1.2e-3 / 3 < grown_m2 * H_M < press.contact(1.2e-3).radius_m ** 2 * 1.2e-3
@@ -92,7 +92,7 @@ def test_shallow_poke_is_linear(base):
     r_m, z_m = nodes(r_max_m=1e-3)
     deformed, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
-    # 5 % of the depth, because the material moves and the contact (0.3 mm) is as small as the shortest wave
+    # tolerance: 5 % of the depth, because the material moves, and the contact (0.3 mm) is as small as the shortest wave
     np.testing.assert_allclose(deformed.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
     np.testing.assert_allclose(deformed.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 

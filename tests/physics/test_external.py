@@ -44,7 +44,7 @@ def test_drawn_fields_have_no_curl():
     fields = rng_for(1, "draws").multivariate_normal(np.zeros(15), covariance(CHIPS, 30.0, 200.0), 50, method="eigh")
     _, left, below, right, above = fields.reshape(50, 5, 3).transpose(1, 0, 2)
     by_dx, bx_dy = (right - left)[:, 1], (above - below)[:, 0]
-    # The finite differences neglect third derivatives, which are smaller by about 10 (7 mm / 200 mm)^2 = 1 %.
+    # Finite differences neglect third derivatives, an error of about 10 (7 mm / 200 mm)^2 = 1 %.
     np.testing.assert_allclose(by_dx, bx_dy, atol=0.05 * np.abs(by_dx).max())
 
 
@@ -65,5 +65,5 @@ def test_suppressor_removes_uniform_fields_and_keeps_fields_with_curl():
     uniform_uT = np.tile([50.0, -30.0, 80.0], 5)
     assert np.linalg.norm(uniform_uT @ matrix) < 0.05 * np.linalg.norm(uniform_uT)
     curl_uT = np.zeros((5, 3))
-    curl_uT[:, :2] = 10 * CHIPS @ [[0, 1], [-1, 0]]  # a vortex around the centre, which no magnet outside makes
+    curl_uT[:, :2] = 10 * CHIPS @ [[0, 1], [-1, 0]]  # a vortex around the centre, which no external magnet can cause
     assert np.linalg.norm(curl_uT.ravel() @ matrix) > 0.8 * np.linalg.norm(curl_uT)  # high orders resemble a vortex

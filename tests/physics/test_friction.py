@@ -75,7 +75,7 @@ def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
 
 def test_loop_dissipates_friction_times_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
-    # 0.8 mm is a whole number of steps of 10 um, so sticking and sliding change exactly at a stop
+    # 0.8 mm is a whole number of steps of 10 um, so sticking changes to sliding exactly at a stop
     stuck_m = mu * 1.0 / K
     along_m = np.concatenate(
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
@@ -84,8 +84,8 @@ def test_loop_dissipates_friction_times_length():
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
-    # In a loop of length 4 reaches, the spring reverses twice, over twice its length each; elsewhere the tip slides.
-    # rounding of sums over 1200 straight pieces
+    # A loop has a length of 4 reaches. At each of its two reversals, the tip sticks over twice the spring's length;
+    # elsewhere it slides. Tolerance: rounding of sums over 1200 straight pieces.
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)

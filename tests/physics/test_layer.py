@@ -41,7 +41,7 @@ def test_compliance_limits():
         layer.bonded_compliance(np.array([0.0, 1e-6, 1e-3])),
         layer.bonded_compliance(np.array([20.0, 1e4, 1e150])),
     )
-    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3; the next term is smaller by A^2
+    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3, A = kh; next term: factor A^2
     np.testing.assert_allclose(short, 1, rtol=1e-13)
 
 
@@ -57,7 +57,7 @@ def test_displacement_over_depth_equals_50_digit_arithmetic(kh, share):
         size = (mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1) / w(a)
         truth = [float(size * mpmath.diff(w, z, order)) for order in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]))
-    # relative to 1 for a half-space
+    # tolerance relative to the value 1 of a half-space
     np.testing.assert_allclose([float(part[0, 0]) for part in found], truth, atol=1e-12)
 
 
@@ -73,8 +73,8 @@ def test_base_is_fixed_and_surface_free_of_shear():
 @settings(max_examples=30)  # an example takes 50 ms
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
 def test_force_equals_dimitriadis_for_small_tips(thickness_m, tip_radius_m, relative_depth):
-    # The published series is too low from its term in chi^2 on: by 8 % at chi = sqrt(R d) / h = 0.5 and by 16 % at 1.
-    # The solution with pressure rings confirms that.
+    # The published series in chi = sqrt(R d) / h is too low from its term in chi^2 on: by 8 % at chi = 0.5, and by
+    # 16 % at chi = 1. The solution with pressure rings confirms this error.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
     assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 

@@ -63,8 +63,8 @@ def test_magnets_cover_a_side_symmetrically(side_mm, n):
 
 @given(places_m, polarities)
 def test_field_of_the_array_under_reflection(point_m, polarity):
-    # If x -> -x maps magnetic charges to equal charges, only Bx changes sign. On a checkerboard, the charges also
-    # change sign.
+    # If the reflection x -> -x maps magnetic charges to equal charges, only Bx changes sign. On a checkerboard, the
+    # charges change sign as well.
     sign = -1 if polarity == "checkerboard" else 1
     here_T, there_T = (magnet.array_field((point_m * (side, 1, 1))[None], THICKNESS_M, polarity)[0] for side in (1, -1))
     np.testing.assert_allclose(there_T, sign * here_T * (-1, 1, 1), atol=1e-12)

@@ -83,7 +83,8 @@ def test_error_falls_with_the_square_of_the_cell():
         truth = 4 * np.sin(300 * half_m) / 300 * np.sin(200 * half_m) / 200 * THICKNESS_M
         return abs(rest.volumes_m3 @ wave / truth - 1)
 
-    # Cell sizes are 6.35 mm and 3.65 mm divided by powers of two, so every cell is halved. 5 %: error of next order.
+    # Cell sizes are 6.35 mm and 3.65 mm divided by powers of two, so every step halves all cells. Tolerance 5 %: the
+    # error of next order.
     coarse, fine = error(6.35e-3 / 8), error(6.35e-3 / 16)
     assert coarse / fine == pytest.approx(4, rel=0.05)
 

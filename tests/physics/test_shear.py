@@ -23,13 +23,13 @@ forces_N = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(np.array)
 
 
 def of_shape(chi, radius_m):
-    """Return a traction of radius a whose transform is the integral of chi(x / a) cos(k x) dx."""
+    """Return a traction of radius a whose 2-D Fourier transform is the integral of chi(x / a) cos(k x) dx."""
     weights = layer.CONTACT_W * chi(layer.CONTACT_X)
     return Traction(radius_m, radius_m * layer.CONTACT_X, weights / weights.sum())
 
 
 def hertzian(radius_m=1.5e-3):
-    """Return q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2), whose transform is 3 (sin ka - ka cos ka) / (ka)^3."""
+    """Return q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2) for Q = 1; its transform is 3 (sin ka - ka cos ka) / (ka)^3."""
     return of_shape(lambda x: 1 - x**2, radius_m)
 
 
@@ -90,13 +90,13 @@ def test_response_of_the_layer_equals_50_digit_arithmetic(kh, share):
         ]
     found = shear.wave_response(np.array([[kh * share]]), np.array([kh]))
     found = [found.w, found.w_slope, found.w_spin, found.v, found.v_slope]
-    # relative to a traction of 1; the rounding of kz adds 1e-16 kh to the exponents
+    # tolerance relative to a traction of 1; rounding of kz adds 1e-16 kh to the exponents
     np.testing.assert_allclose([part[0, 0] for part in found], [float(part) for part in truth], atol=1e-13)
 
 
 @pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
 def test_response_solves_the_boundary_value_problem(kh):
-    """Reference: equilibrium and Hooke's law for k = G = 1, in the plane of the wave and across this plane."""
+    """Reference: equilibrium and Hooke's law for k = G = 1, in the plane of the wave and perpendicular to it."""
 
     def slopes(_z, state):
         along, up, shearing, normal, across, across_stress = state
@@ -131,7 +131,7 @@ def test_boundary_conditions_of_short_waves():
 
 
 def test_bettis_reciprocity_with_pressure():
-    """Betti's theorem: pressure does the same work on the displacement by traction as traction on that by pressure."""
+    """Betti: pressure does as much work on the displacement by traction as traction on the displacement by pressure."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
@@ -209,7 +209,8 @@ def test_table_equals_direct_integration(force):
 @pytest.mark.parametrize("radius_m", [0.05e-3, 0.3e-3])
 def test_stiffness_on_thick_layers_equals_mindlin(radius_m):
     assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
-    # The mean of 6 a^2 - 3 r^2, weighted by q ~ sqrt(a^2 - r^2), is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a.
+    # u is the mean displacement, weighted by the traction q ~ sqrt(a^2 - r^2). The mean of 6 a^2 - 3 r^2 is 24/5 a^2,
+    # so u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a.
     assert shear.tangential_stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 
 
@@ -218,14 +219,14 @@ def test_thin_layer_shears_uniformly():
     blocks_m = np.sqrt(
         [H_M / np.pi * shear.tangential_stiffness_m(shear.stick_traction(a_m, H_M), H_M) for a_m in wide_m]
     )
-    # k_t = pi G (a + seam)^2 / h, with the same seam for all radii, up to terms of (h / a)^2.
+    # The stiffness is k_t = pi G (a + seam)^2 / h, with an equal `seam` for all radii a, up to terms of (h / a)^2.
     np.testing.assert_allclose(np.diff(blocks_m), H_M, rtol=5e-3)
     seam = (blocks_m - wide_m) / H_M
     assert ((seam > 0.5) & (seam < 1)).all()
     middle_m = shear.evaluate_map(
         shear.stick_traction(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M
     )[0, :, 0]
-    # u = q z / G; the edges are 3 h away
+    # expected in the middle: u = q z / G, because the edges are 3 h away
     np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)
 
 
@@ -243,7 +244,7 @@ def test_sticking_contact_moves_rigidly():
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
 def test_traction_of_a_sticking_contact_is_the_stiffest(a_h, square, fourth):
-    """Thomson: of all tractions with equal total force, that of a rigid contact stores the least energy."""
+    """Thomson's theorem: of all tractions with equal total force, that of a rigid contact stores the least energy."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
@@ -365,7 +366,7 @@ def test_mean_displacement_of_the_traction_is_force_over_stiffness():
 
 
 def shear_in_many_steps(force_N, nodes_m, table, steps_n):
-    """Reference: apply the force in many small steps; each step moves nodes and traction. The contact starts at 0."""
+    """Reference: apply the force in many small steps; each moves nodes and traction. The contact starts at 0."""
     at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / table.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
@@ -388,7 +389,7 @@ def test_midpoint_steps_equal_many_small_steps():
         assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
     assert over[0] < 0.02
     assert over[2] < 0.05
-    assert over[1] < over[0] / 3  # below the factor of 4 of second order, because the interpolated table has kinks
+    assert over[1] < over[0] / 3  # below the 4 of a second-order method, because the interpolated table has kinks
 
 
 def test_small_force_needs_no_midpoint_step():

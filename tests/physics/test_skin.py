@@ -20,7 +20,7 @@ EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
 PEAK_T = 1e-3  # magnitude of the fields; tolerances for rounding are relative to this value
-# COARSE is for tests of laws that hold with any quadrature; SPARSE is for tests that draw many skins.
+# COARSE: quadrature for tests of laws that hold with any quadrature. SPARSE: quadrature for tests with many skins.
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
 DEPTH_M = 0.6e-3  # the tested laws hold at any depth; a single depth needs only one table
 places_m = st.floats(-8e-3, 8e-3)
@@ -116,7 +116,7 @@ def test_error_of_the_quadrature_in_use(depth_m, base):
 
 
 def test_field_change_without_rotation_of_moments_is_wrong():
-    # Without rotation (R.M) of the moments, dB is wrong by 156-242 % for indentations on the grid.
+    # Without rotation of the moments, the field change dB is wrong by 156-242 % for indentations on the grid.
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
         moved = move_dipoles(one, (*place, DEPTH_M))
@@ -279,7 +279,7 @@ def test_field_at_rest_has_the_magnitude_of_recordings():
 
 def test_slipping_skin_is_softer_and_reaches_farther():
     bonded, slipping = skin(), skin(base="slipping")
-    # at 1.2 mm, the bonded skin is 1.8 times as stiff
+    # at a depth of 1.2 mm, the bonded skin is 1.8 times as stiff as the slipping one
     assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))
     far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]  # chip 3, 15 mm away
     assert far[1] > 10 * far[0]
@@ -333,8 +333,8 @@ def test_held_skin_slides_rigidly():
     assert np.abs(apart_m[:, 2]).max() == 0
     distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
     np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
-    # Without the limit by friction, the skin at the poke would move by `taken_m`: give - away (1 - load) p, as in
-    # `press_displacement_m`. Friction allows the fraction `share`.
+    # Without the limit by friction, the skin at the poke would move by `taken_m` (formula of `press_displacement_m`).
+    # Friction allows the fraction `share` of this move.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m

@@ -37,7 +37,7 @@ def drag_matrix(pieces_n, sides_m):
 def test_motion_minimises_the_drag(sides_m):
     place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
     # Reference: least drag for a given displacement at the place, by Lagrange multipliers. With 80 pieces per side,
-    # rho^2 has a relative error of 1/80^2.
+    # the squared radius of gyration rho^2 has a relative error of 1/80^2.
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
     equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
@@ -47,14 +47,15 @@ def test_motion_minimises_the_drag(sides_m):
 
 
 def test_pull_at_the_edge_of_a_square():
-    # p = (L/2, 0), D along y: f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, theta = 6 f (L/2) / L^2 = 3 f / L.
+    # A square of side L is displaced by D along y at the place (L/2, 0). Expected: displacement of its middle
+    # f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, and rotation theta = 6 f (L/2) / L^2 = 3 f / L.
     move_m, spin_rad = motion_of((SIDE_M / 2, 0.0), (0.0, 1e-4))
     np.testing.assert_allclose(move_m, (0.0, 1e-4 / 2.5), rtol=1e-12)
     assert spin_rad == pytest.approx(3 * 1e-4 / 2.5 / SIDE_M, rel=1e-12)
 
 
 @given(places_m, displacements_m)
-def test_place_moves_by_the_given_displacement(place_m, taken_m):
+def test_skin_at_the_place_moves_by_the_given_displacement(place_m, taken_m):
     move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
@@ -72,14 +73,14 @@ def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
 def test_displacement_follows_force_and_distance():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
-    # 7 um/mm at 4 mm from the middle is 28 um at zero force, and half of that at half the force at which this slide
-    # vanishes.
+    # 7 um/mm at 4 mm from the middle is 28 um at zero force, and 14 um at half the force at which this slide vanishes.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
 @given(places_m, st.floats(1e3, 1e5))
 def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
-    # Uniform springs of stiffness k: a force moves the skin by f / k and rotates the skin by moment / (k rho^2).
+    # On uniform springs of stiffness k, a force f moves the skin by f / k and rotates the skin by moment / (k rho^2),
+    # where rho is the radius of gyration.
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
     taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
     move_m, spin_rad = motion_of(place_m, taken_m)
@@ -98,7 +99,7 @@ def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
     assert x * whole_y == pytest.approx(y * whole_x, rel=1e-12, abs=1e-24)
-    if moves:  # displacement and rotation are limited by the same factor, 1 - exp(-mu F / k u)
+    if moves:  # friction limits displacement and rotation by the same factor, 1 - exp(-mu F / k u)
         with np.errstate(over="ignore"):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
         np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)

@@ -20,7 +20,7 @@ def test_profile_and_compliance_equal_dense_solve(kh, share):
         w, z = mechanics.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
-    # 1e-10: for long waves, the profile is a difference of numbers that are larger by 1 / (kh)^2
+    # tolerance 1e-10: for long waves, the profile is a difference of numbers that are larger by a factor 1 / (kh)^2
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
     assert mechanics.sliding_compliance(np.array([kh])).holds
 
@@ -44,13 +44,14 @@ def test_far_motion_of_slipping_and_bonded_skins():
     r_m, z_m = np.repeat([8e-3, 12e-3], 3), np.tile([0.0, 1e-3, 2e-3], 2)
     far = layer.displacement(r_m, z_m, layer.waves(under, SKIN["thickness_m"], "slipping"))
     volume_m3 = 2 * np.pi * r_m * SKIN["thickness_m"] * far.r_m
-    # Volume is conserved: the displaced volume flows through every circle, uniformly over the thickness.
-    # 0.01: waves that have decayed to exp(-pi r / h) at 4 h
+    # Volume is conserved, so the displaced volume flows through every circle, uniformly over the thickness.
+    # tolerance 0.01: waves that have decayed to exp(-pi r / h) at r = 4 h
     np.testing.assert_allclose(volume_m3, volume_m3.mean(), rtol=0.01)
     assert volume_m3.mean() > 0
     bonded = layer.contact_of_depth(0.2e-3, **SKIN, base="bonded")
     held = layer.displacement(r_m, z_m, layer.waves(bonded, SKIN["thickness_m"], "bonded"))
-    # At 1.5 times the distance, the surface of a slipping skin moves 2/3 as much, that of a bonded skin less than 1/4.
+    # At 1.5 times the distance, the surface of a slipping skin moves 2/3 as far, that of a bonded skin less than 1/4 as
+    # far.
     assert far.r_m[5] == pytest.approx(far.r_m[2] * 2 / 3, rel=0.01)
     assert held.r_m[5] < held.r_m[2] / 4
 

@@ -42,4 +42,4 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
     of_trainings = [one["of_trainings"] for one in numbers["findings"]]
     assert of_trainings == ["supported", "supported"]  # verdicts over three networks per policy
-    assert numbers["contact_every_s"] > 1  # in s; a real rig takes more than a second per contact
+    assert numbers["contact_every_s"] > 1  # seconds per contact; a real rig takes more than one

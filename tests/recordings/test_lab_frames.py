@@ -63,8 +63,8 @@ def _change_uT(readings: Readings) -> np.ndarray:
 
 
 def test_chip_rotations_equal_those_of_the_scenes(recorded_uT, simulated_uT, design):
-    # Rotations are fitted to all files together: from one file alone, a rotation is wrong by up to 40 degrees or even
-    # mirrored.
+    # Rotations are fitted to all files together. From a single file, a rotation would be wrong by up to 40 degrees, or
+    # even mirrored.
     for chip_i, turn_deg in enumerate(design.chips_turn_deg):
         read_uT = recorded_uT[:, :, chip_i].reshape(-1, 3)
         found, _ = orthogonal_procrustes(read_uT, np.tile(simulated_uT[:, chip_i], (len(LAB), 1)))

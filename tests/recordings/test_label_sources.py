@@ -231,7 +231,7 @@ def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
 
 
 class PollCounter(threading.Event):
-    """Stop event that counts waits: the follower of a table waits on this event once per poll."""
+    """Stop event that counts its waits. The follower of a table waits on this event once per poll."""
 
     def __init__(self):
         super().__init__()
@@ -275,7 +275,7 @@ def test_interrupted_table_ends_the_labels(context, tmp_path, interruption, prob
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
-        if context.marks:  # the source is ready: it has skipped existing rows
+        if context.marks:  # there is a mark as soon as the source has skipped the existing rows
             break
     if interruption == "replaced":
         (tmp_path / "new.csv").write_text(header)

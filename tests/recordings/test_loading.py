@@ -26,7 +26,7 @@ from tests.test_io import readings
 
 RATE_HZ, FRAMES_N, CHIPS_N = 100.0, 120, 2
 CHANNELS = ["bx0_uT", "by0_uT", "bz0_uT", "bx1_uT", "by1_uT", "bz1_uT"]
-PLACES_MM = (2.0, 6.0, 10.0)  # places in x of the contacts, of 0.2 s each, after 0.2 s without contact each
+PLACES_MM = (2.0, 6.0, 10.0)  # x of the three contacts; each lasts 0.2 s, after 0.2 s without contact
 
 
 def frames_of_board() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -128,7 +128,7 @@ def test_table_is_read_as_a_capture_of_this_layout(tmp_path):
     frame = reskin.load_recording(tmp_path / "my table.csv")
 
     check_units(frame)
-    # tolerance: the CSV has the fewest digits of float32, so the means of no-load fields differ by rounding
+    # tolerance: the CSV has as few digits as float32 needs, so the means of no-load fields differ by rounding
     pd.testing.assert_frame_equal(frame, reskin.load_recording(tmp_path / "my table.parquet"), rtol=1e-6, atol=1e-4)
     np.testing.assert_array_equal(frame[CHANNELS], b_uT[contact])
     assert (set(frame["capture"]), set(frame["board"])) == ({"my_table"}, {"unnamed"})

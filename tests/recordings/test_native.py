@@ -186,7 +186,7 @@ def test_stream_in_another_unit_is_refused(tmp_path: Path, factor: float) -> Non
 
 
 @pytest.mark.parametrize(("sent", "declared"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
-@pytest.mark.parametrize("scale", [1.0, 0.05])  # with 0.05, fields are as weak as temperatures
+@pytest.mark.parametrize("scale", [1.0, 0.05])  # with 0.05, field values in uT are as small as temperatures in degC
 def test_wrong_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wire, scale: float) -> None:
     frames = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(scale))
     with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {declared} .* Is the wire format {sent}\?"):

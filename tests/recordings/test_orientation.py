@@ -48,7 +48,7 @@ def test_correct_or_uninformative_labels_raise_no_alarm():
 
 
 def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
-    """Both recordings are at depth 2. Of all 18 pairs, one is inconclusive: board 2 depth 3 with board 1 depth 1."""
+    """The test uses depth 2. Of all 18 pairs, one is inconclusive: board 2 at depth 3 with board 1 at depth 1."""
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)

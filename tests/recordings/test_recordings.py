@@ -68,7 +68,8 @@ def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # The tip pushes the skin: experiment compare finds, from fields alone, a move of 48 um along the labels' +x axis.
+    # The tip pushes the skin. From fields alone, experiment compare finds a move of 48 um along the +x axis of the
+    # labels.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
@@ -114,7 +115,7 @@ def test_ini_centre_is_one_of_the_places(shared_data: Path, tmp_path: Path) -> N
 
 
 def test_ini_fields_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
-    # Known fault of these recordings: the field of a row belongs to the force of the previous row.
+    # Known fault of these recordings: the field in a row belongs to the force in the previous row.
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path, options={"rows_late": "0"})
     change_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     same_row = np.corrcoef(readings.Fz_N[:-1], change_uT[:-1])[0, 1]

@@ -36,7 +36,7 @@ def scene(accuracy: dict, r2: dict, source: str = "simulated") -> dict:
         ({"mean": 92.0, "n": 2, "values": [89.0, 95.0]}, PARTLY),  # one board does not reach it
     ],
 )
-def test_place_is_answered_from_the_whole_interval(accuracy, reached):
+def test_answer_on_the_place_depends_on_the_whole_interval(accuracy, reached):
     place = answers(scene(accuracy, over(0.8, 0.7, 0.9))).place
     assert place.level == reached
     assert ("not reached" in " ".join(place.sentences)) == (
@@ -47,7 +47,7 @@ def test_place_is_answered_from_the_whole_interval(accuracy, reached):
 @pytest.mark.parametrize(
     ("r2", "reached"), [(over(0.95, 0.92, 0.97), YES), (over(0.76, 0.6, 0.85), PARTLY), (over(0.2, 0.1, 0.3), NO)]
 )
-def test_unusable_force_is_said_to_be_unusable(r2, reached):
+def test_answer_states_that_a_force_is_not_usable(r2, reached):
     force = answers(scene(over(80.0, 70.0, 90.0), r2)).force
     assert (force.level, force_level(r2)) == (reached, reached)
     assert ("not usable" in force.short) == (reached == NO)
@@ -55,7 +55,7 @@ def test_unusable_force_is_said_to_be_unusable(r2, reached):
     assert "1.4 N" in force.short  # of the mean force
 
 
-def test_answer_is_that_of_the_best_model_without_labels():
+def test_answer_uses_the_best_model_without_labels():
     found = answers(scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9)))
     assert found.place.sentences[0].startswith("80.0 % [70.0, 88.0] of readings are within 1 mm")
     assert f"Paper: {TABLE_2['adapted']['accuracy_pct'][0]:g} %" in " ".join(found.place.sentences)
@@ -69,7 +69,7 @@ def labelled(method: str, labels_n: int, accuracy: float, r2: float) -> dict:
     return {"method": method, "inputs": "raw", "labels_n": labels_n, "as_labelled": few}
 
 
-def test_labels_are_beside_the_answer_without_labels():
+def test_scores_with_labels_are_shown_beside_the_answer_without_labels():
     rows = [("network", 0, 31.0, -2.0), ("network", 40, 55.0, 0.1), ("universal, alone", 0, 71.0, 0.2)]
     rows += [("universal, alone", 10, 79.0, 0.4), ("universal, alone", 40, 91.0, 0.6)]
     found = answers(all_experiments("recorded") | {"labels": [labelled(*one) for one in rows]})
@@ -115,5 +115,5 @@ def test_rms_has_no_standard_deviation():
     assert rms(None) is None
 
 
-def test_level_of_a_single_value_is_that_of_its_mean():
+def test_level_without_interval_follows_the_mean():
     assert [level({"mean": value, "n": 1}, 90.0, 50.0) for value in (90.0, 89.9, 49.9)] == [YES, PARTLY, NO]

@@ -97,7 +97,7 @@ def test_missing_experiment_is_not_run():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_number_is_met_within_the_papers_sd_or_ten_percent(mean, sd, ours, path):
+def test_number_is_met_within_the_sd_of_the_paper_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
     alone = judge_value(stat(ours), mean, ours=f"a.{path}")
@@ -108,7 +108,7 @@ def test_number_is_met_within_the_papers_sd_or_ten_percent(mean, sd, ours, path)
 
 
 @pytest.mark.parametrize(("printed", "verdict"), [(80.0, AGREES), (70.0, DIFFERS), ((85.0, 3.0), DIFFERS)])
-def test_number_is_judged_by_whether_our_interval_includes_the_papers(printed, verdict):
+def test_number_is_judged_by_whether_our_interval_includes_it(printed, verdict):
     assert judge_value(over_boards(75.0, 84.0), printed).verdict == verdict
     few = {"mean": 80.0, "n": 2, "values": [75.0, 85.0]}
     assert judge_value(few, printed).verdict == FEW_BOARDS
@@ -123,7 +123,7 @@ def test_sign_of_a_bias_is_explained(bias_N, meaning):
     assert bias["met"] == ("yes" if bias_N > 0 else "no")
 
 
-def test_protocol_is_beside_the_papers():
+def test_our_protocol_is_beside_that_of_the_paper():
     numbers = all_experiments()
     assert line(numbers, "single-accuracy_pct")["note"].startswith(
         f"{SHORT_OF}7,020 training readings (paper: {paper.SINGLE_TRAIN_N:,})"

@@ -58,7 +58,7 @@ def test_skin_and_chips_are_drawn_only_on_the_papers_grid():
     assert "chip" not in elsewhere
 
 
-def test_given_outline_is_drawn_instead():
+def test_outline_of_another_board_replaces_that_of_the_paper():
     outline = Outline((10.0, 4.0), (30.0, 20.0), ((20.0, 10.0), (25.0, 15.0)))
     text = error_grid(PLACES_MM + 12, PLACES_MM + 12, title="mine", outline=outline)
     assert draw_grid().count('id="patch_') - text.count('id="patch_') == 5 - 2  # chips
@@ -228,7 +228,7 @@ def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
     assert FORCE_LABEL not in texts_of(figures[HEADLINE])
 
 
-def test_bars_of_another_kind_are_named():
+def test_caption_names_rows_with_another_kind_of_bar():
     scores = {"single": row(40.0), "multi": row(80.0, ci95=[70, 90]), "adapted": row(85.0, ci95=[80, 90])}
     assert spread_of(scores) == "95 % interval over boards; single: standard deviation"
     del scores["single"]

@@ -61,7 +61,7 @@ def test_figures_with_rows_and_columns_keep_them():
     assert len({round(axes.get_window_extent().x0) for axes in figure.axes}) == 2
 
 
-def test_panels_stay_beside_each_other_if_asked():
+def test_panels_stay_side_by_side_if_requested():
     figure = laid_out(lambda figure: figure.subplots(1, 2), column=False)
     assert figure.get_figwidth() == 9.0
     assert len({round(axes.get_window_extent().y0) for axes in figure.axes}) == 1

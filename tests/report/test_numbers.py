@@ -79,7 +79,7 @@ def test_scores_include_the_last_window_of_drift():
     assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # scores without forces
 
 
-def test_scores_of_recorded_scenes_are_registered_ones_and_best_methods():
+def test_scores_of_recorded_scenes_include_registered_scores_and_best_methods():
     def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
         fields = {"method": method, "inputs": "raw", "labels_n": labels_n, "registered": scores()}
         return fields | {"as_labelled": {"accuracy_pct": stat(accuracy_pct)}}

@@ -122,7 +122,7 @@ def test_tables_name_their_columns(read):
 
 
 def test_stacked_rows_keep_their_labels_and_roles(read):
-    """In a narrow place, the rows of a table are stacked: each cell is labelled, and roles restore the table."""
+    """On narrow screens, rows are stacked. Each cell then has a label, and roles keep the structure of the table."""
     widths = {above[-1].rpartition(" ")[2] for _, above in read.all("table")}
     stacked = set(re.findall(r"\n[.](w\d+) tbody tr {", render()))
     assert widths <= stacked == {f"w{rem}" for rem in STEPS_REM}
@@ -152,12 +152,12 @@ def test_each_table_and_figure_of_the_paper_is_linked_from_the_top():
     ids = {attributes["id"]: tag for tag, attributes, _ in read.elements if "id" in attributes}
     assert all(ids[place.id] == ("details" if place.shown[0] in tables else "figure") for place in places)
     assert all(link.startswith("#") for link in re.findall('href="([^"]+)"', bar))
-    # The page of a scene without one of them says so, and has no link to it.
+    # The page of a scene without one of these tables and figures says so, and has no link to it.
     assert 'href="#figure-4a"' not in render()
     assert "not in this scene" in render()
 
 
-def test_first_section_answers_for_place_and_force(read):
+def test_first_section_answers_questions_on_place_and_force(read):
     main = render().partition("<main>")[2]
     first = main.partition("</section>")[0]
     assert 'id="answer"' in first
@@ -182,7 +182,7 @@ def test_results_link_to_the_table_or_figure_that_shows_them():
     assert ours == ['<a href="#drift-table">see table drift</a>', "see figure gone", '<a href="#figure-5a">90 %</a>']
 
 
-def test_what_ran_is_beside_what_the_paper_ran():
+def test_our_protocol_is_shown_beside_that_of_the_paper():
     text = render()
     single = text[text.index('<section id="single"') :].partition("</section>")[0]
     assert single.index("45,000 for training") < single.index("7,020 readings") < single.index("<details")
@@ -387,7 +387,7 @@ def test_scenes_without_held_out_boards_come_last():
     assert "no board was held out" in recorded
 
 
-def test_index_says_what_a_scene_is_and_answers_for_place_and_force():
+def test_index_describes_each_scene_and_answers_on_place_and_force():
     text = index([scene_numbers("here", "simulated")], {}, {"here": "Two boards, pressed by `a rig`."})
     entry = text[text.index("Scene here") :].partition("</li>")[0]
     assert "Two boards, pressed by <code>a rig</code>." in entry
@@ -399,7 +399,7 @@ def test_index_says_what_a_scene_is_and_answers_for_place_and_force():
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_scene_says_in_its_first_sentence_what_it_is(file):
+def test_first_sentence_of_every_scene_describes_the_scene(file):
     about = about_scene(file.read_text(encoding="utf-8"))
     assert about[0].isupper()
     assert not about.startswith("Scene")

@@ -3,7 +3,7 @@ from pipeline.report.protocol import protocols
 from tests.report.synthetic import all_experiments
 
 
-def test_papers_numbers_are_beside_ours():
+def test_numbers_of_the_paper_are_beside_ours():
     ran = {one.experiment: one for one in protocols(all_experiments())}
     single = ran["one skin, random readings held out"]
     assert "45,000 for training, 5,000 for testing" in single.paper
@@ -15,7 +15,7 @@ def test_papers_numbers_are_beside_ours():
     assert "0, 390 and 780" in ran["figure 6a"].ours
 
 
-def test_what_a_scene_did_not_run_is_absent():
+def test_protocols_of_missing_experiments_are_omitted():
     numbers = {name: value for name, value in all_experiments().items() if name != "sweep_pokes"}
     numbers["protocol"] = {"lobo": numbers["protocol"]["lobo"]}
     assert [one.experiment for one in protocols(numbers)] == ["table 2, many training skins", "figure 6b"]

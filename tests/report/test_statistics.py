@@ -92,7 +92,7 @@ def test_seeds_of_a_fold_are_averaged_first():
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
 
 
-def test_sd_over_seeds_is_within_boards():
+def test_sd_over_seeds_is_computed_within_each_board():
     rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
     found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
@@ -269,7 +269,7 @@ def test_single_board_has_no_verdict():
 def test_repeats_on_one_skin_do_not_count_as_boards():
     assert (
         verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
-    )  # n counts repeats, so there is no interval over boards
+    )  # n counts repeats on one skin, so there is no interval over boards
 
 
 def test_combined_verdicts():
@@ -306,7 +306,7 @@ def test_paired_with_single_counts_training_skins():
     certain, uncertain = (paired_with_single(many, one)["accuracy_pct"] for one in (equal_gains, different_gains))
     assert certain["mean"] == pytest.approx(60.0)
     assert certain["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
-    # The mean gains are 50 on every board and 60, 50, 40 for the training skins: variance 100 / 3, two degrees of
+    # The mean gain is 50 on every board, and 60, 50, 40 for the training skins: variance 100 / 3 with two degrees of
     # freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
     assert uncertain["ci95"] == pytest.approx([low, high])

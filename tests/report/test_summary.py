@@ -26,7 +26,7 @@ def test_summary_fits_a_terminal_and_names_the_kind_of_data(scene):
     assert not lines or lines[0].lower().startswith(numbers_of(scene)["provenance"]["source"])
 
 
-def test_simulated_scores_stand_beside_those_of_the_paper():
+def test_simulated_scores_are_beside_those_of_the_paper():
     lines = summarise(numbers_of("quick"))
     row = next(line for line in lines if "multi-sensor  " in line)
     for metric, (mean, _) in TABLE_2["multi"].items():
@@ -34,7 +34,7 @@ def test_simulated_scores_stand_beside_those_of_the_paper():
     assert f"{numbers_of('quick')['table2']['multi']['accuracy_pct']['mean']:.0f} (" in row
 
 
-def test_recorded_scores_stand_alone():
+def test_recorded_scores_are_shown_without_those_of_the_paper():
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}, "mse_f_N2": {"mean": 1.0, "n": 2}}
     lines = summarise({"provenance": {"source": "recorded"}, "table2": {"multi": row}})
     assert "(" not in "".join(lines)

@@ -153,7 +153,7 @@ def test_every_row_has_its_source():
 def test_table_2_has_the_papers_numbers():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
-        assert f"{value[0]:g} ± {value[1]:g}" in text  # with the digits that the paper prints
+        assert f"{value[0]:g} ± {value[1]:g}" in text  # with as many digits as in the paper
     assert "85.0 ± 7.1" in text
 
 
@@ -198,9 +198,9 @@ def test_uncertainty_decides_the_digits(mean, half, asymmetry):
     unit = 10.0 ** -len(show(value).partition(" ")[0].partition(".")[2])
     ends = zip((shown, low, high), (mean, *value["ci95"]), strict=True)
     assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)  # all have the same number of decimals
-    digits = np.floor(np.log10(half / unit)) + 1  # of half of the interval
-    assert digits <= 3  # two, or three to keep an end from being rounded to 0
-    assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10  # fewer only if the mean already has four
+    digits = np.floor(np.log10(half / unit)) + 1  # digits of half of the interval
+    assert digits <= 3  # two digits, or three if an end would otherwise be rounded to 0
+    assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10  # fewer only if the mean already has four digits
 
 
 def test_end_of_an_interval_is_not_rounded_to_zero():

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 INDICES = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
-MOMENTS = {"min", "max", "mean", "std", "count"}  # LeRobot computes them in single precision, quantiles roughly
+MOMENTS = {"min", "max", "mean", "std", "count"}  # computed in single precision; quantiles are only approximate
 
 
 def compare(exported: Path, own: Path) -> None:
@@ -43,7 +43,7 @@ def compare(exported: Path, own: Path) -> None:
     for name, values in statistics.items():
         assert values.keys() == their_statistics[name].keys(), name
         if np.isnan(their_statistics[name]["mean"]).any():
-            continue  # some values are unknown; LeRobot's statistics are then NaN
+            continue  # if some values are unknown, LeRobot's statistics are NaN
         largest = np.abs([values["min"], values["max"]]).max()
         for key in MOMENTS:
             np.testing.assert_allclose(

@@ -1,8 +1,8 @@
 """A strict fake of rclpy, with message classes that are made from recorded message definitions.
 
 `ros_messages.txt` has the definitions of ROS 2 Humble and Jazzy, without comments. If RESKIN_ROSBAGS is set,
-test_ros2.py compares them with the package rosbags. Like the classes of rclpy, those made here refuse unknown fields,
-and values of a wrong type, size or range.
+test_ros2.py compares them with the package rosbags. As in rclpy, the classes refuse unknown
+fields, and values of a wrong type, size or range.
 """
 
 import re

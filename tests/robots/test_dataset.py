@@ -60,7 +60,7 @@ def values_of(table: pa.Table, name: str) -> np.ndarray:
 
 
 def load_with_lerobot(exported: Path, folder: Path, *options: str) -> list[dict]:
-    """Load a dataset with LeRobot in an environment of its own; return its frames."""
+    """Load a dataset with LeRobot, in a separate environment; return its frames."""
     io.remove(folder)
     folder.mkdir()
     environment = {"PATH": os.environ["PATH"], "HF_HUB_OFFLINE": "1", "HF_HOME": str(folder / "hf")}

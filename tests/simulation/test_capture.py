@@ -102,7 +102,7 @@ def test_labels_are_commanded_and_forces_measured(capture):
 
 
 def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
-    # Frames without motion: while the tip moves, chips that convert earlier read less.
+    # Only frames without motion are compared, because while the tip moves, chips that convert earlier read less.
     without_motion = [1, 2, 3, 4, 8, 9, 10]
     b_uT = frames_by_indentation(capture)[:, without_motion]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)

@@ -129,13 +129,13 @@ def test_chips_read_a_rising_press_late():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     fast, slow = (
         capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
-        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # both have 20 frames: 2.5 ms and 250 ms apart
+        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # both presses have 20 frames, 2.5 ms and 250 ms apart
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
     assert (late_uT > 1.0).all()  # 1 uT is more than three LSB of z
-    # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart: each reading is between two readings of
-    # the slow press.
+    # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart. Each reading must therefore be between two
+    # readings of the slow press.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
     assert (moving_uT[1:] >= low_uT - 1).all()  # tolerance in uT: more than one LSB of x, y and z
     assert (moving_uT[1:] <= high_uT + 1).all()

@@ -95,7 +95,7 @@ def test_robot_misses_places_by_the_given_spread():
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
     loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
     missed_mm = actual_positions(grid, loose, rng_for(0, "robot")) - exact_mm
-    # 25 %: four standard errors of 6 % for 130 draws
+    # tolerance 25 %: four standard errors, 6 % each for 130 draws
     np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)
     planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
     along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm

@@ -63,8 +63,8 @@ def test_direction_of_the_drag_changes_the_field():
 
 
 def test_mirror_symmetry_of_a_drag():
-    # Reflection x -> -x swaps chips 1 and 3 and leaves the checkerboard unchanged as a field of axial vectors, so By
-    # and Bz change sign.
+    # The reflection x -> -x swaps chips 1 and 3, and leaves the checkerboard unchanged as a field of axial vectors. By
+    # and Bz therefore change sign.
     one = drag(line(-1.0, 2.0))
     mirrored = drag(line(1.0, -2.0)).change_T[0][:, [0, 3, 2, 1, 4]]
     np.testing.assert_allclose(mirrored, one.change_T[0] * (1, -1, -1), atol=1e-9 * np.abs(one.change_T).max())

@@ -27,7 +27,7 @@ TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
 STOPS_N = 48  # number of stops of a path; twice as many for the finer path
-# Limit on the ratio of the largest change of dB between two stops, on the finer path, to that on the coarse path. The
+# Limit on a ratio: largest change of dB between two stops on the finer path, divided by that on the coarse path. The
 # ratio is 0.5 if dB is smooth, and 1 if dB jumps.
 HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))

@@ -1,4 +1,4 @@
-"""Copies of this checkout in which tests run stages: code, configuration and environment, without data and git."""
+"""Copies of this checkout in which tests run stages: with code, configuration and environment, without data and git."""
 
 import compileall
 import os
@@ -43,7 +43,7 @@ def copy_checkout(folder: Path) -> Path:
             shutil.copy(path, folder)
     (folder / "dvc.lock").unlink(missing_ok=True)
     (folder / "reports/tuning").mkdir(parents=True)
-    # stage audit compares recipes with this file
+    # stage audit compares the recipes with those in this file
     shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")
     (folder / "data").mkdir()
     (folder / "data/captures.yaml").write_text("captures: {}\n")

@@ -52,7 +52,7 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "worlds",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
-# time limit for tests that hang; long, because a busy machine needs four times as long
+# time limit for tests that hang; a busy machine needs four times as long as an idle one
 pytestmark = pytest.mark.timeout(1800)
 slow = pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 
@@ -243,7 +243,7 @@ def test_checklist_rows_resolve_to_numbers_and_files(story):
     numbers = json.loads((reports / "numbers.json").read_text())
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
-    assert [row.id for row in missing] == ["plateau"]  # not reached: the sweep is too short
+    assert [row.id for row in missing] == ["plateau"]  # not reached, because the sweep is too short
     assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     resolved = [row for row in rows if row not in missing]
@@ -422,7 +422,7 @@ def test_missing_tracking_server_is_reported_quickly(story):
              "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *arguments, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
-    assert time.monotonic() - start_s < 100  # without our time limit, MLflow would retry for minutes
+    assert time.monotonic() - start_s < 100  # without the project's time limit, MLflow would retry for minutes
 
 
 @slow

@@ -1,9 +1,9 @@
 """Run stages as DVC does, but each in a fork of one process that has imported all modules.
 
 `warm_stages` (checkout.py) starts this program in a copy of the checkout. Each line of input names stages (`drift@ci
-sleeve@ci`; an empty line: all). The program runs these stages in DVC's order, commits them like `dvc commit`, prints
-`DONE` or `FAILED`, and reads the next line. This saves time, because small stages spend most of it on imports and
-tables of skin deformation. tests/recordings/test_lab_story.py runs DVC itself.
+sleeve@ci`; an empty line means all stages). The program runs these stages in DVC's order, commits them like `dvc
+commit`, prints `DONE` or `FAILED`, and reads the next line. This program saves time, because small stages spend most of
+their time on imports and on tables of skin deformation. tests/recordings/test_lab_story.py runs DVC itself.
 """
 
 import gc
@@ -49,7 +49,7 @@ def run_stage(name: str, command: str) -> int:
 
 
 def commands_of(stage: PipelineStage) -> list[str]:
-    """Return the commands of a stage, which DVC has as one text or as a list."""
+    """Return the commands of a stage; DVC stores them as a text or as a list of texts."""
     return stage.cmd if isinstance(stage.cmd, list) else [stage.cmd]
 
 

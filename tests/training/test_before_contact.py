@@ -1,4 +1,4 @@
-"""Tests of predicting places from readings before contact, for scans in a fixed and in a random order."""
+"""Tests of predicting places from readings before contact, for scans in fixed order and in random order."""
 
 from pathlib import Path
 
@@ -55,7 +55,7 @@ def test_snake_scan_without_memory_reveals_places_by_their_order(tmp_path):
 
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
-    """Score predictions from readings while the tip hovers above the next place, which only a magnetic tip affects."""
+    """Score predictions from readings while the tip hovers; only a magnetic tip affects these readings."""
     # Two readings per place: above the place, then in contact.
     place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)
     touches = np.tile([False, True], PASSES_N * PLACES_N)

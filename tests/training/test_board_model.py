@@ -90,7 +90,7 @@ def test_simulated_presses_of_the_board_are_placed_within_1_mm(made, labels_n, l
 
 
 def test_presses_simulated_by_independent_code_are_placed_within_1_mm(made):
-    # This simulator has its own code for positions and turns of chips. With a wrong turn of one chip, places are wrong.
+    # This simulator has separate code for positions and turns of chips. A wrong turn of one chip makes places wrong.
     model = load_universal(file=made)
     layout, rng, within, with_wrong_turn = model.layout, rng_for(0, "square"), [], []
     turned = (layout.chips[0].model_copy(update={"turn_deg": 270}), *layout.chips[1:])

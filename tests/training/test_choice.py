@@ -15,7 +15,7 @@ Card = dict[str, Any]
 
 
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
-    """Return a card with one skin per board; accuracy and force error improve as the place error gets worse."""
+    """Return a card with one skin per board. The larger the place error, the better are accuracy and force error."""
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
         "all": score,
@@ -97,7 +97,7 @@ def test_mean_over_boards_decides():
 
 
 def test_adapted_skins_are_pooled_by_board():
-    # Board b0 has two skins (0.2, 0.4), b1 has one (0.9): the mean is (0.3 + 0.9) / 2, not that of three skins.
+    # Board b0 has two skins (0.2, 0.4), b1 has one (0.9). The mean is (0.3 + 0.9) / 2, not the mean over three skins.
     skins = [
         adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
@@ -105,7 +105,7 @@ def test_adapted_skins_are_pooled_by_board():
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
     scores = chosen["candidates"][0]["mse_xy_mm2"]
     assert scores["mean"] == pytest.approx(0.6)
-    assert "sd_seeds" not in scores  # a spread over skins is not one over seeds
+    assert "sd_seeds" not in scores  # a spread over skins is not a spread over seeds
 
 
 SHAPED = {"inputs": "shape"}

@@ -27,7 +27,7 @@ def model() -> Universal:
 
 
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
-    """Return simulated skins near the nominal one: presses on the lattice, law errors proportional to the field."""
+    """Return simulated skins near the nominal one: presses on the lattice; law errors are proportional to the field."""
     tables, rng = model.tables, rng_for(0, "shipping")
     place_i = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
     force_i = rng.integers(1, len(tables.force_N), (skins_n, PRESSES_N))

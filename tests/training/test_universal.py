@@ -52,7 +52,7 @@ def test_place_and_label_are_inverse():
 
 
 def test_recorded_readings_are_grouped_by_press():
-    counts = [2, 150, 1, 3]  # numbers of readings of four presses; the third has no force, the last is on another board
+    counts = [2, 150, 1, 3]  # readings of four presses; the third press has no force, the last is on another board
     press = np.repeat(np.arange(4), counts)
     board = np.where(press == 3, "other", "own")
     target = np.stack([8 + press, 7 + press, np.where(press == 2, 0.0, 1 + press)], axis=1).astype(np.float32)
@@ -141,7 +141,7 @@ def test_errors_of_held_out_labels_widen_intervals(exact_and_wrong_labels):
     _, misled = exact_and_wrong_labels
     assert (misled_powers < fitting_powers / 2).all()
     assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
-    # Forty wrong labels lower the powers more than three wrong labels do.
+    # Forty wrong labels must lower the powers more than three wrong labels.
     assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 

@@ -22,7 +22,7 @@ REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 
 
 def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -> np.ndarray:
-    """Return fields in 15 channels, largest near each chip; x and y point away from the chip, `upright` scales z."""
+    """Return fields in 15 channels, largest near each chip. x and y point away from the chip; `upright` scales z."""
     offset = (place_mm[:, None] - CHIPS_MM) / WIDE_MM
     size = 400 * force_N[:, None] ** 0.7 * np.exp(-(offset**2).sum(axis=2) / 2)
     return np.stack([size * offset[..., 0], size * offset[..., 1], size * upright], axis=2).reshape(len(place_mm), -1)
@@ -49,7 +49,7 @@ def make_tables() -> Tables:
 
 
 def make_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
-    """Draw synthetic skins with random parameters; if `weight_N` is given, the last press has this force, at (0, 0)."""
+    """Draw synthetic skins with random parameters. With `weight_N`, the last press is at (0, 0) with this force."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))
     number = rng.standard_normal((skins_n, 3))

@@ -36,7 +36,7 @@ NAMES = (
     "label_x_mm",
     "label_y_mm",
     "away_um_mm",
-)  # for three parameters in tests of the algebra; the third is the slide
+)  # tests of the algebra have three parameters, of which the third is the slide
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_order_of_presses_and_labels_of_a_new_day_does_not_matter(skin, first_da
         one.see(read_uT).label(*labels)
         if shift:
             other.label(*labels).see(read_uT[::-1])
-        else:  # presses of an unchanged slide are added to those of the first day, so the first call matters
+        else:  # if the slide is unchanged, presses are added to those of the first day, so the first call matters
             other.see(read_uT[::-1]).label(*labels)
         assert one.slide.same == other.slide.same == (not shift)
         assert one.slide.log_odds == pytest.approx(other.slide.log_odds, rel=1e-6)

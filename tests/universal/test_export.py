@@ -126,9 +126,9 @@ def run_onnx(file: Path, db_uT: np.ndarray) -> dict[str, np.ndarray]:
 def check_equal(model: Universal, found: dict[str, np.ndarray], changes: dict[str, np.ndarray]) -> None:
     """Compare exported estimates with Python's.
 
-    Python sums chi^2 in single precision, so its rounding errors grow with chi^2. They matter only if two distant
-    hypotheses have large, nearly equal chi^2, as can happen for readings that are not presses. For such readings, 90 %
-    of the estimates must agree to the usual tolerance, and the others to a larger one.
+    Python sums chi^2 in single precision, so rounding errors grow with chi^2. These errors matter only if two distant
+    hypotheses have large, nearly equal chi^2, which can happen for readings that are not presses. For such readings, 90
+    % of the estimates must agree to the usual tolerance, and the others to a larger one.
     """
     expected = model.estimate(np.concatenate(list(changes.values())) + model.noload_uT)
     kind_of = np.repeat(list(changes), [len(rows) for rows in changes.values()])

@@ -14,7 +14,7 @@ from tests.universal.test_shipped import PLACES_MM, pokes
 
 UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
 
-FORCE_I = 4  # index of the pokes' force; their field changes are 220 to 410 uT (norm), the uniform fields 224 uT
+FORCE_I = 4  # index of the pokes' force; norms: 220 to 410 uT (their field changes), 224 uT (uniform fields)
 
 
 def nominal(external_uT: float) -> tuple[Universal, np.ndarray]:

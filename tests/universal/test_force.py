@@ -103,7 +103,7 @@ def calibrated() -> list[tuple]:
 @pytest.mark.parametrize("labels_n", [0, 1, LABELS_N])
 def test_force_intervals_cover_simulated_skins(calibrated, labels_n):
     inside = [np.abs(error) < NORMAL_90 * sd for n, error, sd in calibrated if n == labels_n]
-    assert 0.8 < np.concatenate(inside).mean() <= 1  # it would be 90 % if errors were as large as assumed
+    assert 0.8 < np.concatenate(inside).mean() <= 1  # the coverage would be 90 % if errors were as large as assumed
 
 
 def test_labels_improve_forces(calibrated):
@@ -140,7 +140,7 @@ def test_presses_with_unknown_force_do_not_calibrate_forces():
 
 
 @pytest.mark.parametrize("labels_n", [1, 5, 12])
-def test_held_out_labels_are_unknown_to_their_model(labels_n):
+def test_held_out_labels_do_not_affect_the_model(labels_n):
     model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     place_i = rng_for(6, "force line").integers(4, 18, (labels_n, 2))
@@ -163,7 +163,7 @@ def test_held_out_labels_are_unknown_to_their_model(labels_n):
     assert model.line.mean[0] != before.mean[0]
 
 
-def test_one_known_weight_corrects_far_forces_by_the_line_and_near_forces_by_the_map():
+def test_known_weight_corrects_near_forces_by_the_map_and_far_forces_by_the_line():
     model, weight_N = load_universal(), 4.0
     rest_uT = to_chips(model.tables.rest_uT[None])
     weight_uT, far_uT = (rest_uT + to_chips(model.tables.mean_uT[i : i + 1, i, 5]) for i in (11, 2))
@@ -174,4 +174,4 @@ def test_one_known_weight_corrects_far_forces_by_the_line_and_near_forces_by_the
     cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.array([off**2, off * (np.log(before_N[1]) - LOG_CENTRE_N)])
     gain = cov / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2 + model.line.scatter_var)
     moved = np.log(after_N[1] / before_N[1]) / np.log(weight_N / before_N[0])
-    assert moved == pytest.approx(gain[1], rel=0.05)  # 12 mm away: the weight is used once
+    assert moved == pytest.approx(gain[1], rel=0.05)  # at a press 12 mm away, only the line uses the known weight

@@ -12,7 +12,7 @@ FIRST_mm, FIRST_SD_mm, LOG_N = np.array([1.0, -2.0]), 1.2, 0.8
 
 
 def total() -> np.ndarray:
-    """Return deviances [4, hypotheses]: of a Gaussian, a sharper noisy one, a noisy one, and a flat one."""
+    """Return deviances [4, hypotheses] of a Gaussian, a sharper and noisy Gaussian, a noisy one, and a flat one."""
     of_place = ((AT.place_mm - FIRST_mm) ** 2).sum(axis=1) / FIRST_SD_mm**2
     of_force = (AT.log_N - LOG_N) ** 2 / 0.5
     of_all = (of_place[:, None] + of_force).ravel() + 300.0

@@ -106,16 +106,16 @@ def test_orientation_stated_by_the_user_is_used_and_kept():
     assert not model.zero(rest_uT).mounting.turned  # without `keep`, the orientation is found again
 
 
-def test_orientation_is_found_again_for_each_no_load_reading_unless_the_user_states_it():
+def test_each_no_load_reading_determines_the_orientation_unless_the_user_states_it():
     rest_uT, *_ = skin(0)
-    assert not load_universal().zero(-rest_uT).zero(rest_uT, keep=True).mounting.turned  # perhaps another skin
+    assert not load_universal().zero(-rest_uT).zero(rest_uT, keep=True).mounting.turned  # it may be another skin
     assert load_universal().zero(-rest_uT, turned=True).zero(rest_uT, keep=True).mounting.turned
 
 
 def test_weak_evidence_does_not_turn_a_skin():
     weak_uT = -0.1 * SKINS.rest_uT[0].astype(float)
     found = find_mounting(TABLES, weak_uT)
-    assert 0 < -found.log_odds < LOG_ODDS_MIN  # turned is a little more probable
+    assert 0 < -found.log_odds < LOG_ODDS_MIN  # the turned orientation is slightly more probable
     assert not found.turned
 
 

@@ -14,8 +14,8 @@ ERRORS = rng_for(0, "missed").standard_normal((3, 15))
 @pytest.mark.parametrize("boards_n", [1, 2, 5])
 def test_equal_errors_predict_their_shared_part(boards_n):
     found = fit_residual([APART_MM] * boards_n, [FORCE_N] * boards_n, [ERRORS] * boards_n).at(APART_MM, np.zeros(3))
-    # Expected: Gaussian conditioning on n equal values with variance 1 + noise; all covariances, also with the new
-    # board, are SHARED.
+    # Expected: Gaussian conditioning on n equal values with variance 1 + noise. All covariances are SHARED, including
+    # those with the new board.
     part = boards_n * SHARED / (1 + NOISE + (boards_n - 1) * SHARED)
     np.testing.assert_allclose(found, part * ERRORS, rtol=1e-9)
 

@@ -55,7 +55,7 @@ CHOICE = {
 
 
 def capture(skin: str) -> Readings:
-    """Return readings of two passes over a grid; each skin's field is a function of the place and exceeds the noise."""
+    """Return readings of two passes over a grid. Each skin's field depends on the place and exceeds the noise."""
     rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
     place_i = np.tile(np.arange(PLACES_N), PASSES_N)
     x, y = place_i // 4, place_i % 4

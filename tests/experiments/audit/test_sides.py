@@ -30,7 +30,7 @@ UNSEEN = ("lobo", "sensors", "transfer")
 
 
 def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Return presses of two skins per board; skins have a common response and an individual one, a third as large."""
+    """Return presses of two skins per board. All skins share a response; each has its own, a third as large."""
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):
@@ -116,7 +116,7 @@ def test_papers_random_readings_are_a_known_leak():
     checks = run_audit(Sides("single_random", "repeat0", rows[::2], NONE, rows[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
-    # each indentation has 3 readings: 2 are on one side of the split, 1 on the other
+    # each indentation has 3 readings, of which 2 are on one side of the split and 1 is on the other side
     assert leak.found.startswith("60 of 60 test indentations are also in training")
     assert passes(checks)
 

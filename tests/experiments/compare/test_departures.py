@@ -114,7 +114,7 @@ def test_departures_from_a_layout_name_the_layout():
     assert sentence == "Against layout square, chips 1 and 3 are exchanged."
 
 
-def test_presses_outside_the_skin_are_named_instead_of_orientations():
+def test_presses_outside_the_skin_are_reported_instead_of_orientations():
     section = square_section()
     recording = square_recording(section)
     elsewhere = replace(recording, x_mm=recording.x_mm + 20, y_mm=recording.y_mm - 5)

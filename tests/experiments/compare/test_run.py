@@ -33,7 +33,7 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
-# The nominal skin is pressed with the same tip: tables for another tip would take seconds to compute.
+# The nominal skin is pressed with the same tip, because tables for another tip would take seconds to compute.
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
@@ -231,8 +231,8 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
-    # A third of the places: 22 of 65 in each of three recordings. Parameters fitted there must agree with those of all
-    # places.
+    # Parameters fitted to a third of the places (22 of 65 in each of three recordings) must agree with those fitted to
+    # all places.
     third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
     numbers, figure_data = compare_boards(third, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}

@@ -34,7 +34,7 @@ def scene_data():
 
 
 def nearest_neighbour(data):
-    """Return a predictor that is exact for single contacts: it returns the target of the most similar row."""
+    """Return a predictor that returns the target of the most similar row, which is exact for single contacts."""
 
     def predict(db_uT):
         known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)

@@ -48,7 +48,8 @@ def test_superposition_error_falls_with_distance_and_rises_with_depth():
         (row["depth_mm"], row["separation_mm"]): row["error_pct"] for row in superposition(SCENE, (4.0, 12.0), seed=1)
     }
     assert sorted(rows) == [(0.6, 4), (0.6, 12), (1.2, 4), (1.2, 12)]
-    # The error is a product of two displacements: relative to the field change, it is proportional to the depth.
+    # The error is a product of two displacements. Relative to the field change, the error is therefore proportional to
+    # the depth.
     for separation_mm in (4, 12):
         assert rows[0.6, separation_mm] < 0.7 * rows[1.2, separation_mm]
     for depth_mm in (0.6, 1.2):
@@ -66,5 +67,5 @@ def test_field_is_from_both_contacts():
 def test_rotated_moments_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
     length, before = (np.linalg.norm(vectors, axis=1) for vectors in (moments, SKIN.moments_A_m2))
-    # Interpolation between two rotated vectors is along a chord: shorter than the vectors by up to (angle^2) / 8.
+    # Interpolation between two rotated vectors is along a chord, so the result is too short by up to (angle^2) / 8.
     np.testing.assert_allclose(length, before, rtol=0.05)

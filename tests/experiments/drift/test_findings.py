@@ -110,7 +110,7 @@ def test_policies_are_compared_over_all_windows():
 
 
 def test_paired_differences_cancel_errors_common_to_both_policies():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # errors that a seed has under both policies
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # errors of a seed that are equal under both policies
     regular = {name: values + shared for name, values in PAPER["regular"].items()}
     each_contact = {name: values + shared for name, values in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE] == SUPPORTED

@@ -78,7 +78,7 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
-    # No-load readings before each contact remove the drift. The initial reading removes none of it; regular readings
+    # No-load readings before each contact remove the drift. The initial reading removes no drift. Regular readings
     # leave the drift of at most 20 contacts.
     off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
     assert off_uT["each"] == 0
@@ -102,7 +102,8 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
     svgs = drift_pages.figures(numbers, results["drawn"], "simulated")
     assert set(svgs) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
-    # A random walk with steps of 0 uT equals the last window; readings before every contact remove any walk.
+    # With steps of 0 uT, the random walk has the errors of the last window. Readings before every contact remove any
+    # walk.
     for policy, (without_walk, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
         assert {name: without_walk[name] for name in last} == pytest.approx(last)
@@ -149,8 +150,8 @@ def test_variation_recovers_drift_and_gain(scene, tmp_path):
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
         assert place["time"]["db_change_uT"] < 1e-3  # rounding of fields of 1000 uT to float32
         assert place["skins"]["skins"] == ["s0", "s1"]  # the first skin of each board
-        # The second skin has 1.5 times the field: the difference is half the weaker field, relative to the rms of both
-        # fields.
+        # The second skin has 1.5 times the field of the first, so they differ by half the weaker field. The
+        # spread is relative to the rms of both fields.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
     assert set(variation_pages.figures(results["numbers"], results["drawn"], "simulated")) == {
         "variation_time.svg", "variation_skins.svg",

@@ -40,7 +40,7 @@ def scan(folder: Path, passes_n: int = 3) -> Path:
 
 
 def strokes(folder: Path, strokes_n: int = 3) -> Path:
-    """Write strokes at one place: five rows down and up, a new baseline before each, no new weight at the top."""
+    """Write strokes at one place: down and up in five rows, after a new baseline. Top rows have no new weight."""
     stroke = [(288.0, -1.0), (284.0, 100.0), (280.0, 1000.0), (284.0, 150.0), (288.0, -1.0)]
     places = [[315.0, -100.0, z, weight] for z, weight in stroke] * strokes_n
     return write(folder, places, [450.0 + i // len(stroke) for i in range(len(places))])

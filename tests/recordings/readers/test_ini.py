@@ -16,8 +16,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# Labels of one pass: two rows at the corner (one with the label of the last place), then presses, one too weak for the
-# gauge.
+# Labels of one pass: two rows at the corner (one has the label of the last place), then presses. One press is too weak
+# for the gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
@@ -172,7 +172,7 @@ def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n,
 
 @settings(max_examples=12, deadline=None)
 @given(late_n=st.integers(0, 5), failed=st.sets(st.integers(10, 20), max_size=1))
-def test_late_fields_are_paired_with_their_presses(
+def test_late_fields_are_paired_with_their_labels(
     tmp_path_factory: pytest.TempPathFactory, late_n: int, failed: set[int]
 ) -> None:
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)

@@ -24,7 +24,7 @@ def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, 
     """Return synthetic fields (|dB| 70 uT, noise 25 uT, drift, one row late) and labels of a printer with a gauge."""
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    presses_n = rng.integers(3, 8, len(places_mm))  # rows per place: the first without contact, then deeper and deeper
+    presses_n = rng.integers(3, 8, len(places_mm))  # rows per place: no contact, then increasing depth
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
