@@ -457,8 +457,8 @@ class Publisher:
     def write_universal(self, weights: Path, tested: Path) -> None:
         """Write and register the universal model, with its scores on the recorded boards of scene lab.
 
-        The step of a metric is the number of labelled presses to which the model was calibrated. MLflow's tables show the
-        last step. Metrics that end in `_0_labels` are the scores without labels.
+        The step of a metric is the number of labelled presses to which the model was calibrated. MLflow's tables show
+        the last step. Metrics that end in `_0_labels` are the scores without labels.
         """
         from pipeline.pyfunc import simulated_example
         from pipeline.report.figures import TESTED
