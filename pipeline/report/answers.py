@@ -6,8 +6,10 @@ Place and force of a contact have separate answers. Each answer states what a us
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
+from statistics import fmean
 from typing import Any
 
+from pipeline.report.figures import WAYS, boards_rows
 from pipeline.report.formatting import Results, Stat, models, show, show_with_unit, three_digits, universal_rows
 from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
 
@@ -27,9 +29,10 @@ IN_BRACKETS = (
 )
 SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the root of each squared error
 UNIVERSAL = "universal, "  # prefix of the methods in `labels` that are calibrated to the tested skin
-NOTHING, UNLABELLED = "nothing", "dozens of presses without labels"
+NOTHING, UNLABELLED = "nothing", "presses without labels"
 NONE_HELD_OUT = "no board held out"
-ANSWER, COMPARED = "answer", "compared"
+ANSWER, SECOND, COMPARED = "answer", "second", "compared"
+RIG, SHIPPED = WAYS  # methods of experiment random_presses
 ADAPTED = "Multi-sensor with triplet loss, adapted"
 NETWORK = "Network of the paper, trained on the other boards"
 OURS = "Universal model (ours), trained on simulated skins"
@@ -41,7 +44,8 @@ WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the fi
 class Effort:
     """Scores of a model on new skins, and the data that it needs of a new skin; `paper` has the paper's means.
 
-    `role`: `answer` if this model gives the answer of the scene, `compared` if a sentence compares it with the answer.
+    `role`: `answer` if this model gives the answer of the scene, `second` if the answer in short names it too,
+    `compared` if another sentence compares it with the answer.
     """
 
     model: str
@@ -71,12 +75,16 @@ class Effort:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer for the place or the force of a contact: a level, a short answer, and sentences with numbers."""
+    """The answer for the place or the force of a contact: a level, the answer in short, and sentences with numbers.
+
+    `second`: a sentence about the second model, which belongs to the answer in short.
+    """
 
     quantity: str
     level: str
     short: str
     sentences: tuple[str, ...] = ()
+    second: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,14 +103,15 @@ def answers(numbers: Results) -> Answers:
     if not efforts:
         return _within_skin(numbers)
     best = next(effort for effort in efforts if effort.role == ANSWER)
-    others = [effort for effort in efforts if effort.role == COMPARED]
+    others = [effort for effort in efforts if effort.role in (SECOND, COMPARED)]
     return Answers(_tested(numbers, best), _place(best, others), _force(numbers, best, others), efforts)
 
 
 def rms(mse: Stat | None) -> Stat | None:
     """Return the square root of a mean squared error, with its interval or the values of its boards.
 
-    Standard deviations are omitted, because they are those of the squared errors, not of their square roots.
+    With values of boards, the mean is that of the boards' square roots.
+    Standard deviations are omitted, because that of the squared errors is not that of their square roots.
 
     >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]})
     {'mean': 0.5, 'n': 6, 'ci95': [0.4, 0.6]}
@@ -110,18 +119,8 @@ def rms(mse: Stat | None) -> Stat | None:
     if mse is None:
         return None
     ends = {name: [sqrt(end) for end in mse[name]] for name in ("ci95", "values") if name in mse}
-    return {"mean": sqrt(mse["mean"]), "n": mse["n"]} | ends
-
-
-def in_words(percent: float) -> str:
-    """Write a percentage as a simple fraction.
-
-    >>> in_words(78.7), in_words(50.2), in_words(95.1), in_words(99.7), in_words(0.2)
-    ('about 4 in 5', 'about 1 in 2', 'about 19 in 20', 'nearly all', 'almost none')
-    """
-    simple = [(part, of) for of in (2, 3, 4, 5, 10, 20) for part in range(of + 1) if of < 20 or part in (1, 19)]
-    part, of = min(simple, key=lambda pair: abs(pair[0] / pair[1] - percent / 100))
-    return "nearly all" if part == of else f"about {part} in {of}" if part else "almost none"
+    mean = fmean(ends["values"]) if "values" in ends else sqrt(mse["mean"])
+    return {"mean": mean, "n": mse["n"]} | ends
 
 
 def level(stat: Stat, yes: float, partly: float) -> str:
@@ -132,20 +131,43 @@ def level(stat: Stat, yes: float, partly: float) -> str:
 
 
 def _efforts(numbers: Results) -> Iterator[Effort]:
-    """Yield the models to show; the model that needs the most data of the new skin comes last."""
+    """Yield the models to show; the one that needs most of the new skin comes last."""
+    if boards_rows(numbers):
+        yield from _efforts_on_random_presses(numbers)
+        return
     if numbers.get("labels"):
         yield from _efforts_by_labels(numbers["labels"])
         return
     known, table2 = models(numbers), numbers.get("table2", {})
     adapting = f"{numbers.get('adapt', {}).get('pokes_n', ADAPTED_POKES_N)} presses without labels"
     rows = [row for row in ("single", "multi", "triplet", "adapted") if row in table2]
+    ours = universal_rows(numbers) if rows else []
+    # A scene without the row of one skin does not repeat the whole of table 2: it is about the universal model.
+    network_role, our_role = (SECOND, ANSWER) if ours and "single" not in table2 else (ANSWER, SECOND)
     for row in rows:
         title = ADAPTED if row == "adapted" else known[row].title
         paper = {metric: mean for metric, (mean, _) in known[row].paper.items()}
         needs = adapting if row == "adapted" else NOTHING
-        yield Effort(title, needs, table2[row], paper, role=ANSWER if row == rows[-1] else "")
-    for _, scores in universal_rows(numbers) if rows else ():
-        yield Effort(OURS, f"{scores['pokes_n']} presses without labels", scores, {}, role=COMPARED)
+        yield Effort(title, needs, table2[row], paper, role=network_role if row == rows[-1] else "")
+    for _, scores in ours:
+        yield Effort(OURS, f"{scores['pokes_n']} presses without labels", scores, {}, role=our_role)
+
+
+def _efforts_on_random_presses(numbers: Results) -> Iterator[Effort]:
+    """Yield the universal models by number of labels, scored as in the figure of boards never seen in training."""
+    rows = sorted(boards_rows(numbers), key=lambda row: int(row["labels"]))
+    first = RIG if any(row["method"] == RIG for row in rows) else SHIPPED
+    for method in dict.fromkeys((SHIPPED, first)):  # the model that gives the answer comes last
+        swept = [row for row in rows if row["method"] == method]
+        for row in swept:
+            unlabelled, labels_n = f"{row['presses_n']} presses without labels", int(row["labels"])
+            needs = f"{unlabelled}, and {labels_n} with known place and force" if labels_n else unlabelled
+            role = ""
+            if row is swept[0]:
+                role = ANSWER if method == first else SECOND
+            elif row is swept[-1] and method == first:
+                role = COMPARED
+            yield Effort(f"Universal model (ours), {WAYS[method]}", needs, row, {}, labels_n, role)
 
 
 def _efforts_by_labels(rows: Sequence[Mapping[str, Any]]) -> Iterator[Effort]:
@@ -168,12 +190,22 @@ def _efforts_by_labels(rows: Sequence[Mapping[str, Any]]) -> Iterator[Effort]:
 
 
 def _tested(numbers: Results, best: Effort) -> str:
-    lobo, source = numbers.get("protocol", {}).get("lobo"), numbers["provenance"]["source"]
-    boards = f"{lobo['boards_n']} {source} boards with {lobo['skins_n']} skins" if lobo else f"{source} boards"
+    source = numbers["provenance"]["source"]
+    boards_n, skins_n = _held_out_n(numbers)
+    boards = f"{boards_n} {source} boards with {skins_n} skins" if boards_n and skins_n else f"{source} boards"
     held_out = f"Tested on {boards}; no tested board or skin was in training."
     if source == "simulated":
         held_out += " This is no evidence about real skins."
     return f"{held_out} Model: {best.model}. It needs of the new skin: {best.needs}."
+
+
+def _held_out_n(numbers: Results) -> tuple[int, int]:
+    """Return the numbers of held-out boards and skins; 0 if unknown. Not all scenes have the protocol of their run."""
+    if lobo := numbers.get("protocol", {}).get("lobo"):
+        return lobo["boards_n"], lobo["skins_n"]
+    described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {})
+    over_skins = [stat["n"] for stat in described.get("over_skins", {}).values()]
+    return len(numbers.get("lobo", {}).get("by_board", ())), max(over_skins, default=0)
 
 
 def _place(best: Effort, others: Sequence[Effort]) -> Answer:
@@ -181,8 +213,8 @@ def _place(best: Effort, others: Sequence[Effort]) -> Answer:
     if accuracy is None:
         return Answer(PLACE, UNTESTED, "the recordings have no places")
     error = show_with_unit(rms(best.scores.get("mse_xy_mm2")), "mm")
+    second = ""
     sentences = [
-        f"{show_with_unit(accuracy, '%')} of readings are within 1 mm in x and in y.",
         f"rms error along x or y: {error}.",
         f'The paper\'s requirement, "1mm with 90% accuracy": {_requirement(accuracy)}.',
     ]
@@ -191,8 +223,10 @@ def _place(best: Effort, others: Sequence[Effort]) -> Answer:
         sentences.append(f"Paper: {three_digits(best.paper['accuracy_pct'])} %; {paper_mm:.2f} mm.")
     for other in others:
         sentences.append(f"{_named(other)}: {show_with_unit(other.scores['accuracy_pct'], '%')} within 1 mm.")
+        second = sentences[-1] if other.role == SECOND else second
     reached = level(accuracy, PLACE_ACCURACY_MIN_PCT, PLACE_PARTLY_PCT)
-    return Answer(PLACE, reached, f"{in_words(accuracy['mean'])} readings are within 1 mm", tuple(sentences))
+    short = f"{show_with_unit(accuracy, '%')} of readings are within 1 mm in x and in y"
+    return Answer(PLACE, reached, short, tuple(sentences), second)
 
 
 def _requirement(accuracy: Stat) -> str:
@@ -209,6 +243,7 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
     explained, error = best.scores.get("r2_f"), rms(best.scores.get("mse_f_N2"))
     if explained is None or error is None:
         return Answer(FORCE, UNTESTED, "the recordings have no forces")
+    second = ""
     sentences = [f"{show_with_unit(error, 'N')} rms; R² {show(explained)}.", *_forces(numbers)]
     constant = numbers.get("constant_force", {}).get("labels" if numbers.get("labels") else "table2")
     if best.paper:
@@ -217,12 +252,13 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         r2 = other.scores["r2_f"]
         shown = show_with_unit(rms(other.scores["mse_f_N2"]), "N")
         sentences.append(f"{_named(other)}: {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
+        second = sentences[-1] if other.role == SECOND else second
     short = f"rms error {error['mean']:.2g} N"
-    if constant:
-        short += f", against {sqrt(constant['mse_f_N2']['mean']):.2g} N for always guessing the mean force"
+    if constant and (guessing := rms(constant["mse_f_N2"])):
+        short += f", against {guessing['mean']:.2g} N for always guessing the mean force"
     if force_level(explained) == NO:
         short = f"not usable; {short}"
-    return Answer(FORCE, force_level(explained), short, tuple(sentences))
+    return Answer(FORCE, force_level(explained), short, tuple(sentences), second)
 
 
 def force_level(explained: Stat) -> str:

@@ -292,12 +292,13 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
 def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
     """Judge a claim about accuracy that must hold for every number of training skins."""
     verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
-    by_number = ", ".join(f"{skins_n} {verdict}" for skins_n, verdict in verdicts.items())
+    counts = [f"with {n}{' training skin' * (i == 0)}{'s' * (i == 0 and n > 1)}" for i, n in enumerate(verdicts)]
+    by_number = "; ".join(f"{count}: {verdict}" for count, verdict in zip(counts, verdicts.values(), strict=True))
     return Judgement(
         statistics.combine_verdicts(list(verdicts.values())),
         "gain above 0 at every number of training skins",
         _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
-        notes=(f"by number of skins: {reworded(by_number)}",),
+        notes=(reworded(by_number),),
     )
 
 
@@ -386,11 +387,18 @@ def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
 
 
 def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
-    """If our mean does not meet the criterion, return the row's possible reason with the numbers filled in."""
+    """Return the row's possible reason, with its numbers filled in, if our mean does not meet the criterion.
+
+    A reason that names several numbers is their difference, so it is omitted if they are equal as shown.
+    """
     why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
     if not why or judgement.met != "no":
         return []
-    return [NAMED_NUMBER.sub(lambda name: f"{look_up(numbers, name[1]):.3g}", why)]
+    named = [f"{look_up(numbers, name):.3g}" for name in NAMED_NUMBER.findall(why)]
+    if len(named) > 1 and len(set(named)) == 1:
+        return []
+    shown = iter(named)
+    return [NAMED_NUMBER.sub(lambda _: next(shown), why)]
 
 
 def _show_ours(row: Row, ours: Any) -> str:

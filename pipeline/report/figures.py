@@ -213,7 +213,7 @@ def unseen_boards(
             f"{rows[0]['presses_n']} unlabelled presses of the board; labels at random places, tests at other places; "
             f"means of {numbers['random_presses']['draws_n']} draws"
         )
-        title = f"Boards never seen in training ({source}): each mark is one board"
+        title = f"Boards never seen in training ({source}):{' ' if large else chr(10)}each mark is one board"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
         return svg(figure, column=not large)
 

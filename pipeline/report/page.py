@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -399,7 +400,19 @@ def link(result: str, shown_in: str, ids: Mapping[str, str]) -> str:
     name = seen["name"] + ".svg" * (seen["kind"] == "figure") if seen else shown_in
     if name not in ids or result in NO_VALUE:
         return result
-    return Markup(f'<a href="#{ids[name]}">{escape(unbroken(result))}</a>')
+    text = f"{SEE}{_in_words(name)}" if seen else unbroken(result)
+    return Markup(f'<a href="#{ids[name]}">{escape(text)}</a>')
+
+
+@cache
+def _in_words(name: str) -> str:
+    """Name a table or figure in a sentence: as the paper does, if it shows one of the paper's, or by its caption."""
+    for place in read_places():
+        if name in place.shown and place.id.startswith(("table-", "figure-")):
+            return place.id.replace("-", " ")
+    captions = {key: text for section in read_sections() for key, text in section.captions.items()}
+    caption = re.split("[:,] ", captions.get(name, _title(name)))[0]
+    return caption[:1].lower() + caption[1:]
 
 
 def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:

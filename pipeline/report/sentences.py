@@ -98,7 +98,21 @@ def _unseen(numbers: Numbers) -> dict[str, str]:
 def _pokes(numbers: Numbers) -> dict[str, str]:
     rows = sorted(numbers["sweep_pokes"], key=lambda row: row["pokes_n"])
     ends = [f"{row['accuracy_pct']['mean']:.1f} % with {row['pokes_n']} pokes" for row in _spaced(rows)]
-    return {"sweep_pokes.svg": f"Mean accuracy: {', '.join(ends)}. The intervals show how sure the difference is."}
+    bars = "The bars are intervals of each score over boards, not of the difference"
+    if difference := _gain_from_pokes(numbers):
+        bars += f": that is {difference}"
+    return {"sweep_pokes.svg": f"Mean accuracy: {', '.join(ends)}. {bars}."}
+
+
+def _gain_from_pokes(numbers: Numbers) -> str:
+    """Write the paired difference in accuracy from adaptation to the default number of pokes."""
+    pokes_n = numbers.get("adapt", {}).get("pokes_n")
+    for pair in numbers.get("paired", ()):
+        if (pair["of"], pair["over"]) == ("adapted", "triplet") and "ci95" in pair["accuracy_pct"] and pokes_n:
+            stat = pair["accuracy_pct"]
+            low, high = stat["ci95"]
+            return f"{stat['mean']:+.1f} points [{low:.2f}, {high:.2f}] from 0 to {pokes_n} pokes"
+    return ""
 
 
 def _spaced(rows: Sequence[Numbers]) -> list[Numbers]:
@@ -124,7 +138,7 @@ def _drift(numbers: Numbers) -> dict[str, str]:
         "each": "one before each contact",
     }
     last = {name: drift[name][-1] for name in names if drift.get(name)}
-    parts = [f"{row['accuracy_pct']:.0f} % with {names[name]}" for name, row in last.items()]
+    parts = [f"{row['accuracy_pct']:.1f} % with {names[name]}" for name, row in last.items()]
     written = {"drift.svg": f"Accuracy in the last test window: {', '.join(parts)}."} if parts else {}
     if "late" in drift:
         bias_N = drift["late"]["bias_N"]
@@ -137,9 +151,10 @@ def _drift(numbers: Numbers) -> dict[str, str]:
 
 def _shear(numbers: Numbers) -> dict[str, str]:
     names = ("explained_fxy", "explained_fz")
-    if not all(name in numbers["shear"] for name in names):
+    by_line = numbers["shear"].get("by_line", {})  # the figure shows networks that were tested on whole lines
+    if not all(name in by_line for name in names):
         return {"shear.svg": "Points on the diagonal are exact."}
-    shares = [100 * numbers["shear"][name]["mean"] for name in names]
+    shares = [100 * by_line[name]["mean"] for name in names]
     share = "{:.2f} % of the variance of sideways forces and {:.2f} % of that of normal forces".format(*shares)
     return {"shear.svg": f"Points on the diagonal are exact. The networks explain {share}."}
 

@@ -1,6 +1,7 @@
 import pytest
 
 from pipeline.report.answers import NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms
+from pipeline.report.figures import TESTED, WAYS
 from pipeline.report.paper import PLACE_ACCURACY_MIN_PCT, TABLE_2
 from tests.report.synthetic import all_experiments
 
@@ -57,7 +58,7 @@ def test_answer_states_that_a_force_is_not_usable(r2, reached):
 
 def test_answer_uses_the_best_model_without_labels():
     found = answers(scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9)))
-    assert found.place.sentences[0].startswith("80.0 % [70.0, 88.0] of readings are within 1 mm")
+    assert found.place.short.startswith("80.0 % [70.0, 88.0] of readings are within 1 mm")
     assert f"Paper: {TABLE_2['adapted']['accuracy_pct'][0]:g} %" in " ".join(found.place.sentences)
     assert [effort.scores["accuracy_pct"]["mean"] for effort in found.efforts] == [50.0, 80.0]
     assert found.efforts[1].cells["place: rms error"] == "0.70 mm [0.60, 0.80]"
@@ -74,11 +75,54 @@ def test_scores_with_labels_are_shown_beside_the_answer_without_labels():
     rows += [("universal, alone", 10, 79.0, 0.4), ("universal, alone", 40, 91.0, 0.6)]
     found = answers(all_experiments("recorded") | {"labels": [labelled(*one) for one in rows]})
     assert (found.place.level, found.force.level) == (PARTLY, NO)
-    assert found.place.sentences[0].startswith("71.0 %")
+    assert found.place.short.startswith("71.0 %")
     compared = [sentence for sentence in found.place.sentences if sentence.endswith("within 1 mm.")]
     assert [sentence.rpartition(": ")[2].partition(" %")[0] for sentence in compared] == ["31.0", "91.0"]
     assert [effort.labels_n for effort in found.efforts] == [0, 0, 10, 40]
     assert "(partly usable)" in found.force.sentences[-1]
+
+
+def few(low: float, high: float) -> dict:
+    return {"mean": (low + high) / 2, "n": 2, "values": [low, high]}
+
+
+def pressed(method: str, labels: str, accuracy: float, presses_n: int = 65) -> dict:
+    scores = {"accuracy_pct": few(accuracy - 1, accuracy + 1), "r2_f": few(0.0, 0.2), "mse_f_N2": few(1.0, 4.0)}
+    place = {"mse_xy_mm2": few(0.5, 0.7)}
+    return {"tested": TESTED, "presses_n": presses_n, "method": method, "labels": labels} | scores | place
+
+
+def test_presses_at_other_places_than_the_labels_answer_first():
+    rig, shipped = WAYS
+    rows = [pressed(rig, "0", 65.0), pressed(rig, "10", 77.0), pressed(rig, "40", 87.0), pressed(rig, "0", 60.0, 12)]
+    rows += [pressed(shipped, "0", 43.0), pressed(shipped, "40", 76.0), pressed(rig, "weight", 70.0)]
+    numbers = all_experiments("recorded") | {"labels": [labelled("network", 0, 31.0, -2.0)]}
+    found = answers(numbers | {"random_presses": {"draws_n": 10, "rows": rows}})
+    assert found.place.short.startswith("65.0 % (64.0; 66.0)")
+    assert found.place.second == f"Universal model (ours), {WAYS[shipped]}: 43.0 % (42.0; 44.0) within 1 mm."
+    assert "With 40 labelled presses: 87.0 % (86.0; 88.0) within 1 mm." in found.place.sentences
+    assert found.force.short.startswith("not usable; rms error 1.5 N")  # the mean of the boards' roots
+    assert "needs of the new skin: 65 presses without labels." in found.tested
+
+
+@pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
+def test_universal_model_leads_in_scenes_without_the_whole_of_table_2(dropped, leads):
+    numbers = scene(over(78.0, 73.8, 81.7), over(0.6, 0.4, 0.8))
+    numbers["table2"]["single"] = row(over(40.0, 30.0, 50.0), over(0.2, 0.1, 0.3))
+    numbers["table2"] = {name: scores for name, scores in numbers["table2"].items() if name != dropped}
+    told = {"way": "universal", "labels_n": 0, "pokes_n": 65} | row(over(94.8, 91.9, 96.7), over(0.8, 0.7, 0.9))
+    found = answers(numbers | {"population": {"told": [told]}})
+    assert found.place.short.startswith(leads)
+    assert ("adapted: 78.0 %" in found.place.second) == (dropped == "single")
+    assert ("Universal model" in found.place.second) == (dropped == "")
+
+
+def test_boards_and_skins_are_counted_without_the_protocol():
+    numbers = scene(over(86.0, 78.0, 91.5), over(0.8, 0.7, 0.9))
+    numbers["described"] = {"grid": {"over_skins": {"rest_changes_in_1_uT": {"mean": 5.0, "n": 18}}}}
+    del numbers["protocol"]
+    numbers["lobo"]["by_board"] = {f"b{i}": {"trained_on_skins_n": 15} for i in range(6)}
+    assert answers(numbers).tested.startswith("Tested on 6 simulated boards with 18 skins")
 
 
 def test_scene_without_held_out_boards_tests_no_new_skin():

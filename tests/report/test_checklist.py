@@ -203,7 +203,7 @@ def test_rule_over_counts_fails_if_one_count_fails():
     ]
     judgement = judge_value(sweep, rule="each")
     assert (judgement.verdict, judgement.met) == (UNDECIDED, "yes")
-    assert judgement.notes == ("by number of skins: 1 supported, 6 inconclusive, 15 supported",)
+    assert judgement.notes == ("with 1 training skin: supported; with 6: inconclusive; with 15: supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
     assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
@@ -294,6 +294,12 @@ def test_reasons_about_simulation_are_only_in_simulated_scenes():
 
 def test_reason_contains_numbers():
     assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
+
+
+def test_equal_numbers_are_no_reason():
+    numbers = all_experiments()
+    numbers["flexible"]["gap_less_pct"] = 80.0
+    assert "a possible reason" not in line(numbers, "flexible-accuracy_pct")["note"]
 
 
 @pytest.mark.parametrize(

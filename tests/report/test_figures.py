@@ -221,6 +221,15 @@ def test_unseen_boards_show_each_board_and_the_paper(lab, large):
         assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
 
 
+def test_title_of_unseen_boards_has_two_short_lines(lab):
+    text = headline_figures(lab, "recorded")[HEADLINE]
+    lines = [line for line in text.splitlines() if "Boards never seen" in line or "each mark is one board" in line]
+    assert [re.sub("<[^>]*>", "", line).strip() for line in lines] == [
+        "Boards never seen in training (recorded):",
+        "each mark is one board",
+    ]
+
+
 def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
     figures = headline_figures(lab, "recorded")
     assert PLACE_LABEL in texts_of(figures[HEADLINE])

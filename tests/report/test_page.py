@@ -175,11 +175,19 @@ def test_headings_are_in_order(read):
 
 
 def test_results_link_to_the_table_or_figure_that_shows_them():
-    rows = {"result": ["a", "b", "c"], "ours": ["see table drift", "see figure gone", "90 %"]}
-    rows |= {"criterion": ["–"] * 3, "verdict": ["–"] * 3, "shown in": ["drift", "gone.svg", "drift.svg, drift"]}
-    table = lay_out("checklist", "C", pd.DataFrame(rows), {"drift": "drift-table", "drift.svg": "figure-5a"})
+    rows = {"result": ["a", "b", "c", "d"], "ours": ["see table drift_findings", "see figure gone", "90 %"]}
+    rows["ours"].append("see figure sweep_sensors")
+    shown = ["drift_findings", "gone.svg", "drift.svg, drift", "sweep_sensors.svg"]
+    rows |= {"criterion": ["–"] * 4, "verdict": ["–"] * 4, "shown in": shown}
+    ids = {"drift_findings": "drift-findings", "drift.svg": "figure-5a", "sweep_sensors.svg": "figure-6b"}
+    table = lay_out("checklist", "C", pd.DataFrame(rows), ids)
     ours = [row[table.columns.index("ours")] for row in table.rows]
-    assert ours == ['<a href="#drift-table">see table drift</a>', "see figure gone", '<a href="#figure-5a">90 %</a>']
+    assert ours == [
+        '<a href="#drift-findings">see the paper&#39;s findings about drift</a>',
+        "see figure gone",
+        '<a href="#figure-5a">90 %</a>',
+        '<a href="#figure-6b">see figure 6b</a>',
+    ]
 
 
 def test_our_protocol_is_shown_beside_that_of_the_paper():

@@ -46,11 +46,32 @@ def test_stated_results_are_those_of_the_run(figure):
     fewest["adapted"]["mean"] = fewest["triplet"]["mean"] + 12.0
     changed["drift"]["initial"][-1]["accuracy_pct"] = 12.0
     changed["drift"]["late"]["bias_N"] = -0.12
-    changed["shear"]["explained_fz"]["mean"] = 0.12
+    changed["shear"]["by_line"]["explained_fz"]["mean"] = 0.12
     before, after = sentences(numbers)[figure], sentences(changed)[figure]
     assert before != after
     assert "12" in after
     assert ("too high" in before and "0.120\u00a0N too low" in after) or figure != "drift_force.svg"
+
+
+def test_shear_is_that_of_whole_lines():
+    numbers = numbers_of("paper")
+    numbers["shear"]["explained_fz"]["mean"] = 0.5  # random readings held out
+    numbers["shear"]["by_line"]["explained_fz"]["mean"] = 0.25
+    assert "25.00\u00a0% of that of normal forces" in sentences(numbers)["shear.svg"]
+
+
+def test_accuracy_after_drift_has_one_decimal():
+    numbers = numbers_of("paper")
+    numbers["drift"]["each"][-1]["accuracy_pct"] = 94.5
+    assert "94.5\u00a0% with one before each contact" in sentences(numbers)["drift.svg"]
+
+
+def test_bars_of_pokes_are_not_called_intervals_of_the_difference():
+    numbers = numbers_of("quick")
+    sentence = sentences(numbers)["sweep_pokes.svg"]
+    assert sentence.endswith("not of the difference: that is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")
+    del numbers["paired"]
+    assert sentences(numbers)["sweep_pokes.svg"].endswith("not of the difference.")
 
 
 def test_unseen_boards_replace_table_2():
