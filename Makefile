@@ -78,7 +78,7 @@ ui: $(STAMP)
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py -s -q -p no:xdist
+	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py tests/test_tutorial.py -s -q -p no:xdist
 
 # Kills, full disks, truncated files, dead servers: each fault is injected into a copy of a small finished checkout.
 faults: $(STAMP)

@@ -13,15 +13,16 @@ pytestmark = [
 ]
 
 
+@pytest.mark.skipif(not FULL, reason="takes minutes: RESKIN_BENCHMARKS=full")
 def test_commands_of_the_page_print_its_outputs():
-    steps = [step for step in read_steps(PAGE.read_text(encoding="utf-8")) if FULL or not step.slow]
+    steps = read_steps(PAGE.read_text(encoding="utf-8"))
     with checkout_copy() as folder:
         wrong = [sentence for done in run(steps, folder) for sentence in differences(done)]
     assert not wrong, "\n".join(wrong)
 
 
 PAGE_TEXT = """\
-<!-- until ready; slow -->
+<!-- until ready; stop -->
 ```sh
 serve
 ```
@@ -38,7 +39,7 @@ print(1)
 
 def test_steps_have_options_and_outputs():
     first, second = read_steps(PAGE_TEXT)
-    assert first == Step("sh", "serve\n", "ready in 2.00 s\n", {"until": "ready", "slow": ""})
+    assert first == Step("sh", "serve\n", "ready in 2.00 s\n", {"until": "ready", "stop": ""})
     assert second == Step("python", "print(1)\n", None)
 
 

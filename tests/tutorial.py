@@ -9,7 +9,6 @@ before a step has options, separated by semicolons:
 * `until TEXT`: run in the background; the output ends with the first line that contains TEXT
 * `stop`: with `until`, then press Ctrl-C
 * `from TEXT`, `to TEXT`: show only the lines from the last one that begins with TEXT, and to the first one after it
-* `slow`: this step trains, or is needed only by steps that train
 * `words`: compare only the words of the output, because trainings amplify the differences between recordings
 
 Consecutive Python steps share their variables.
@@ -46,7 +45,7 @@ TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
 NUMBER = re.compile(r"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 OPTIONAL = (  # parts of lines that occur only if the machine is busy
     re.compile(r"; [a-z ]+(?:: [a-z ]+)? \(\d+, [\d.]+ s\)"),  # alarms
-    re.compile(r", skipped_\w+ \d+|; gap\w+ \d+"),
+    re.compile(r"[,;] (?:skipped_|gap)\w+ \d+"),
     re.compile(r"; \d+ touches left out: [^;\n]*"),
     re.compile(r", \d+ (?:without a no-load dwell before them|out of order)"),
 )
@@ -61,10 +60,6 @@ class Step:
     code: str
     output: str | None  # None: the page shows no output
     options: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def slow(self) -> bool:
-        return "slow" in self.options
 
 
 class Done(NamedTuple):
