@@ -1,5 +1,7 @@
 """Summarise the planned scenes: main scores, whether these equal the committed scores, and where to look next."""
 
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill
@@ -52,6 +54,11 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
     values = f"{sum(part.compared_n for part in parts.values()):,} numbers and table cells"
     if all(part.reproduced for part in parts.values()):
         if fresh.provenance == committed.provenance:
+            if _is_up_to_date(root, scene):
+                return [
+                    f"Scene {scene} is reproduced: all results from which its report is made equal those in dvc.lock, "
+                    f"so DVC kept the report {committed.where}, with {values}."
+                ]
             return [f"Scene {scene}: reports/{scene} is the report {committed.where}; it was not computed again."]
         return [f"Scene {scene} is reproduced: all {values} equal those {committed.where}."]
     return [
@@ -60,6 +67,13 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
         *_probable_reasons(committed.provenance, fresh.provenance),
         f"All differences: reskin compare {scene}",
     ]
+
+
+def _is_up_to_date(root: Path, scene: str) -> bool:
+    """Return whether DVC finds that the inputs and outputs of a scene's report are those that dvc.lock records."""
+    command = [sys.executable, "-m", "dvc", "status", "--json", f"report@{scene}"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    return done.returncode == 0 and done.stdout.strip() == "{}"
 
 
 def _differences(parts: Mapping[str, Comparison]) -> str:
