@@ -9,12 +9,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from pipeline import FLOW
 from pipeline.benchmark import entries
-from pipeline.report.figures import TESTED, unseen_boards
+from pipeline.report.figures import TESTED, readable, unseen_boards
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.paper import TABLE_2, TABLE_2_ROWS
@@ -236,7 +235,7 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
     stat = row[metric]
     if metric != "mse_f_N2":
         return stat
-    values = np.sqrt(stat["values"])
+    values = readable(metric, stat["values"])
     return {"mean": values.mean(), "values": values}
 
 
