@@ -461,14 +461,11 @@ class Publisher:
         the last step. Metrics that end in `_0_labels` are the scores without labels.
         """
         from pipeline.pyfunc import simulated_example
-        from pipeline.report.figures import TESTED
+        from pipeline.report.figures import boards_rows
 
         card = io.read_json(weights.with_suffix(".json"))
-        scores = io.read_json(tested).get("random_presses", {}).get("rows", []) if tested.exists() else []
-        of_this = [row for row in scores if (row["method"], row["tested"]) == (card["name"], TESTED)]
-        presses_n = max((row["presses_n"] for row in of_this), default=0)
-        by_labels = {int(row["labels"]): row for row in of_this
-                     if row["presses_n"] == presses_n and row["labels"].isdecimal()}  # fmt: skip
+        scores = boards_rows(io.read_json(tested) if tested.exists() else {}, [card["name"]])
+        by_labels = {int(row["labels"]): row for row in scores}
         rows = [
             (name, row[name]["mean"], labels_n)
             for labels_n, row in sorted(by_labels.items())
@@ -487,7 +484,7 @@ class Publisher:
             self.log(run_id, [*rows, (TRAIN_S, seconds, 0)], span, params=params, tags=about)
             self.end(run_id, span)
         tested_on = (
-            f"Scores on recorded boards of scene lab, calibrated to {presses_n} unlabelled presses and "
+            f"Scores on recorded boards of scene lab, calibrated to {scores[0]['presses_n']} unlabelled presses and "
             f"{max(by_labels)} labels; those without labels end in _0_labels."
             if by_labels
             else "Not tested here."

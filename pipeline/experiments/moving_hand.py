@@ -631,5 +631,5 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set(ylabel="within 1 mm / %", title=f"Places, {kind}", ylim=(0, 100))
         for axes in panels:
             axes.set(xlabel="external_uT / µT")
-            axes.legend(fontsize=7)
+            axes.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2))
         return {"moving_hand.svg": svg(figure)}

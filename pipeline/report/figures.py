@@ -4,7 +4,7 @@ Our scores are filled marks with thin bars and caps. The paper's scores are holl
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
@@ -159,15 +159,24 @@ def _spread(stat: Mapping[str, Any]) -> str:
     return "standard deviation over seeds" if "sd_seeds" in stat else "standard deviation" if "sd" in stat else "no bar"
 
 
-def boards_rows(numbers: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the scores on boards never seen in training, with the most presses, by model and number of labels."""
+def unseen_rows(numbers: Mapping[str, Any], models: Collection[str] = tuple(WAYS)) -> list[Mapping[str, Any]]:
+    """Return the scores of universal models on boards never seen in training, with the most unlabelled presses.
+
+    There is one row for each model and each number of labels, and one for a single press of known weight, where
+    `labels` is "weight".
+    """
     rows = [
         row
         for row in numbers.get("random_presses", {}).get("rows", ())
-        if row["method"] in WAYS and row["tested"] == TESTED and row["labels"].isdecimal()
+        if row["method"] in models and row["tested"] == TESTED
     ]
     most_n = max((row["presses_n"] for row in rows), default=0)
     return [row for row in rows if row["presses_n"] == most_n]
+
+
+def boards_rows(numbers: Mapping[str, Any], models: Collection[str] = tuple(WAYS)) -> list[Mapping[str, Any]]:
+    """Return the rows of `unseen_rows` that are for a number of labels."""
+    return [row for row in unseen_rows(numbers, models) if row["labels"].isdecimal()]
 
 
 def unseen_boards(

@@ -13,7 +13,7 @@ import pandas as pd
 
 from pipeline import FLOW
 from pipeline.benchmark import entries
-from pipeline.report.figures import TESTED, readable, unseen_boards
+from pipeline.report.figures import TESTED, readable, unseen_boards, unseen_rows
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.paper import TABLE_2, TABLE_2_ROWS
@@ -48,7 +48,7 @@ SIMULATED_MEANING = (
     "simulated, the paper's were recorded. An earlier simulation was tuned to row *Single-sensor*, so this row is not "
     "evidence. The paper does not state its forces, so MSE_F may not be comparable."
 )
-HALVES, PRESSES_N, UNIVERSAL = "other half of the skin", 65, "universal, "
+HALVES, UNIVERSAL = "other half of the skin", "universal, "
 TRAINED_ON = {
     "universal, boards of the rig": "simulation, other board of the rig",
     "universal, simulated alone": "simulation (the model that we ship)",
@@ -208,21 +208,18 @@ def _simulated(scenes: Sequence[Numbers]) -> str:
 
 def _recorded(numbers: Numbers) -> str:
     """Tabulate place and force scores of the universal model, by labels, on recorded boards never seen in training."""
-    rows = {
-        (row["method"], row["labels"]): row
-        for row in numbers["random_presses"]["rows"]
-        if row["tested"] == TESTED and row["presses_n"] == PRESSES_N
-    }
-    methods = list(dict.fromkeys(method for method, _ in rows if method.startswith(UNIVERSAL)))
+    unseen = unseen_rows(numbers, tuple(TRAINED_ON))
+    rows = {(row["method"], row["labels"]): row for row in unseen}
     lines = [
-        {"trained on": TRAINED_ON.get(method, method), "on new boards": title}
+        {"trained on": trained_on, "on new boards": title}
         | {name: _compact(_readable(rows.get((method, labels)), metric), digits) for labels, name in LABELS.items()}
-        for method in methods
+        for method, trained_on in TRAINED_ON.items()
+        if any(method == row["method"] for row in unseen)
         for metric, (title, digits) in RECORDED_METRICS.items()
     ]
     provenance = numbers["provenance"]
     meaning = RECORDED_MEANING.format(
-        scene=provenance["scene"], code=provenance["trained"], presses_n=PRESSES_N,
+        scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["presses_n"],
         draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
@@ -241,8 +238,7 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
 
 def _halves(numbers: Numbers) -> str:
     """State the accuracy on one half of the skin if all labels are on the other half."""
-    rows = [row for row in numbers["random_presses"]["rows"]
-            if (row["tested"], row["presses_n"], row["labels"]) == (HALVES, PRESSES_N, "40")]  # fmt: skip
+    rows = [row for row in numbers["random_presses"]["rows"] if (row["tested"], row["labels"]) == (HALVES, "40")]
     scores = [f"{row['accuracy_pct']['mean']:.0f} %" for row in rows if row["method"].startswith(UNIVERSAL)]
     return (
         f"If all 40 labels are on one half of the skin, the other half scores {' and '.join(scores)}." if scores else ""
