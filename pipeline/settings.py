@@ -111,7 +111,10 @@ class Settings:
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
-        """Parse a section of the scene's file, with the content of the shared rows that the section names."""
+        """Parse a section of the scene's file.
+
+        A section can name rows of `params.yaml`, for example a recipe. The content of these rows is inserted first.
+        """
         if (model, name) not in self.parsed:
             content, where = self[name], f"{self.where}: {name}"
             if issubclass(model, SectionWithRows):
@@ -126,8 +129,9 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Remove a key from a section; return the row in section `shared` of `params.yaml` that the key's value names.
+        """Return the row of `params.yaml` that a key of a scene's section names, and remove the key from the section.
 
+        The value of the key is the name of the row, and `shared` is the section of `params.yaml` that contains this row.
         If the key or the row is missing, raises `ParamsError`, whose message names `where` and the key.
         """
         name, rows = take(section, key, where), self.shared[shared]

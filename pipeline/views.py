@@ -9,7 +9,8 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")  # metrics of every training run, and of its stage's run
+# The metrics of each training run. The run of a stage has their means over the training runs of the stage.
+SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
 TRAIN_S = "train_s"
 TAG, NOTE = "mlflow.sharedViewState.", "mlflow.note.content"
 UI = "http://127.0.0.1:5000"  # where `mlflow ui` listens by default
@@ -18,7 +19,11 @@ WIDTHS = {"name": 170, "metric": 100, "other": 130}  # px; all scores fit on a p
 
 @dataclass(frozen=True)
 class View:
-    """A view: key in links, title, filter for the current runs that it lists, and columns beside the scores."""
+    """A saved view of the table of runs.
+
+    `key` identifies the view in links. `filter` is the condition that runs must meet to be listed; runs of
+    older results are never listed. `columns` are shown in addition to the columns of scores.
+    """
 
     key: str
     title: str
@@ -33,7 +38,9 @@ class View:
         name = _column("attributes", "Run Name")
         state = {
             "searchFilter": f"{self.filter} and tags.current = 'true'",
-            "orderByKey": _column("attributes", "Created"),  # by `attributes.start_time`, runs are hidden in stages
+            # Sorted by `attributes.start_time`, MLflow groups training runs under the runs of their stages and hides
+            # them until a user opens each group.
+            "orderByKey": _column("attributes", "Created"),
             "orderByAsc": False,
             "selectedColumns": columns,
             "columnOrder": [name, *columns],

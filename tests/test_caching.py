@@ -97,7 +97,7 @@ def test_edited_output_is_kept(root):
     assert (root / FOLDS).read_bytes() == b"by hand"
 
 
-def test_folder_whose_list_is_damaged_is_not_deleted(root):
+def test_folder_is_kept_if_its_list_of_files_is_damaged(root):
     name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     put_in_cache(root, name, b"[")
     assert f"It was moved to {cache.DAMAGED}/{name}. Run: dvc repro train_multi@one" in check(root)[1]

@@ -319,7 +319,11 @@ ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor times in s: of a calibration to a skin, and of one estimate among many readings in one call."""
+    """Processor times of a method, in s.
+
+    `train_s` is the time to calibrate the method to one skin. `one_reading_s` is the time of one estimate. To measure
+    it, many readings are estimated in one call, and the time of the call is divided by the number of readings.
+    """
 
     name: str
     train_s: float

@@ -29,8 +29,9 @@ INTERVAL = (
     "skins and networks. With fewer than four boards there is no interval, and (a; b) are the values of the boards."
 )
 SPREAD = (
-    f"{INTERVAL} ± is a standard deviation. For one skin, it is over n repeats. For one skin tested on others, it is "
-    "over n pairs of a training skin and a test skin. If marked (seeds), it is over network seeds."
+    f"{INTERVAL} ± is a standard deviation. If networks are tested on the skin on which they were trained, it "
+    "is over n repeats of the split. If they are tested on other skins, it is over n pairs of a training skin and a "
+    "test skin. If marked (seeds), it is over network seeds."
 )
 SHORT = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",

@@ -366,7 +366,7 @@ def measure(file: str, svg: str, id: str) -> Drawing:
 
 
 def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
-    """Add the sentence about each figure to the figure, if there is a sentence for its name."""
+    """Add to each drawing the sentence that tells readers what to see in it, if `by_name` has one for its name."""
     return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
 
 

@@ -44,7 +44,7 @@ Rows = Sequence[Mapping[str, Any]]
 SPLITS = {
     "single_random": "random readings held out (as in the paper: an indentation has readings in training and test)",
     "single_indentation": "random indentations held out (an indentation is never split between training and test)",
-    "single_pass": "random passes held out (each pass visits every place and depth again)",
+    "single_pass": "random passes held out (each pass presses all places to all depths)",
     "single_temporal": "trained on the first passes, tested on the last",
 }
 UNCERTAINTY = {
@@ -56,10 +56,12 @@ BEFORE_TOUCH = {
     "scan": "only the number of the indentation in its pass",
 }
 BEFORE_TOUCH_MEANING = (
-    'Rows "position from only ...": the 2 nearest training rows predict the position without the field change. The '
-    "row with the number of the indentation shows how exactly the rig repeats its order of places; no network receives "
-    "this number. The row with the no-load reading shows how much the skin's memory of earlier indentations reveals "
-    "about that order. A network may use this memory, because it is part of the field change."
+    'The rows "position from only ..." show how well the position can be guessed without touching the skin. They do '
+    "not use the field change, but only the stated quantity; the position is the mean position of the two training "
+    "readings whose value of this quantity is most similar. The row with the number of the indentation shows how "
+    "exactly the rig repeats its order of places. No network receives this number. The row with the no-load reading "
+    "shows how much the remaining field of earlier indentations reveals about this order. A network may use this "
+    "remaining field, because it is part of the field change."
 )
 SEEN_TIP = (
     "Some scores are not comparable with the paper's numbers and are not evidence of touch: the position of a tip that "

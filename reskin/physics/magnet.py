@@ -71,9 +71,9 @@ def array_field(
 ) -> Float[np.ndarray, "s 3"]:
     """Return the field in T of the magnetising array at nodes inside the skin.
 
-    The array has `cubes_n` cubes (along x, along y) below the skin and the same number above. Adjacent cubes have
-    common corners. The field of each corner is therefore computed once, with the sum of the signs of its cubes as the
-    weight.
+    The array has `cubes_n` cubes (along x, along y) below the skin and the same number above. The field of a cube is a
+    sum of eight terms, one for each of its corners. Adjacent cubes share corners. Therefore, the term of each corner is
+    computed once, and multiplied by the sum of the signs of the cubes that share the corner.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"

@@ -799,7 +799,12 @@ class Universal:
         return [replace(estimate, place_mm=estimate.place_mm + self._centre_mm) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
-        """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
+        """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses.
+
+        A likelihood power is the exponent to which the likelihoods of map and networks are raised. The variance
+        inflation is the factor by which the variances of the places must be multiplied to match the errors of the
+        labelled presses that were held out.
+        """
         folds = [
             ([fold.evaluation.combined(power) for power in powers], fold.labels.place_mm) for fold in self._held_out()
         ]
@@ -811,18 +816,23 @@ class Universal:
         return self._folds
 
     def save(self, file: Path | str) -> None:
-        """Write this skin's calibration data to a file for `load_universal(file)`; raise SchemaError before `zero`."""
+        """Write this skin's calibration data to a file; `load_universal(file)` restores the calibrated model from it.
+
+        Raises SchemaError if `zero` was not called before, because the model then has no no-load reading.
+        """
         if self._noload_uT is None:
             raise SchemaError("save: the model has no no-load reading. First call zero.")
         write_calibration(self._data, Path(file), self.layout.name)
 
     def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
-        """Write the estimate of this skin as an ONNX file, for programs without Python (docs/robots.md).
+        """Write the calibrated model as an ONNX file, so that programs without Python can use it (docs/robots.md).
 
-        Input `db_uT` has field changes since the no-load reading, along the chips' axes [f, ch], in double precision.
-        Outputs are the attributes of `estimate`, `change_uT` (|dB|) and, if `quiet_uT` is given, `contact`. quiet_uT:
-        readings without contact; their noise determines the threshold of contact, as in `reskin.open`. Requires the
-        package onnx; raises SchemaError before `zero`.
+        The input `db_uT` contains changes of the field since the no-load reading, along the axes of the chips, with
+        shape [f, ch] and in double precision. There is one output for each attribute of an `Estimate`, and the output
+        `change_uT`, which is the magnitude of the change, |dB|. If `quiet_uT` is given, there is also the output
+        `contact`. quiet_uT: readings without contact. Their noise determines the threshold above which a reading
+        counts as contact, as in `reskin.open`. This method requires the package onnx. It raises SchemaError if `zero`
+        was not called before.
         """
         from reskin.universal import export
 

@@ -88,7 +88,7 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
     return row.error
 
 
-def test_skin_with_nodes_of_a_quadrature_equals_the_drawn_skin():
+def test_skin_built_with_a_quadrature_equals_the_simulated_skin():
     even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))

@@ -253,10 +253,15 @@ def test_rbf_draws_rows_at_random():
 
 
 def test_rbf_keeps_rows_of_greater_weight():
-    """The inputs of rows of greater weight are far from all others, so predictions there depend only on these rows."""
+    """Only a subset of the training rows is kept, but every row with a greater weight must be in it.
+
+    Five of the 300 rows have a greater weight. Their inputs are far from those of all other rows, so a prediction at
+    one of these inputs depends on this row alone.
+    """
     db_uT, target = rows(n=300)
     db_uT[:5] += 1e5 * np.arange(1, 6)[:, None]
-    weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)  # together, half the weight of the others
+    # The five rows together have the weight 5 * 59 = 295, the same as the 295 other rows together.
+    weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)
     found = fit_to("rbf_ridge", db_uT, target, weight, gamma=300.0, rows_max_n=64).predict(db_uT[:5])
     lowered = 59 * 59 / 295  # 59 of the 295 other rows are kept, each standing for five
     mean = target.mean(axis=0, dtype=float)

@@ -118,7 +118,7 @@ def test_boards_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
     assert apart_mm.min(initial=pitch_mm) == pytest.approx(pitch_mm)
 
 
-def test_single_tile_is_the_board():
+def test_array_of_one_board_equals_this_board():
     alone = {"columns_n": 1, "rows_n": 1, "pitch_mm": 25.4}
     assert same(
         draw_board(design(), spreads(), seed=1, name="b0"),
@@ -131,7 +131,7 @@ def test_too_many_chips_are_refused():
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_gaps_are_positive_and_tilt_and_bow_need_a_single_board():
+def test_drawn_gaps_are_positive():
     wide = spreads(board_gap=0.5, board_uneven=0.5)
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])

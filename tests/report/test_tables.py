@@ -83,7 +83,7 @@ def test_rows_before_touch_follow_the_row_of_their_split():
     assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15.0", "98.0"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
-    assert "without the field change" in table.attrs["meaning"]
+    assert "do not use the field change" in table.attrs["meaning"]
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 

@@ -25,7 +25,9 @@ STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic-errors", "-Werror"]
 PROGRAM = re.search(r"```c\n(.*?)```", (ROOT / "docs/robots.md").read_text(encoding="utf-8"), re.DOTALL)[1]
 NAMES = ("place_mm", "sd_mm", "force_N", "sd_log_N", "misfit")
 LABELS_N = {"unlabelled": 0, "few forces, moving, two networks": 3, "labels, turned": 6}
-EXACT = 1e-5  # in mm and N: single precision of Python, for presses and for readings without contact
+# Tolerance in mm and in N, for presses and for readings without contact. The model in Python computes in single
+# precision, so its estimates are no more exact than this.
+EXACT = 1e-5
 
 
 @cache
@@ -35,9 +37,10 @@ def whole() -> Universal:
 
 @cache
 def coarse(kind: str) -> Universal:
-    """Return a model with every third place of the lattice, which is quick to compile, calibrated to its own presses.
+    """Return a calibrated model whose lattice has only every third place, so that its C code compiles quickly.
 
-    The presses are those of the prior mean, each with another factor, so that the model's misfit is not zero.
+    The field changes of the calibration presses are the mean of the model's prior, each multiplied by a different
+    factor, so that the misfit of the model is not zero.
     """
     tables = whole().tables
     tables = replace(
