@@ -131,7 +131,7 @@ class Settings:
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
         """Return the row of `params.yaml` that a key of a scene's section names, and remove the key from the section.
 
-        The value of the key is the name of the row, and `shared` is the section of `params.yaml` that contains this row.
+        The value of the key is the name of the row, and `shared` is the section of `params.yaml` that contains it.
         If the key or the row is missing, raises `ParamsError`, whose message names `where` and the key.
         """
         name, rows = take(section, key, where), self.shared[shared]
