@@ -32,7 +32,7 @@ export PYTHONDONTWRITEBYTECODE =
 # Stages run `python`, which must be the one of this environment.
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
-.PHONY: repro test test-pythons test-processors compiled lint ui bench faults time-repro time-install readme constraints licences audit clean
+.PHONY: repro test test-pythons test-processors compiled collected lint ui bench faults time-repro time-install readme constraints licences audit clean
 .PHONY: team-server teams cluster-test
 .DEFAULT_GOAL := repro
 
@@ -50,7 +50,7 @@ repro: $(STAMP)
 
 # Three workers, for two cores or more: tests of live boards mostly wait.
 test: $(STAMP)
-	@$(MAKE) --no-print-directory --jobs=2 lint compiled
+	@$(MAKE) --no-print-directory --jobs=2 lint compiled collected
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 test-pythons:
@@ -66,6 +66,10 @@ test-processors: $(STAMP)
 
 compiled: $(STAMP)
 	$(BIN)/python -m tests.compiled
+
+# Imports all tests once, so that their bytecode exists before the workers of `make test` import them at the same time.
+collected: $(STAMP)
+	@output=$$($(BIN)/python -m pytest -q --collect-only -p no:xdist) || { echo "$$output" | tail -40; exit 1; }
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

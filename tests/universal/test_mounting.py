@@ -1,6 +1,6 @@
 """Tests of how the orientation of a skin and of its labels is found."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -17,22 +17,28 @@ from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Estimate, OFFSET_uT
 from reskin.universal.model import Universal, load_universal
 from reskin.universal.mounting import LABELS_MIN_N, LOG_ODDS_MIN, find_label_frame, find_mounting, frames
-from reskin.universal.population import draw_population
+from reskin.universal.population import Population, draw_population
 from tests.universal.skins import SETUP
 
 TABLES = load_universal().tables
-SKINS = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, 20, rng_for(0, "mounted"))
+SKINS_N = 20
 PLACES_MM = np.array([[5.0, 1.0], [-2.0, 6.0], [-4.0, -3.0], [1.0, -5.0]])
+
+
+@cache
+def skins() -> Population:
+    """Draw simulated skins; not at import, because every worker imports all tests."""
+    return draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, SKINS_N, rng_for(0, "mounted"))
 
 
 def skin(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return a simulated skin's no-load reading and readings in contact, along the chips' axes, places and forces."""
-    rest_uT, db_uT = to_chips(SKINS.rest_uT[i : i + 1]), to_chips(SKINS.db_uT[i])
-    return rest_uT, rest_uT + db_uT, SKINS.place_mm[i] + 8.0, np.asarray(SKINS.force_N[i], float)
+    rest_uT, db_uT = to_chips(skins().rest_uT[i : i + 1]), to_chips(skins().db_uT[i])
+    return rest_uT, rest_uT + db_uT, skins().place_mm[i] + 8.0, np.asarray(skins().force_N[i], float)
 
 
 def test_log_odds_equal_the_ratio_of_densities():
-    rest_uT = SKINS.rest_uT[0].astype(float)
+    rest_uT = skins().rest_uT[0].astype(float)
     cov = TABLES.rest_slope_uT @ TABLES.rest_slope_uT.T + OFFSET_uT**2 * np.eye(15)
     log_p, log_p_turned = (multivariate_normal.logpdf(sign * rest_uT, TABLES.rest_uT, cov) for sign in (1, -1))
     found = find_mounting(TABLES, rest_uT)
@@ -41,7 +47,7 @@ def test_log_odds_equal_the_ratio_of_densities():
 
 
 def test_orientation_of_all_simulated_skins_is_found():
-    for rest_uT in SKINS.rest_uT.astype(float):
+    for rest_uT in skins().rest_uT.astype(float):
         found, turned = find_mounting(TABLES, rest_uT), find_mounting(TABLES, -rest_uT)
         assert (found.turned, turned.turned) == (False, True)
         assert found.log_odds == pytest.approx(turned.log_odds)
@@ -76,7 +82,7 @@ def test_zero_field_is_reported_as_uncertain():
 
 
 def test_wrong_orientation_is_reported():
-    found = find_mounting(TABLES, SKINS.rest_uT[0].astype(float), turned=True)
+    found = find_mounting(TABLES, skins().rest_uT[0].astype(float), turned=True)
     assert found.turned
     assert found.log_odds < -LOG_ODDS_MIN
     assert "fits the other orientation better" in " ".join(found.warnings())
@@ -113,7 +119,7 @@ def test_each_no_load_reading_determines_the_orientation_unless_the_user_states_
 
 
 def test_weak_evidence_does_not_turn_a_skin():
-    weak_uT = -0.1 * SKINS.rest_uT[0].astype(float)
+    weak_uT = -0.1 * skins().rest_uT[0].astype(float)
     found = find_mounting(TABLES, weak_uT)
     assert 0 < -found.log_odds < LOG_ODDS_MIN  # the turned orientation is slightly more probable
     assert not found.turned
@@ -196,7 +202,7 @@ def test_frames_are_all_symmetries_of_a_square():
     assert (np.linalg.det(matrices) > 0).sum() == 4
 
 
-@given(st.integers(0, len(SKINS) - 1))
+@given(st.integers(0, SKINS_N - 1))
 def test_labels_as_given_raise_no_warning(i):
     rest_uT, b_uT, place_mm, force_N = skin(i)
     model = load_universal().zero(rest_uT).label(place_mm[:5], force_N[:5], b_uT[:5])
