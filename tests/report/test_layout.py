@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from pipeline.report.drawing import DARK, drawing, svg
+from pipeline.report.drawing import DARK, EXACT, drawing, svg
 from pipeline.report.layout import LEGIBLE_PT, WIDTH_IN, lay_out
 
 TITLE = "a title of a figure that is much longer than the width of a phone allows without a line break"
@@ -90,9 +90,11 @@ def test_logarithmic_axes_have_readable_numbers(limits, shown):
     assert shown <= texts
 
 
-def test_figures_have_colours_for_dark_mode():
+def test_figures_have_styles_for_dark_mode_and_small_screens():
     with drawing(4.0, 3.0) as figure:
         figure.subplots()
         text = svg(figure)
-    assert DARK in re.search(r"<style[^>]*>(.*?)</style>", text, re.DOTALL)[1]
+    style = re.search(r"<style[^>]*>(.*?)</style>", text, re.DOTALL)[1]
+    assert DARK in style
+    assert EXACT in style
     ET.fromstring(text)
