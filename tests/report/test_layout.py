@@ -55,6 +55,16 @@ def test_texts_are_inside_the_figure_and_legible():
     assert min(sizes) >= LEGIBLE_PT
 
 
+def test_labels_of_y_axes_are_no_longer_than_their_panels():
+    def draw(figure):
+        for axes in figure.subplots(1, 2):
+            axes.set_ylabel("a mean of many values and their standard deviation / µT")
+
+    for axes in laid_out(draw).axes:
+        panel, label = axes.get_window_extent(), axes.yaxis.label.get_window_extent()
+        assert panel.y0 - 1 < label.y0 < label.y1 < panel.y1 + 1
+
+
 def test_figures_with_rows_and_columns_keep_them():
     figure = laid_out(lambda figure: figure.subplots(2, 2), width_in=8.0)
     assert figure.get_figwidth() == 8.0
