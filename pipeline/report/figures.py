@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, universal_rows
+from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 
 HEADLINE = "headline.svg"
@@ -122,7 +122,7 @@ def _draw_scores(axes: Any, metric: str, y: np.ndarray, rows: Rows, **look: Any)
     axes.errorbar(means, drawn_y, xerr=lengths, **look)
     for mean, length, row_y in zip(means, lengths[1], drawn_y, strict=True):
         beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.5}
-        shown = f"{mean:.2f}" if metric == "r2_f" else f"{mean:.2g}"
+        shown = f"{mean:.2f}" if metric == "r2_f" else two_digits(mean)
         axes.annotate(shown, (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
 
 
