@@ -139,7 +139,11 @@ class Entry:
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name."""
+    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name.
+
+    Tables without rows are not shown.
+    """
+    tables = {name: table for name, table in tables.items() if len(table)}
     source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
     drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
     drawings = describe(drawings, sentences(numbers))

@@ -12,6 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from pipeline.catalogue import experiment_files
 from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
@@ -287,6 +288,17 @@ def test_tables_without_a_section_are_shown_as_text(read):
     assert "<b>" in read.words  # shown as text, not interpreted as a tag
     assert "a & b" in read.words
     assert "Unheard of (simulated)" in read.words
+
+
+def test_table_without_rows_is_not_shown():
+    assert 'id="surprise-table"' in render(surprise=pd.DataFrame({"a": ["1"]}))
+    assert "surprise" not in render(surprise=pd.DataFrame({"a": []}))
+
+
+def test_what_experiments_found_is_before_checks_and_captures():
+    keys = [section.key for section in read_sections()]
+    experiments = [name for name, file in experiment_files().items() if file.section is not None]
+    assert all(keys.index(name) < keys.index("checks") for name in experiments)
 
 
 def test_missing_experiment_has_no_section():
