@@ -44,9 +44,10 @@ SOURCES = {
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# Places where no line break is allowed: between a number and its deviation, and between an interval and its unit.
+UNIT = r" (%|mm²|N²|mm|N|Hz|µT)(?!\w)"
+# Places where no line break is allowed: between a number and its deviation or unit, and in an interval with its unit.
 UNBROKEN = re.compile(
-    r"(?<=\d) ± (?=\d)|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?"
+    rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]({UNIT})?"
 )
 SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
@@ -290,7 +291,7 @@ def show_code(text: str) -> Markup:
 
 
 def unbroken(text: str) -> str:
-    """Use non-breaking spaces between a number and its deviation, and within an interval and its unit."""
+    """Use non-breaking spaces between a number and its deviation or unit, and within an interval and its unit."""
     if isinstance(text, Markup):
         return text
     return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)

@@ -186,7 +186,7 @@ def test_results_link_to_the_table_or_figure_that_shows_them():
     assert ours == [
         '<a href="#drift-findings">see the paper&#39;s findings about drift</a>',
         "see figure gone",
-        '<a href="#figure-5a">90 %</a>',
+        '<a href="#figure-5a">90\u00a0%</a>',
         '<a href="#figure-6b">see figure 6b</a>',
     ]
 
@@ -233,6 +233,7 @@ def test_figure_without_size_is_an_error():
         ("+1 [-0.358, 2.43] points", "+1 [-0.358,_2.43] points"),
         ("0.5 [1e-05, 2e+03] mm²; x", "0.5 [1e-05,_2e+03]_mm²; x"),
         ("a ± b, [low, high]", "a ± b, [low, high]"),
+        ("rms error 0.6 N, 78 % of 3 Names", "rms error 0.6_N, 78_% of 3 Names"),
     ],
 )
 def test_numbers_are_not_broken_across_lines(text, kept):
@@ -414,7 +415,7 @@ def test_index_describes_each_scene_and_answers_on_place_and_force():
     assert "<small>simulated</small>" in entry
     place, force = re.findall(r'<p class="line">(.*?)</p>', entry)
     assert "Place" in place
-    assert "within 1 mm" in place
+    assert "within 1\u00a0mm" in place
     assert "Force" in force
 
 
