@@ -43,12 +43,11 @@ SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
+RESULTS = ("table-2", "figure-")  # starts of the ids of the paper's tables and figures with results
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
 UNIT = r" (%|mm²|N²|mm|N|Hz|µT)(?!\w)"
 # Places where no line break is allowed: between a number and its deviation or unit, and in an interval with its unit.
-UNBROKEN = re.compile(
-    rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]({UNIT})?"
-)
+UNBROKEN = re.compile(rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]({UNIT})?")
 SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
@@ -129,7 +128,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes: name, description, counts of captures, answers and headline figure."""
+    """A scene on the page of all scenes: name, description, counts of captures, answers, headline figure, and those
+    tables and figures of the paper with results that its page shows.
+    """
 
     scene: str
     about: str
@@ -137,6 +138,7 @@ class Entry:
     answers: Answers
     efforts: Table | None
     figure: Drawing | None
+    places: list[dict[str, Any]]
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
@@ -234,16 +236,19 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
 
 
 def index(
-    results: Sequence[Mapping[str, Any]], headlines: Mapping[str, str], described: Mapping[str, str] | None = None
+    results: Sequence[Mapping[str, Any]],
+    headlines: Mapping[str, str],
+    described: Mapping[str, str] | None = None,
+    shown: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
     """Render the page of all scenes, with recorded scenes first.
 
-    headlines: headline figures by scene. described: descriptions by scene.
+    headlines: headline figures by scene. described: descriptions by scene. shown: names of tables and figures by scene.
     """
     kinds = []
     for source, title in KINDS.items():
         entries = [
-            _entry(numbers, headlines, described or {})
+            _entry(numbers, headlines, described or {}, shown or {})
             for numbers in results
             if numbers["provenance"]["source"] == source
         ]
@@ -253,13 +258,21 @@ def index(
     return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
 
 
-def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str], described: Mapping[str, str]) -> Entry:
+def _entry(
+    numbers: Mapping[str, Any],
+    headlines: Mapping[str, str],
+    described: Mapping[str, str],
+    shown: Mapping[str, Sequence[str]],
+) -> Entry:
     scene, answered = str(numbers["provenance"]["scene"]), answers(numbers)
     figure = None
     if scene in headlines:
         figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene], f"{scene}-figure")
     efforts = efforts_table(f"efforts-{scene}", answered)
-    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure)
+    ids = ids_of(shown.get(scene, ()))
+    places = [place_on_page(place, ids) for place in read_places() if place.id.startswith(RESULTS)]
+    here = [place for place in places if place["here"]]
+    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure, here)
 
 
 def about_scene(text: str) -> str:

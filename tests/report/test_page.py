@@ -419,6 +419,15 @@ def test_index_describes_each_scene_and_answers_on_place_and_force():
     assert "Force" in force
 
 
+def test_index_links_to_tables_and_figures_of_the_paper():
+    shown = {"here": ["table1", "table2", "sweep_pokes.svg", "labels.svg"], "there": ["labels"]}
+    text = index([scene_numbers("here", "simulated"), scene_numbers("there", "simulated")], {}, {}, shown)
+    assert re.findall(r'href="(\w+/index.html#[^"]+)"', text) == [
+        "here/index.html#table-2",
+        "here/index.html#figure-6a",
+    ]
+
+
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
 def test_first_sentence_of_every_scene_describes_the_scene(file):
     about = about_scene(file.read_text(encoding="utf-8"))
