@@ -20,7 +20,7 @@ from scipy.constants import micro
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, show, tabulate
+from pipeline.report.formatting import COLUMNS, show, show_difference, tabulate
 from pipeline.report.paper import FIGURE_5
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import (
@@ -837,8 +837,9 @@ def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]],
         axes.plot(limits, limits, color="0.5", linewidth=1, linestyle="--", label="predicted = true")
         axes.scatter(points["true_N"], points["predicted_N"], s=9, color=COLOURS[1], alpha=0.5, linewidths=0)
         axes.set(xlabel="true force / N", ylabel="predicted force / N", xlim=limits, ylim=limits, aspect="equal")
+        bias = {"mean": late["bias_N"], "n": late["indentations_n"], "sd": late["bias_se_N"]}
         text = (
-            f"bias {late['bias_N']:+.3g} ± {late['bias_se_N']:.1g} N ({late['bias_pct']:+.2g} %)\n"
+            f"bias {show_difference(bias)} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
             f"no-load reading: {name}\n"
             f"mean of {len(late['network_bias_N'])} networks; points: the first"

@@ -496,8 +496,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the percentage of readings with an error above 1 mm against the number of simulated training skins."""
+    """Draw the percentage of readings with an error above 1 mm against the number of simulated training skins.
+
+    A scene with a single number of training skins has no figure.
+    """
     rows = pd.DataFrame(numbers["scaling"])
+    if rows["skins_n"].nunique() == 1:
+        return {}
     with drawing(6.0, 3.8) as figure:
         axes = figure.subplots()
         for i, way in enumerate(("network", "universal")):

@@ -228,7 +228,7 @@ def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
-    with _panels(places, title, "field minus that of the first visit / µT") as (figure, panels):
+    with _panels(places, title, "field minus first visit / µT") as (figure, panels):
         # The upper 15 % of the colour map are left out, because yellow is hard to see on white.
         colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
         scale = mpl.colors.Normalize(0, most_n)

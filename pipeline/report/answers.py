@@ -10,7 +10,16 @@ from statistics import fmean
 from typing import Any
 
 from pipeline.report.figures import WAYS, boards_rows
-from pipeline.report.formatting import Results, Stat, models, show, show_with_unit, three_digits, universal_rows
+from pipeline.report.formatting import (
+    Results,
+    Stat,
+    models,
+    show,
+    show_with_unit,
+    three_digits,
+    two_digits,
+    universal_rows,
+)
 from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
 
 PLACE, FORCE = "place", "force"
@@ -253,9 +262,9 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         shown = show_with_unit(rms(other.scores["mse_f_N2"]), "N")
         sentences.append(f"{_named(other)}: {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
         second = sentences[-1] if other.role == SECOND else second
-    short = f"rms error {error['mean']:.2g} N"
+    short = f"rms error {two_digits(error['mean'])} N"
     if constant and (guessing := rms(constant["mse_f_N2"])):
-        short += f", against {guessing['mean']:.2g} N for always guessing the mean force"
+        short += f", against {two_digits(guessing['mean'])} N for always guessing the mean force"
     if force_level(explained) == NO:
         short = f"not usable; {short}"
     return Answer(FORCE, force_level(explained), short, tuple(sentences), second)
@@ -276,7 +285,7 @@ def _forces(numbers: Results) -> list[str]:
     if not {"force_median_N", "force_max_N"} <= over_skins.keys():
         return []
     median_N, max_N = over_skins["force_median_N"]["mean"], over_skins["force_max_N"]["most"]
-    return [f"Tested forces: median {median_N:.2g} N, up to {max_N:.2g} N."]
+    return [f"Tested forces: median {two_digits(median_N)} N, up to {two_digits(max_N)} N."]
 
 
 def _within_skin(numbers: Results) -> Answers:
@@ -294,7 +303,7 @@ def _within_skin(numbers: Results) -> Answers:
         magnetic = ", but the tip is sensed without touch too" if seen else ""
         places.append(f"{named}{three_digits(scores['accuracy_pct'])} % within 1 mm{magnetic}")
         if "mse_f_N2" in scores:
-            forces.append(f"{named}rms error {sqrt(scores['mse_f_N2']):.2g} N, R² {scores['r2_f']:.3f}")
+            forces.append(f"{named}rms error {two_digits(sqrt(scores['mse_f_N2']))} N, R² {scores['r2_f']:.3f}")
     return Answers(
         tested,
         Answer(PLACE, UNTESTED, NONE_HELD_OUT, (f"{own}: {'; '.join(places)}.",)),

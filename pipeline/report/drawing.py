@@ -29,6 +29,8 @@ DIGITS_BEYOND_2 = re.compile(r"(?<=\.\d\d)\d+")
 SVG_DPI = 72  # the unit of the file is the point, 1/72 inch
 # In dark mode, lightness is inverted and hues are kept. White becomes the colour of the page in dark mode.
 DARK = "@media screen and (prefers-color-scheme: dark) {svg {filter: invert(0.91) hue-rotate(180deg)}}"
+# Otherwise browsers may round the widths of letters to pixels; texts are then too wide in a small figure, and are cut.
+EXACT = "text {text-rendering: geometricPrecision}"
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
@@ -167,4 +169,4 @@ def svg(figure: Any, *, column: bool = True) -> str:
     # For formulas, Matplotlib writes only one font family. The other families are added, because browsers without this
     # family could use a serif font.
     text = text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\"")
-    return put_titles(text.replace("</style>", f"{DARK}</style>", 1), titles)
+    return put_titles(text.replace("</style>", f"{DARK}{EXACT}</style>", 1), titles)

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, universal_rows
+from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 
 HEADLINE = "headline.svg"
@@ -90,7 +90,10 @@ def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str
     table_rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
     rows = table_rows + universal_rows(numbers)  # the paper's rows first, in its order
     y = np.arange(len(rows))[::-1].astype(float)
-    with drawing(4.7, 1.2 + 0.5 * len(rows) * len(metrics)) as figure:
+    # Non-breaking spaces keep "n = 6" on one line.
+    names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]
+    row_in = max(0.5, 0.19 * max(name.count("\n") + 1 for name in names))  # so that neighbouring names do not touch
+    with drawing(4.7, 1.2 + row_in * len(rows) * len(metrics)) as figure:
         for axes, metric in zip(figure.subplots(len(metrics), 1, squeeze=False)[:, 0], metrics, strict=True):
             paper = [
                 {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))} if metric in model.paper else {}
@@ -100,8 +103,6 @@ def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str
             _draw_scores(axes, metric, y + OFFSET, [row for _, row in rows], label=name, **_look(1))
             _draw_scores(axes, metric, y - OFFSET, paper, label=PAPER_NAME, **PAPER)
             _limit(axes, metric)
-            # Non-breaking spaces keep "n = 6" on one line.
-            names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]
             axes.set_yticks(y, names, fontsize=8.5)
             axes.set_ylim(-0.6, len(rows) - 0.4)
         _finish(figure, f"Scores on held-out boards (scene {numbers['provenance']['scene']}, {source})")
@@ -122,7 +123,7 @@ def _draw_scores(axes: Any, metric: str, y: np.ndarray, rows: Rows, **look: Any)
     axes.errorbar(means, drawn_y, xerr=lengths, **look)
     for mean, length, row_y in zip(means, lengths[1], drawn_y, strict=True):
         beside = {"xytext": (5, 0), "textcoords": "offset points", "va": "center", "fontsize": 8.5}
-        shown = f"{mean:.2f}" if metric == "r2_f" else f"{mean:.2g}"
+        shown = f"{mean:.2f}" if metric == "r2_f" else two_digits(mean)
         axes.annotate(shown, (mean + length, row_y), color=look["color"], annotation_clip=True, **beside)
 
 

@@ -165,6 +165,15 @@ def three_digits(value: float) -> str:
     return f"{value:.4g}" if abs(value) >= 100 else f"{value:.3g}"
 
 
+def two_digits(value: float) -> str:
+    """Write a number with two significant digits, also if the last one is 0, and without an exponent if it is large.
+
+    >>> [two_digits(value) for value in (0.6, 1.234, 47.4, 99.7)]
+    ['0.60', '1.2', '47', '100']
+    """
+    return f"{value:.0f}" if abs(value) >= 9.95 else f"{value:#.2g}"
+
+
 def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[str, str]:
     """Write every metric of a row as text; return the cells by column title."""
     return {title: show(row.get(metric)) for metric, title in titles.items()}

@@ -136,7 +136,7 @@ def _texts(figure: Any) -> Iterator[tuple[Any, float]]:
         yield axes.title, figure.bbox.width - left
         yield axes.xaxis.label, figure.bbox.width - left
         if axes.get_subplotspec() is not None:
-            yield axes.yaxis.label, axes.get_window_extent().height * 1.2
+            yield axes.yaxis.label, axes.get_window_extent().height
 
 
 def _break_lines(text: Any, width: float) -> None:

@@ -35,7 +35,7 @@ SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
 SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
 # Tables that are unfolded when the page loads; all other tables are folded.
-OPEN = {"table1", "table2", "labels", "claims", "final_model"}
+OPEN = {"table1", "table2", "claims", "final_model"}
 WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist lists all
 EFFORTS = "Scores on new skins, by model and by what the model needs of the new skin"
@@ -43,11 +43,11 @@ SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
+RESULTS = ("table-2", "figure-")  # starts of the ids of the paper's tables and figures with results
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# Places where no line break is allowed: between a number and its deviation, and between an interval and its unit.
-UNBROKEN = re.compile(
-    r"(?<=\d) ± (?=\d)|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?"
-)
+UNIT = r" (%|mm²|N²|mm|N|Hz|µT)(?!\w)"
+# Places where no line break is allowed: between a number and its deviation or unit, and in an interval with its unit.
+UNBROKEN = re.compile(rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+)+\)|\[[-+\d.e]+, [-+\d.e]+\]({UNIT})?")
 SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
@@ -128,7 +128,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes: name, description, counts of captures, answers and headline figure."""
+    """A scene on the page of all scenes: name, description, counts of captures, answers, headline figure, and those
+    tables and figures of the paper with results that its page shows.
+    """
 
     scene: str
     about: str
@@ -136,10 +138,15 @@ class Entry:
     answers: Answers
     efforts: Table | None
     figure: Drawing | None
+    places: list[dict[str, Any]]
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name."""
+    """Render the page of a scene, which is equal for all repeats of a run; `figures` contains SVG text by file name.
+
+    Tables without rows are not shown.
+    """
+    tables = {name: table for name, table in tables.items() if len(table)}
     source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
     drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
     drawings = describe(drawings, sentences(numbers))
@@ -229,16 +236,19 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
 
 
 def index(
-    results: Sequence[Mapping[str, Any]], headlines: Mapping[str, str], described: Mapping[str, str] | None = None
+    results: Sequence[Mapping[str, Any]],
+    headlines: Mapping[str, str],
+    described: Mapping[str, str] | None = None,
+    shown: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
     """Render the page of all scenes, with recorded scenes first.
 
-    headlines: headline figures by scene. described: descriptions by scene.
+    headlines: headline figures by scene. described: descriptions by scene. shown: names of tables and figures by scene.
     """
     kinds = []
     for source, title in KINDS.items():
         entries = [
-            _entry(numbers, headlines, described or {})
+            _entry(numbers, headlines, described or {}, shown or {})
             for numbers in results
             if numbers["provenance"]["source"] == source
         ]
@@ -248,13 +258,21 @@ def index(
     return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
 
 
-def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str], described: Mapping[str, str]) -> Entry:
+def _entry(
+    numbers: Mapping[str, Any],
+    headlines: Mapping[str, str],
+    described: Mapping[str, str],
+    shown: Mapping[str, Sequence[str]],
+) -> Entry:
     scene, answered = str(numbers["provenance"]["scene"]), answers(numbers)
     figure = None
     if scene in headlines:
         figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene], f"{scene}-figure")
     efforts = efforts_table(f"efforts-{scene}", answered)
-    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure)
+    ids = ids_of(shown.get(scene, ()))
+    places = [place_on_page(place, ids) for place in read_places() if place.id.startswith(RESULTS)]
+    here = [place for place in places if place["here"]]
+    return Entry(scene, described.get(scene, ""), counts_of(numbers), answered, efforts, figure, here)
 
 
 def about_scene(text: str) -> str:
@@ -286,7 +304,7 @@ def show_code(text: str) -> Markup:
 
 
 def unbroken(text: str) -> str:
-    """Use non-breaking spaces between a number and its deviation, and within an interval and its unit."""
+    """Use non-breaking spaces between a number and its deviation or unit, and within an interval and its unit."""
     if isinstance(text, Markup):
         return text
     return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)

@@ -31,6 +31,7 @@ from pipeline.report.formatting import (
     show_with_unit,
     table_2_rows,
     tabulate,
+    three_digits,
     to_markdown,
     universal_rows,
 )
@@ -627,7 +628,7 @@ def measured(numbers: Numbers) -> dict[str, str]:
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
     cells = {}
     if rate := described["over_skins"].get("rate_hz"):
-        cells["Frequency"] = f"{rate['mean']:.4g} Hz" + ", a setting read back from the captures" * simulated
+        cells["Frequency"] = f"{three_digits(rate['mean'])} Hz" + ", a setting read back from the captures" * simulated
     if sleeve := numbers.get("sleeve"):
         area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
         cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated

@@ -187,8 +187,16 @@ def write_index(reports: Path) -> None:
     headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
     settings = (Path(SCENES) / f"{numbers['provenance']['scene']}.yaml" for numbers in results)
     about = {file.stem: about_scene(file.read_text(encoding="utf-8")) for file in settings if file.exists()}
-    shown = [numbers for numbers in results if "described" in numbers]
-    io.write_text(reports / "index.html", index(shown, headlines, about))
+    folders = [file.parent for file in reports.glob("*/numbers.json")]
+    shown = {
+        folder.name: [
+            *(file.stem for file in folder.glob("tables/*.csv")),
+            *(file.name for file in folder.glob("figures/*.svg")),
+        ]
+        for folder in folders
+    }
+    listed = [numbers for numbers in results if "described" in numbers]
+    io.write_text(reports / "index.html", index(listed, headlines, about, shown))
 
 
 def publish(settings: Settings, indentations: Path, models: Path, results: Path, reports: Path) -> None:

@@ -155,6 +155,8 @@ def test_tables_and_figure_list_every_method():
         "simulated skins that the network was trained on"
         in population.figures(numbers, {}, "simulated")["population_scaling.svg"]
     )
+    one = numbers | {"scaling": [row for row in numbers["scaling"] if row["skins_n"] == 3000]}
+    assert population.figures(one, {}, "simulated") == {}  # one number of skins shows no dependence
 
 
 def test_intervals_are_over_boards():

@@ -52,7 +52,7 @@ def test_answer_states_that_a_force_is_not_usable(r2, reached):
     force = answers(scene(over(80.0, 70.0, 90.0), r2)).force
     assert (force.level, force_level(r2)) == (reached, reached)
     assert ("not usable" in force.short) == (reached == NO)
-    assert "0.5 N" in force.short  # rms error
+    assert "rms error 0.50 N" in force.short
     assert "1.4 N" in force.short  # of the mean force
 
 

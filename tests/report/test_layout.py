@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from pipeline.report.drawing import DARK, drawing, svg
+from pipeline.report.drawing import DARK, EXACT, drawing, svg
 from pipeline.report.layout import LEGIBLE_PT, WIDTH_IN, lay_out
 
 TITLE = "a title of a figure that is much longer than the width of a phone allows without a line break"
@@ -55,6 +55,16 @@ def test_texts_are_inside_the_figure_and_legible():
     assert min(sizes) >= LEGIBLE_PT
 
 
+def test_labels_of_y_axes_are_no_longer_than_their_panels():
+    def draw(figure):
+        for axes in figure.subplots(1, 2):
+            axes.set_ylabel("a mean of many values and their standard deviation / µT")
+
+    for axes in laid_out(draw).axes:
+        panel, label = axes.get_window_extent(), axes.yaxis.label.get_window_extent()
+        assert panel.y0 - 1 < label.y0 < label.y1 < panel.y1 + 1
+
+
 def test_figures_with_rows_and_columns_keep_them():
     figure = laid_out(lambda figure: figure.subplots(2, 2), width_in=8.0)
     assert figure.get_figwidth() == 8.0
@@ -90,9 +100,11 @@ def test_logarithmic_axes_have_readable_numbers(limits, shown):
     assert shown <= texts
 
 
-def test_figures_have_colours_for_dark_mode():
+def test_figures_have_styles_for_dark_mode_and_small_screens():
     with drawing(4.0, 3.0) as figure:
         figure.subplots()
         text = svg(figure)
-    assert DARK in re.search(r"<style[^>]*>(.*?)</style>", text, re.DOTALL)[1]
+    style = re.search(r"<style[^>]*>(.*?)</style>", text, re.DOTALL)[1]
+    assert DARK in style
+    assert EXACT in style
     ET.fromstring(text)

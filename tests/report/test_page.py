@@ -12,6 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from pipeline.catalogue import experiment_files
 from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
@@ -185,7 +186,7 @@ def test_results_link_to_the_table_or_figure_that_shows_them():
     assert ours == [
         '<a href="#drift-findings">see the paper&#39;s findings about drift</a>',
         "see figure gone",
-        '<a href="#figure-5a">90 %</a>',
+        '<a href="#figure-5a">90\u00a0%</a>',
         '<a href="#figure-6b">see figure 6b</a>',
     ]
 
@@ -232,6 +233,7 @@ def test_figure_without_size_is_an_error():
         ("+1 [-0.358, 2.43] points", "+1 [-0.358,_2.43] points"),
         ("0.5 [1e-05, 2e+03] mm²; x", "0.5 [1e-05,_2e+03]_mm²; x"),
         ("a ± b, [low, high]", "a ± b, [low, high]"),
+        ("rms error 0.6 N, 78 % of 3 Names", "rms error 0.6_N, 78_% of 3 Names"),
     ],
 )
 def test_numbers_are_not_broken_across_lines(text, kept):
@@ -287,6 +289,17 @@ def test_tables_without_a_section_are_shown_as_text(read):
     assert "<b>" in read.words  # shown as text, not interpreted as a tag
     assert "a & b" in read.words
     assert "Unheard of (simulated)" in read.words
+
+
+def test_table_without_rows_is_not_shown():
+    assert 'id="surprise-table"' in render(surprise=pd.DataFrame({"a": ["1"]}))
+    assert "surprise" not in render(surprise=pd.DataFrame({"a": []}))
+
+
+def test_what_experiments_found_is_before_checks_and_captures():
+    keys = [section.key for section in read_sections()]
+    experiments = [name for name, file in experiment_files().items() if file.section is not None]
+    assert all(keys.index(name) < keys.index("checks") for name in experiments)
 
 
 def test_missing_experiment_has_no_section():
@@ -402,8 +415,17 @@ def test_index_describes_each_scene_and_answers_on_place_and_force():
     assert "<small>simulated</small>" in entry
     place, force = re.findall(r'<p class="line">(.*?)</p>', entry)
     assert "Place" in place
-    assert "within 1 mm" in place
+    assert "within 1\u00a0mm" in place
     assert "Force" in force
+
+
+def test_index_links_to_tables_and_figures_of_the_paper():
+    shown = {"here": ["table1", "table2", "sweep_pokes.svg", "labels.svg"], "there": ["labels"]}
+    text = index([scene_numbers("here", "simulated"), scene_numbers("there", "simulated")], {}, {}, shown)
+    assert re.findall(r'href="(\w+/index.html#[^"]+)"', text) == [
+        "here/index.html#table-2",
+        "here/index.html#figure-6a",
+    ]
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)

@@ -316,6 +316,8 @@ def test_simulated_settings_are_not_called_measured():
         numbers["sleeve"]["area_mm"] = [50.8, 101.6]
         cells = measured(numbers)
         assert cells["Frequency"] == rate
+        numbers["described"]["grid"]["over_skins"]["rate_hz"] = stat(9.2143)
+        assert measured(numbers)["Frequency"].startswith("9.21 Hz")
         assert cells["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
 
 

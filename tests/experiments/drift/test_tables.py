@@ -114,7 +114,7 @@ def test_figure_labels():
     for label in ("accuracy / %", "MSE_F / N²", "contacts of the skin before the test", "every 390 indentations"):
         assert label in words["drift.svg"]
     assert "bars: the standard deviation over 2 network seeds" in words["drift.svg"]
-    for label in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
+    for label in ("true force / N", "predicted force / N", "bias +0.01570 ± 0.00080 N (+1.3 %)", "45,000 contacts"):
         assert label in words["drift_force.svg"]
 
 
