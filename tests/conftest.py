@@ -4,6 +4,7 @@ import pipeline  # isort: skip  # noqa: F401  (must be first: `pipeline` sets va
 
 import gc
 import inspect
+import os
 from collections import Counter
 from dataclasses import is_dataclass
 from functools import partial, wraps
@@ -12,6 +13,7 @@ from typing import Any, get_args
 
 import jaxtyping
 import pytest
+from filelock import FileLock
 from hypothesis import HealthCheck, settings
 from jaxtyping import AbstractArray, jaxtyped
 
@@ -94,3 +96,19 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("needs the real recordings in ../shared/data, which are not part of the repository")
     return SHARED_DATA.resolve()
+
+
+@pytest.fixture(scope="session")
+def empty_store(tmp_path_factory) -> Path:
+    """Return an MLflow store without runs; tests copy this store, because creating a store takes seconds.
+
+    The first worker that needs the store creates it for all workers.
+    """
+    folder = tmp_path_factory.getbasetemp()
+    store = (folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "empty-mlflow.db"
+    with FileLock(f"{store}.lock"):
+        if not store.exists():
+            import mlflow
+
+            mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
+    return store

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -49,10 +50,11 @@ def publish_final(root: Path, key: str = "k0") -> Path:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
+def root(tmp_path_factory, empty_store) -> Path:
     """Return a folder whose MLflow store has the models of a scene and the universal model."""
     folder = tmp_path_factory.mktemp("models")
     os.environ.pop("MLFLOW_TRACKING_URI", None)
+    shutil.copy(empty_store, folder / "mlflow.db")
     publish_final(folder)
     return folder
 
@@ -89,7 +91,8 @@ def test_champion_of_a_scene_predicts_like_the_saved_model(client, root):
     assert run.data.metrics["mse_xy_mm2"] == 1.5
 
 
-def test_champion_moves_to_the_current_model(tmp_path, monkeypatch):
+def test_champion_moves_to_the_current_model(tmp_path, monkeypatch, empty_store):
+    shutil.copy(empty_store, tmp_path / "mlflow.db")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'mlflow.db'}")
     client = mlflow.MlflowClient()
 

@@ -20,14 +20,6 @@ from reskin import io
 from tests.stages.checkout import ROOT
 
 
-@pytest.fixture(scope="module")
-def empty_store(tmp_path_factory) -> Path:
-    """Return an MLflow store without runs; tests copy this store, because creating a store takes seconds."""
-    store = tmp_path_factory.mktemp("store") / "mlflow.db"
-    mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
-    return store
-
-
 @pytest.fixture(autouse=True)
 def _embedded(monkeypatch, tmp_path, empty_store):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)

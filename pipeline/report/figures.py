@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
+from pipeline.report.layout import WIDTH_IN
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
 
 HEADLINE = "headline.svg"
@@ -320,7 +321,7 @@ def error_grid(
     places, place_indices = np.unique(np.round(true_mm, 2), axis=0, return_inverse=True)
     distance_mm = np.linalg.norm(predicted_mm - true_mm, axis=1)
     mean_mm = np.bincount(place_indices.ravel(), distance_mm) / np.bincount(place_indices.ravel())
-    with drawing(5.2, 5.0) as figure:
+    with drawing(WIDTH_IN, 4.8) as figure:
         axes = figure.subplots()
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         size = float(np.clip(12_000 / len(places), 6, 170))

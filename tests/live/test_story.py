@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from contextlib import closing
 from pathlib import Path
 
@@ -72,10 +73,11 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     seal(folder, header)
 
 
-def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
+def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path, empty_store):
     script, log = make_poke_script()
     root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
     (root / "robot.csv").write_text(probe.render(log))
+    shutil.copy(empty_store, root / "mlflow.db")
     with (root / "pipeline/scenes/pressed.yaml").open("w") as stream:
         YAML().dump(SCENE, stream)
     plan.use(root, [])

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,8 +20,9 @@ pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
+def lab(tmp_path_factory, shared_data, empty_store) -> Iterator[Path]:
     root = copy_checkout(tmp_path_factory.mktemp("lab"))
+    shutil.copy(empty_store, root / "mlflow.db")
     scene = root / SCENES / "lab.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
