@@ -30,7 +30,7 @@ from reskin.universal.training import train as train_universal
 from tests.models.example_jobs import some_job, some_rows
 from tests.universal.skins import SETUP
 
-STEPS_N = 30
+STEPS_N = 10
 SCHEDULE = Schedule(steps_n=STEPS_N, batch_n=128, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.01)
 
 
