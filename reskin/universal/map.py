@@ -1,7 +1,21 @@
-"""The map: for each place and force on one skin, a Gaussian model of the reading, conditioned on the skin's data.
+"""The map: a probabilistic model of one skin.
 
-The prior consists of tables of simulated fields, linearised in the skin's parameters, and of a Gaussian process for the
-error of the law.
+For each place and force of a press, the map gives a normal distribution of the reading. To estimate the place and the
+force of a reading, Bayes' rule turns these distributions into the probability of each place and force.
+
+This module uses the following terms:
+
+- The law (`reskin.universal.law`) is a simulation that gives the field change of a press at any place with any force.
+  Its parameters, such as the gap between skin and chips, differ from skin to skin. The central law has the mean
+  parameters.
+- The error of the law is the difference between the field change of a skin and that of the law. It is given relative
+  to the size of the field change, |dB|. A Gaussian process describes how this error varies with place and force.
+- A hypothesis is a pair of a place and a force that a press may have.
+- The map is conditioned on data of a skin: each datum (no-load field, press at an unknown place, labelled press)
+  changes the distribution of the skin's parameters and of the error of the law.
+
+The prior of the parameters consists of tables of field changes of the central law, and of their derivatives with
+respect to the parameters.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +70,8 @@ STEP = 0.4  # step of the finite differences that give the slopes, in units of t
 class Tables:
     """Field changes and no-load field of the central law, and their derivatives with respect to the parameters.
 
-    Field changes are tabulated by place (in the board's frame) and force. Derivatives are per spread of a parameter.
+    Field changes are tabulated by place (in the board's frame) and force. A derivative is the change that is caused by
+    changing a parameter by its spread, which is its standard deviation over skins.
     """
 
     names: tuple[str, ...]
@@ -86,9 +101,10 @@ def lattice_mm(area: Area = PAPER_AREA) -> Float[np.ndarray, " a"]:
 def tabulate(
     centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
 ) -> Tables:
-    """Simulate presses at all places and forces, for the central law and for laws with one parameter slightly changed.
+    """Make the tables: simulate presses at all places and with all forces.
 
-    With the default forces, these are 4,356 presses per law, 70,000 in total; the simulation takes about 30 s.
+    The presses are simulated for the central law, and for each parameter with a law in which this parameter is slightly
+    changed. With the default forces, there are 4,356 presses for each law and 70,000 in total. This takes about 30 s.
     """
     axis_mm = lattice_mm(setup.area)
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -110,7 +126,11 @@ def tabulate(
 
 
 def mean_law(laws: list[Law]) -> Law:
-    """Return the prior mean for a new board of a rig: the mean of the fitted laws, with seat and rotation set to 0."""
+    """Return the central law for a new board of a rig, from the laws that were fitted to known boards of this rig.
+
+    Each parameter is the mean over the known boards, except the position (seat) and the rotation of the skin on the
+    board, which are 0.
+    """
     by_name = {name: np.array([asdict(law)[name] for law in laws]) for name in asdict(laws[0])}
     means = {
         name: float(np.exp(np.log(values).mean()) if name in LOGARITHMIC else values.mean())
@@ -129,20 +149,25 @@ Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
 # Length scales of the law's errors in place and in log force. The errors' correlation is 0.74 between places that are
 # 2 mm apart, and 0.2 between places that are 6 mm apart.
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
-NOISE = 0.1  # fraction of the errors' variance that differs between presses at the same place
-SHARED = 0.55  # fraction of the errors' variance that boards have in common
-EVEN = 0.5  # weight of an isotropic matrix in the covariance between channels, which a few boards determine poorly
+NOISE = 0.1  # fraction of the variance of the law's error that differs between presses at the same place
+SHARED = 0.55  # fraction of the variance of the law's error that is the same on all boards
+# A few boards are not enough to determine the covariance between channels. The covariance that is used is therefore a
+# weighted mean of the one of the boards and of an isotropic matrix. This is the weight of the isotropic matrix.
+EVEN = 0.5
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Gaussian process that predicts the law's relative errors on a new board from its errors on known boards."""
+    """Gaussian process that predicts the law's relative errors on a new board from its errors on known boards.
+
+    The known errors are those of m presses on boards with known parameters.
+    """
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
-    solved: Float[np.ndarray, "m ch"]  # inverse covariance of the known errors times these errors
+    solved: Float[np.ndarray, "m ch"]  # inverse of the covariance matrix of the known errors, times these errors
     channel_cov: Float[np.ndarray, "ch ch"]  # covariance between channels, with a trace of 1
-    noise: float  # part of the errors' variance that differs between presses at the same place, relative to the total
+    noise: float  # fraction of the variance of the error that differs between presses at the same place
 
     def at(self, place_mm: Float[np.ndarray, "n 2"], log_N: Float[np.ndarray, " n"]) -> Relative:
         """Return the law's expected relative errors for presses at these places with these log forces."""
@@ -150,7 +175,7 @@ class Residual:
 
 
 def no_residual(channels_n: int) -> Residual:
-    """Return the residual for the case without known boards: zero mean, and the same variance in all channels."""
+    """Return the residual if no board is known: its mean is zero, and its variance is the same in all channels."""
     empty = np.empty((0, 2)), np.empty(0), np.empty((0, channels_n))
     return Residual(*empty, np.eye(channels_n) / channels_n, noise=NOISE / 2)
 
@@ -186,13 +211,16 @@ def kernel(
     return np.exp(-distance_mm2 / (2 * LENGTH_MM**2) - distance_log2 / (2 * LENGTH_LOG_N**2))
 
 
-LAW_ERROR = 0.35  # relative rms error of the law before conditioning: norm over channels divided by |dB|
+LAW_ERROR = 0.35  # rms error of the law before conditioning: length of the error vector over channels, divided by |dB|
 NOISE_uT = 4.5  # standard deviation of a reading's noise, per channel
 
 
 @dataclass(frozen=True)
 class Information:
-    """Information about the parameters from one unlabelled press, under each hypothesis about its place and force."""
+    """What one unlabelled press tells about the parameters of the law, if a hypothesis about this press is true.
+
+    The inverse of the information matrix is the covariance of the parameters that this press alone would determine.
+    """
 
     matrix: Float32[np.ndarray, "h tt"]  # information matrix, flattened
     per_uT: Float32[np.ndarray, "h ch t"]  # information vector, per uT of a channel's deviation from its mean
@@ -202,8 +230,10 @@ class Information:
 class Hypotheses:
     """Hypotheses about a press: all pairs of a place and a force, each with its expected field change.
 
-    The force index varies fastest. residual: the law's expected relative error. error_cov: covariance of the relative
-    error between channels. external_cov: covariance of a reading's external field, or None if there is no such field.
+    The hypotheses are ordered by place and then by force. `mean_uT` and `slope_uT` are the field change of the central
+    law and its derivatives. `residual` is the expected relative error of the law, and `error_cov` the covariance of
+    this error between channels. `external_cov` is the covariance of an external field (for example the earth's field
+    on a moving robot) in a reading, or None if there is no such field.
     """
 
     place_mm: Float[np.ndarray, "p 2"]
@@ -234,7 +264,7 @@ class Hypotheses:
 
     @cached_property
     def information(self) -> Information:
-        """Information from an unlabelled press; the law's error (before conditioning) is treated as noise."""
+        """The information from an unlabelled press. The law's error (before conditioning) is treated as noise."""
         slope_uT, h = self.slope_uT.astype(float), len(self.mean_uT)
         squared_uT2 = (self.mean_uT.astype(float) ** 2).sum(axis=1)
         cov = squared_uT2[:, None, None] * self.error_cov + self.noise_cov
@@ -262,29 +292,38 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
     return Hypotheses(place_mm, log_N, mean_uT, slope_uT, expected, error_cov, external_cov)
 
 
-# How a skin slides under a press can change from day to day. SLIDE: the parameters that describe the slide; all other
-# parameters are constant. SLIDE_CORRELATION and ERROR_CORRELATION: correlations between two days if the slide has
-# changed, of each parameter of the slide and of the law's errors. Both were chosen on simulated skins
-# (tests/benchmarks/test_days_benchmark.py).
+# How a skin slides under a press can change from one day to the next. SLIDE lists the parameters that describe the
+# slide; all other parameters stay the same. If the slide has changed, SLIDE_CORRELATION is the correlation of each of
+# these parameters between the two days, and ERROR_CORRELATION that of the law's errors. Both values were chosen on
+# simulated skins (tests/benchmarks/test_days_benchmark.py).
 SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
-OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
-SHARE_MIN = 0.03  # smallest fraction of the law's error variance that remains, however many labels there are
-PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
+# Standard deviation of the difference between a no-load field and that of the law. It combines the offsets of the chips
+# (200 uT) and the error of the law (250 uT).
+OFFSET_uT = 320.0
+SHARE_MIN = 0.03  # however many labels there are, this fraction of the variance of the law's error always remains
+# Weight of an unlabelled press. It is below 1 because the law's errors at nearby places are correlated, so that many
+# presses contain less information than the same number of independent ones.
+PRESS_WEIGHT = 0.2
 ROUNDS_N = 3  # default number of rounds of expectation maximisation
 LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
-# Lattice on which the shift of presses onto the area is computed: width beyond the area, step, and largest shift.
+# `shift_onto_area` computes the density of presses on a lattice of places. The lattice extends beyond the area by the
+# first value, and its step is the second value. The third value is the largest shift.
 AREA_BEYOND_MM, AREA_STEP_MM, SHIFT_MAX_MM = 4.0, 0.2, 2.0
-DENSITY_MIN = 1e-3  # density far outside the area, relative to that inside; above 0, so that outliers are tolerated
-EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses about the centre of the labels' frame
+# Density of presses far outside the area, relative to the density inside. It is above 0, so that a few places outside
+# are possible.
+DENSITY_MIN = 1e-3
+# The mean place of evenly spread presses is close to the centre of the labels' frame, with this standard deviation.
+EVEN_MM = 0.15
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates for readings: places and forces with standard deviations, and misfit of the most likely hypothesis.
+    """Estimates for n readings: places and forces, each with its standard deviation, and the misfit.
 
-    sd_log_N: standard deviation of the logarithm of the force; NaN if forces are not calibrated.
+    The misfit shows how well the most likely hypothesis explains a reading. `sd_log_N` is the standard deviation of the
+    logarithm of the force; it is NaN if forces are not calibrated.
     """
 
     place_mm: Float[np.ndarray, "n 2"]
@@ -303,7 +342,10 @@ def concatenate(parts: Sequence[Estimate]) -> Estimate:
 
 @dataclass(frozen=True)
 class Likelihoods:
-    """Likelihood of each hypothesis for each reading."""
+    """Likelihood of each of h hypotheses for each of n readings.
+
+    `chi2` is the squared deviation of a reading from a hypothesis, relative to its covariance, summed over channels.
+    """
 
     chi2: Float32[np.ndarray, "n h"]
     deviance: Float32[np.ndarray, "n h"]  # -2 log likelihood, up to a constant
@@ -322,7 +364,7 @@ class Likelihoods:
 
 @dataclass(frozen=True)
 class LabelledErrors:
-    """Presses with known places and forces, and the Gaussian process of the law's errors given these presses."""
+    """Presses with known places and forces, and what they tell about the law's errors at other places and forces."""
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
@@ -333,11 +375,11 @@ class LabelledErrors:
 
 @dataclass(frozen=True)
 class SkinMap:
-    """Posterior distribution of one skin's parameters and of the law's errors on this skin.
+    """The map of one skin: the distribution of its parameters and of the law's errors on this skin.
 
-    mean, cov: mean and covariance of the parameters' deviations from the central law, in units of their spreads. The
-    parameters of the current day come first. The parameters of the slide on earlier days follow, latest day first (see
-    `begin_day`).
+    `mean` and `cov` are the mean and the covariance of the parameters, given as deviations from the central law in
+    units of their spreads. The parameters of the current day come first. They are followed by the parameters of the
+    slide on earlier days, beginning with the latest day (see `begin_day`).
     """
 
     tables: Tables
@@ -367,7 +409,11 @@ class SkinMap:
 
 
 class MapEvaluator:
-    """A map prepared for the evaluation of readings: the whitened Gaussians of all hypotheses."""
+    """A map that is prepared for the evaluation of readings.
+
+    It stores the normal distributions of all hypotheses in a form in which the likelihood of a reading is a product of
+    matrices (`reskin.universal.kernels`).
+    """
 
     def __init__(self, skin: SkinMap) -> None:
         self._hypotheses = skin.hypotheses
@@ -383,9 +429,10 @@ class MapEvaluator:
             raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
-        """Return, for each hypothesis, the law's expected relative error, and the remaining fraction of its variance.
+        """Return, for each hypothesis, the expected relative error of the law and how uncertain it still is.
 
-        This fraction remains after conditioning on the labels; without labels, it is 1.
+        The uncertainty is the fraction of the variance of the error that remains after conditioning on the labels.
+        Without labels, it is 1.
         """
         expected, labelled = skin.hypotheses.residual, skin.labelled
         if labelled is None:
@@ -422,11 +469,11 @@ class MapEvaluator:
 def new_map(
     tables: Tables, residual: Residual | None = None, external_cov: Float[np.ndarray, "ch ch"] | None = None
 ) -> SkinMap:
-    """Return the prior map.
+    """Return the map of a skin about which nothing is known yet.
 
-    residual: predicts the law's errors from its errors on other boards of the rig. external_cov: covariance of an
-    unknown external field that each reading may contain; if it is None, readings are assumed to contain only the field
-    change of the press and noise.
+    If a `residual` is given, it predicts the law's errors from its errors on other boards of the rig. `external_cov` is
+    the covariance of an unknown external field that each reading may contain. If it is None, readings are assumed to
+    contain only the field change of the press and noise.
     """
     t, expected = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
     return SkinMap(tables, expected, lattice(tables, expected, external_cov), np.zeros(t), np.eye(t))
@@ -475,10 +522,10 @@ def move_places(skin: SkinMap, by_mm: Float[np.ndarray, "2"]) -> SkinMap:
 
 
 def shift_onto_area(estimate: Estimate, sd_mm: float, area: Area = PAPER_AREA) -> Float[np.ndarray, "2"]:
-    """Return the shift that moves estimated places of presses onto the area, as a posterior mean.
+    """Return the shift that moves the estimated places of presses onto the area where the skin was pressed.
 
-    The true places are assumed to be uniformly distributed over the area. sd_mm: standard deviation of the shift's
-    prior, a normal distribution with mean zero.
+    The true places are assumed to be uniformly distributed over the area. The prior of the shift is a normal
+    distribution with mean zero and standard deviation `sd_mm`. The result is the mean of the posterior.
     """
     reach_mm = float(area.half_mm.max()) + AREA_BEYOND_MM
     axis_mm = np.arange(-reach_mm, reach_mm + AREA_STEP_MM / 2, AREA_STEP_MM)
@@ -611,10 +658,10 @@ def interpolate(
 def expected_gain(
     skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.ndarray, " c"]
 ) -> Float[np.ndarray, " c"]:
-    """Return how much a labelled press at each place would reduce the variance of the field changes over the skin.
+    """Return how much one more labelled press at each place would reduce the uncertainty about the whole skin.
 
-    The variance is that of field changes divided by |dB|, given earlier labels. This variance is summed over channels
-    and averaged over all places of the map, for presses with the median of the tabulated forces.
+    The uncertainty is the variance of the relative field changes that remains with the labels so far. It is summed over
+    channels and averaged over all places of the map, for presses with the median of the tabulated forces.
     """
     hypotheses, error_cov, gains = skin.hypotheses, skin.error_cov, []
     median_force = slice(len(hypotheses.log_N) // 2, None, len(hypotheses.log_N))

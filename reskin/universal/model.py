@@ -1,12 +1,22 @@
 """The universal model: estimates places and forces on a new skin without training on that skin.
 
-`PriorModel` consists of a map and networks that were computed from simulated skins. Calibration conditions both on the
-data of one skin: `PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` also on
-labelled presses. These three classes use the board's frame and axes, and work for any board.
+The model has two parts, which estimate independently: a map (`reskin.universal.map`), which is a probabilistic model
+based on a physical law, and networks (`reskin.universal.network`). Both were computed from simulated skins. Their
+estimates are combined.
 
-`Universal` is a model for the board of one layout (`reskin.universal.layout`); the one that comes with the project is
-for the paper's board. It takes readings along the chips' axes, and its places are in the frame of the labels, in which
-the board's centre is at the layout's `centre_mm`.
+Three classes contain both parts at different stages of calibration:
+
+- `PriorModel`: before calibration, for any skin;
+- `PressCalibration`: conditioned on the no-load field of one skin, and on presses at unknown places;
+- `CalibratedModel`: also conditioned on labelled presses, which are presses with known places and forces.
+
+These three classes use the frame and the axes of the board, and work for any board. `Universal` is the class for users.
+It is made for the board of one layout (`reskin.universal.layout`); the model that comes with the project is for the
+paper's board. `Universal` takes readings along the axes of the chips, and its places are in the frame of the labels, in
+which the centre of the board is at the layout's `centre_mm`.
+
+A likelihood power is the exponent to which a likelihood is raised. A power below 1 increases standard deviations. It is
+used where likelihoods are multiplied as if errors were independent although they are correlated.
 """
 
 import math
@@ -73,17 +83,22 @@ from reskin.universal.map import (
 from reskin.universal.mounting import LABELS_MIN_N, LabelFrame, Mounting, find_label_frame, find_mounting
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
-# Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
-# of channels are correlated. It is not fitted to any board.
+# Likelihood power of the map when it is combined with the networks. It is below 1, because the errors of channels are
+# correlated. It is not fitted to any board.
 MAP_POWER = 0.6
 # Power of the map's probabilities of forces if the map alone estimates forces. It is below 1, because the map
 # underestimates the uncertainty of forces. The value is the best of four values on simulated skins
 # (tests/benchmarks/test_force_benchmark.py).
 FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networks' estimates
-FADES_PER_LABEL = 0.15  # the first correction of `network_offsets_mm` is divided by 1 + this value * labels
-OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
-MISFIT_MAX = 4.0  # assumed chi^2 per channel above which a warning is given; about 1 for skins like in training
+# `network_offsets_mm` corrects the places of the networks twice. The first correction, from unlabelled presses, loses
+# weight as labels are added: it is divided by 1 + this value * number of labels.
+FADES_PER_LABEL = 0.15
+# The error of the networks in place is a constant error on each skin, with the first standard deviation, plus an error
+# that differs from press to press, with the second one.
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0
+# A warning is given if chi^2 per channel exceeds this assumed value. For skins like those in training, it is about 1.
+MISFIT_MAX = 4.0
 # If the no-load field differs from that of the saved calibration by more than this fraction, a warning says that this
 # may be another skin. In scene lab, recordings of one board differ by at most 5 %, and recordings of different boards
 # by 65 %.
@@ -93,26 +108,33 @@ BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 # divided by 1 + external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Both values were chosen so that 90 % intervals
 # contain 90 % of the true values on simulated skins.
 POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
-EXTERNAL_MAX_uT = 1000.0  # largest external field; for a much larger field, single precision is not sufficient
+EXTERNAL_MAX_uT = 1000.0  # largest allowed external field; much larger ones would require double precision
 
 FILE = Path(__file__).with_name("universal.safetensors")  # the model's card is universal.json
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
-OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # the spreads of these parameters give the prior of a shift of all places
-# The skin is assumed to slide as on the last day if the log odds for this, from presses of the new day, are at least
-# this value. Otherwise, a change is assumed, because an unnoticed change costs more accuracy than a wrongly assumed
-# change. The value was chosen on simulated skins.
+# A shift of all places is caused by these two parameters. Their spreads therefore give the standard deviation of the
+# prior of the shift.
+OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")
+# Presses of a new day show whether the skin still slides as on the day before. If the log odds for this are at least
+# this value, the slide is assumed to be unchanged. Otherwise, a change is assumed, because an unnoticed change costs
+# more accuracy than a wrongly assumed one. The value was chosen on simulated skins.
 SAME_SLIDE_LOG_ODDS_MIN = 2.0
-UNSTORED = ("names", "area")  # fields of `Tables` that are not stored, because they follow from the card
-CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
+UNSTORED = (
+    "names",
+    "area",
+)  # fields of `Tables` that model files do not contain, because the model card determines them
+CHOICE_EVERY_N = 3  # to propose the next labelled press, only every third place of the lattice is considered
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The likelihood power affects standard deviations and, in `by_map`, also places and forces. If only few forces are
-    known, `few` has the presses with these forces, and `unlabelled` has the likelihoods of the map that is not
-    conditioned on them.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces.
+
+    `line` calibrates the forces (`reskin.universal.force`). If only few forces are known, they are used in two ways:
+    `likelihoods` are those of the map that is conditioned on the presses with known forces, and `unlabelled` those of
+    the map that is not conditioned on them. `few` contains these presses.
     """
 
     evaluator: MapEvaluator
@@ -125,7 +147,7 @@ class Evaluation:
     __repr__ = one_line
 
     def by_map(self, power: float) -> Estimate:
-        """Estimate with the map alone, as means over the map's hypotheses."""
+        """Estimate with the map alone: places and forces are means over its hypotheses, weighted by probability."""
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
@@ -134,12 +156,12 @@ class Evaluation:
         return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), unknown, unknown)
 
     def combined(self, power: float) -> Estimate:
-        """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
+        """Combine map and networks: multiply their probability distributions of places and of forces.
 
-        The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
-        are computed from a power of the product. Forces are calibrated by the skin's line. If only few forces are
-        known, the line is used far from the presses with known forces. Close to these presses, the force is estimated
-        by the map that is conditioned on them.
+        The errors of map and networks are correlated, because both use the same field changes. Therefore, the product
+        is raised to the likelihood power `power` before the standard deviations are computed. The line of this skin
+        calibrates the forces. If only few forces are known, the line is used only far from the presses with known
+        forces. Close to these presses, the force comes from the map that is conditioned on them.
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
         selected = ESTIMATORS.index(self.line.estimator)
@@ -150,12 +172,15 @@ class Evaluation:
         return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
-        """Return the log forces of each of `ESTIMATORS` before their calibration."""
+        """Return the logarithms of the forces before calibration, once for each of `ESTIMATORS`."""
         return self.other_log_forces or self._products(self.likelihoods, 1.0)[2]
 
     @cached_property
     def other_log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
-        """Log forces from the map that is not conditioned on few known forces, if there is one; otherwise empty."""
+        """Logarithms of the forces from the map that is not conditioned on the few known forces.
+
+        Empty if there is no such map.
+        """
         return () if self.unlabelled is None else self._products(self.unlabelled, 1.0)[2]
 
     def _products(
@@ -173,7 +198,7 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class FewForces:
-    """A few presses with known forces (board's frame), and the map that is not conditioned on them."""
+    """A few presses with known forces, with places in the board's frame, and a map that is not conditioned on them."""
 
     skin: SkinMap
     place_mm: Float[np.ndarray, "m 2"]
@@ -186,8 +211,8 @@ class FewForces:
 class CalibratedModel:
     """Map and networks, calibrated to one skin.
 
-    offsets_mm: corrections that are added to the networks' places, one after the other. line: calibration of forces.
-    few: the presses with known forces, if they are few.
+    The corrections `offsets_mm` are added to the places of the networks. `line` calibrates the forces. `few` contains
+    the presses with known forces if there are only few of them.
     """
 
     skin: SkinMap
@@ -199,7 +224,10 @@ class CalibratedModel:
     __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
-        """Return the model with its offsets in the networks' last biases: faster, but in single precision."""
+        """Return the same model, with its offsets added to the biases of the networks' last layers.
+
+        This makes estimates faster. However, the offsets are then added in single precision.
+        """
         offset_mm = sum(self.offsets_mm, np.zeros(2))
         return replace(self, networks=[shift_places(layers, offset_mm) for layers in self.networks], offsets_mm=())
 
@@ -210,13 +238,19 @@ class CalibratedModel:
     def estimate_by(
         self, method: Callable[[Evaluation], Sequence[Estimate]], db_uT: Float[np.ndarray, "n ch"]
     ) -> list[Estimate]:
-        """Estimate places and forces block by block; `method` returns one or several estimates for a block."""
+        """Estimate places and forces, one block of readings at a time, which limits the memory.
+
+        `method` computes one or several estimates from the evaluation of a block.
+        """
         starts = range(0, max(len(db_uT), 1), BLOCK_N)
         by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in starts]
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
-        """Evaluate map and networks on a block of readings; the external field is subtracted for the networks."""
+        """Evaluate map and networks on a block of readings.
+
+        The networks receive readings from which the external field that the map expects has been subtracted.
+        """
         evaluator, few = self.skin.evaluator, self.few
         likelihoods = evaluator.evaluate(db_uT)
         networks = self.evaluate_networks(evaluator.without_external(db_uT, likelihoods))
@@ -249,11 +283,11 @@ def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
 
 @dataclass(frozen=True)
 class PressCalibration:
-    """Map and networks, conditioned on a skin's no-load field and its presses at unknown places.
+    """Map and networks, calibrated to a skin's no-load field and to its presses at unknown places.
 
-    earlier: the calibration to the last day on which the skin slid in another way, if any. In this case, `skin` is also
-    conditioned on the unlabelled presses of that day and of the days before it. The networks are conditioned only on
-    presses of `data`.
+    How the skin slides under a press can change from day to day. If it has changed, `earlier` is the calibration to the
+    last day before the change. In this case, the map `skin` is also conditioned on the unlabelled presses of all
+    earlier days, but the networks only on the presses in `data`.
     """
 
     skin: SkinMap
@@ -275,7 +309,11 @@ class PressCalibration:
 
     @cached_property
     def centre_mm(self) -> Float[np.ndarray, "2"]:
-        """Shift of the networks' places that follows from unlabelled presses."""
+        """Shift that is added to the places of the networks, estimated from unlabelled presses.
+
+        If the presses are at random places all over the area of presses, the shift moves their estimated places onto
+        this area. If they are evenly spread, it moves their mean place to the centre.
+        """
         if self.spread is not self:
             return self.spread.centre_mm
         if len(self.data.area_uT):
@@ -287,22 +325,27 @@ class PressCalibration:
 
     @cached_property
     def moved(self) -> SkinMap:
-        """The map; if presses are at random places all over the area of presses, places are moved onto this area."""
+        """The map; if presses are at random places all over the area of presses, its places are shifted like those of
+        the networks.
+        """
         return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
 
     @property
     def spread(self) -> "PressCalibration":
-        """The latest calibration, of this or an earlier day, whose presses are spread evenly or over the area."""
+        """The calibration from which the shift of places is computed.
+
+        This is the latest calibration, of this or an earlier day, whose presses are spread evenly or over the area.
+        """
         known = len(self.data.even_uT) or len(self.data.area_uT)
         return self if known or self.earlier is None else self.earlier.spread
 
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        labels: labelled presses since the last change of the slide; labels from before this change are added. few:
-        whether the line of forces corrects the forces of a second map, which is not conditioned on presses with known
-        forces. By default, this is so if 1 to `FEW_N` - 1 forces are known, because these forces would otherwise be
-        used twice: for the map and for the line.
+        `labels` are the labelled presses since the last change of the slide. Labels from before this change are added
+        to them. If `few` is True, the line of forces corrects the forces of a second map, which is not conditioned on
+        the presses with known forces. Otherwise these forces would be used twice: for the map, and for the line. By
+        default, `few` is True if 1 to `FEW_N` - 1 forces are known.
         """
         by_day = self.labels_by_day(labels)
         days_ago = np.repeat(np.arange(len(by_day)), [len(day) for day, _ in by_day])
@@ -320,7 +363,10 @@ class PressCalibration:
         return CalibratedModel(skin, self.layers, offsets_mm, few=few_forces)
 
     def labels_by_day(self, labels: LabelledPresses) -> list[tuple[LabelledPresses, Sequence[Layers]]]:
-        """Return one group of labels for each period without a change of the slide, latest first, with its networks."""
+        """Group the labels by period between changes of the slide, latest period first.
+
+        Each group comes with the networks that are conditioned on the presses of its period.
+        """
         earlier = self.earlier
         return [(labels, self.layers), *([] if earlier is None else earlier.labels_by_day(earlier.data.labels))]
 
