@@ -48,10 +48,14 @@ SIMULATED_MEANING = (
     "simulated, the paper's were recorded. An earlier simulation was tuned to row *Single-sensor*, so this row is not "
     "evidence. The paper does not state its forces, so MSE_F may not be comparable."
 )
-HALVES, UNIVERSAL = "other half of the skin", "universal, "
+HALVES = "other half of the skin"
 TRAINED_ON = {
-    "universal, boards of the rig": "simulation, other board of the rig",
-    "universal, simulated alone": "simulation (the model that we ship)",
+    "universal, boards of the rig": "simulation and the rig's other board",
+    "universal, simulated alone": "simulation (the universal model that we ship)",
+}
+SHORT_NAMES = {
+    "universal, boards of the rig": "model trained with the other board",
+    "universal, simulated alone": "shipped model",
 }
 LABELS = {"0": "no label", "weight": "one known weight", "10": "10 labels", "40": "40 labels"}
 RECORDED_METRICS = {
@@ -59,9 +63,8 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. The model is calibrated to "
-    "{presses_n} presses at unknown places, and to labels: presses with known places and forces, spread over the skin. "
-    "{halves}\n\n{touch}"
+    "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. In all columns, the model is also "
+    "calibrated to {presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -237,11 +240,17 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
 
 
 def _halves(numbers: Numbers) -> str:
-    """State the accuracy on one half of the skin if all labels are on the other half."""
-    rows = [row for row in numbers["random_presses"]["rows"] if (row["tested"], row["labels"]) == (HALVES, "40")]
-    scores = [f"{row['accuracy_pct']['mean']:.0f} %" for row in rows if row["method"].startswith(UNIVERSAL)]
+    """State the accuracy of each model on one half of the skin if all labels are on the other half."""
+    scores = [
+        f"{row['accuracy_pct']['mean']:.0f} % ({SHORT_NAMES[row['method']]})"
+        for row in numbers["random_presses"]["rows"]
+        if (row["tested"], row["labels"]) == (HALVES, "40") and row["method"] in SHORT_NAMES
+    ]
+    if not scores:
+        return ""
     return (
-        f"If all 40 labels are on one half of the skin, the other half scores {' and '.join(scores)}." if scores else ""
+        "If all 40 labels are on one half of the skin, this share of the presses on the other half is within 1 mm: "
+        f"{', '.join(scores)}."
     )
 
 
@@ -259,10 +268,11 @@ def _touches(numbers: Numbers) -> str:
         f"{baseline}, {max(row['false_alarm_pct'] for row in rows):.0f} %" for baseline, rows in by_baseline.items()
     ]
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
+    share = f"at most {missed:.2g} %" if missed else "none"
     return (
-        f"Forces of the presses: {ranges}. At the threshold of the live page, at most {missed:.2g} % of these touches "
-        f"are missed. How many readings without touch are reported as one depends on when the no-load reading was "
-        f"taken: {'; '.join(false)}. So take a new one often (key z)."
+        f"Forces of the presses: {ranges}. At the threshold of the live page, {share} of these touches are missed. How "
+        "often a reading without touch is taken for a touch depends on when the no-load reading was taken: "
+        f"{'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the live page)."
     )
 
 
