@@ -63,8 +63,8 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. In all columns, the model is also "
-    "calibrated to {presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
+    "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. In all columns, the model is "
+    "also calibrated to {presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
