@@ -244,7 +244,7 @@ class CalibrationData:
 
     @classmethod
     def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "CalibrationData":
-        """Return the data of a skin of which only the no-load field is known. The board can have any number of chips."""
+        """Return the data of a skin of which only the no-load field is known, on a board with any number of chips."""
         empty = no_presses(len(rest_uT))
         return cls(rest_uT, empty, empty, empty, no_labels(len(rest_uT)))
 
@@ -273,8 +273,8 @@ class CalibrationData:
         """Join these data and the data `last` of the last day as if all were of one day.
 
         This is used for a skin that slid in the same way on both days. The presses of the last day come first in the
-        result. Its `area_uT` is kept only if the current day has no presses at unknown places, because random places
-        must not be followed by other presses. `Universal.see` follows the same rule within a day.
+        result. The `area_uT` of the last day is kept only if the current day has no presses at unknown places, because
+        all presses together must be at random places. `Universal.see` follows the same rule within a day.
         """
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
         even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT

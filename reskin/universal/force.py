@@ -36,8 +36,8 @@ class LinePrior(NamedTuple):
 # twice as large. They have the following means and standard deviations, with those for doubled errors in brackets:
 # "combined": intercept -0.1 +- 0.35 (-0.7 +- 0.6), slope 1.0 +- 0.1 (1.0 +- 0.15), scatter 0.36 (0.55).
 # "map": intercept -0.3 +- 0.5 (-1.4 +- 1.1), slope 1.15 +- 0.15 (1.5 +- 0.5).
-# The priors were chosen between the two cases, except the mean of "combined": its intercept of 0 and slope of 1 leave
-# forces unchanged as long as no force is known.
+# The prior of "map" is between the two cases. The prior of "combined" has a mean intercept of 0 and a mean slope of 1,
+# so that forces are not changed as long as no force is known.
 PRIORS = {
     "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
     "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
