@@ -145,12 +145,12 @@ class LabelFrame:
 def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame:
     """Find the most probable orientation of the labels' axes among those that the user has not stated.
 
+    The errors of the estimated places are assumed to be normally distributed, except for a fraction of outliers.
+
     Parameters
     ----------
     estimate : estimated places of the labelled presses, from a model that is not calibrated to these labels
     place_mm : labelled places. Both these and the estimated places are relative to the board's centre.
-
-    The errors of the estimated places are assumed to be normally distributed, except for a fraction of outliers.
     """
     log_p = {name: _log_likelihood(estimate, place_mm @ matrix.T) for name, matrix in frames().items()}
     as_given = log_p.pop("as given")
