@@ -70,7 +70,7 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
     """Combine the presses of all captures of one skin on one board, in the order of the captures.
 
     Presses without a known place and a known force are excluded. If `with_force` is False and no force is known at all,
-    all presses with a known place are kept.
+    all presses with a known place are kept. Raises SchemaError if no press is left.
     """
     parts = [_means(readings) for readings in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
