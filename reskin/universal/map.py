@@ -153,8 +153,9 @@ Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
 NOISE = 0.1  # fraction of the variance of the law's error that differs from press to press at the same place
 SHARED = 0.55  # fraction of the variance of the law's error that is the same on all boards
-# A few boards are not enough to determine the covariance between channels. The covariance that is used is therefore a
-# weighted mean of the one of the boards and of an isotropic matrix. This is the weight of the isotropic matrix.
+# A few known boards are not enough to determine the covariance of the errors between channels. Therefore, a weighted
+# mean of two matrices is used: the covariance of the errors on the known boards, and an isotropic matrix (equal
+# variances, no correlation). This is the weight of the isotropic matrix.
 EVEN = 0.5
 
 

@@ -608,8 +608,9 @@ class Universal:
         """Return a matrix that shrinks the external fields in readings to the size of noise.
 
         Multiply field changes along the chips' axes (one per row) by this matrix to detect contacts. The magnitude |dB|
-        alone is not sufficient, because a contact and an external field both make it large. After the multiplication,
-        only a contact does. The result is None if `external_uT` is 0.
+        alone is not sufficient, because an external field can make it as large as a contact does. After the
+        multiplication, the part of an external field is as small as the noise. The result is None if `external_uT` is
+        0.
         """
         cov = self.external_cov
         return (
