@@ -1,1 +1,1 @@
-"""Datasets: rows for training and testing, baselines, and train/test splits."""
+"""Datasets: rows for training and testing, baselines that are subtracted, and splits into training and test rows."""

@@ -1,4 +1,8 @@
-"""Baseline policies: rules that choose the no-load reading to subtract from each reading (paper section 4)."""
+"""Baseline policies (paper section 4).
+
+A baseline is a no-load reading (a reading without contact) that is subtracted from a reading, because the change of the
+field shows the contact. A baseline policy is a rule that chooses the no-load reading for each reading.
+"""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -7,10 +11,13 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three values were tuned on all passes of the recording of scene `eflesh`, so they cannot be tested on it.
-# Number of latest states with which `follow_free` compares a reading; usually, five are contacts and five are not.
+# The following three values were tuned on all passes of the recording of scene `eflesh`. This recording can therefore
+# not be used to test them.
+# Number of latest states with which `follow_free` compares a reading. Usually, five of them are contacts and five are
+# not. A state consists of consecutive similar readings.
 STATES_N = 10
-# a state is free of contact if it is similar to at least this many of the latest states, including itself
+# A state is classified as free of contact if it is similar to at least this number of the latest states. The state
+# itself is counted.
 SIMILAR_MIN_N = 4
 # Two readings are similar if their distance is below this factor times the median distance between the no-load readings
 # of successive indentations.
@@ -23,29 +30,36 @@ def subtract(b_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "
 
 
 def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the runs of equal labels from 0; return for each row the number of its run.
+    """Number the runs of equal labels, and return the number of its run for each row.
 
-    `label` is, for example, the indentation or pass of each row of a capture, in order of time.
+    A run consists of successive rows with the same label. Runs are numbered from 0. `label` is, for example, the
+    indentation or the pass of each row of a capture, in order of time.
     """
     return np.cumsum(np.concatenate([[0], label[1:] != label[:-1]])).astype(np.int64)[: len(label)]
 
 
 def initial(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Use the first no-load reading for all rows (paper section 4: "a single no-load measurement")."""
+    """Return the first no-load reading as the baseline of all rows.
+
+    The paper calls this "a single no-load measurement" (section 4).
+    """
     return np.broadcast_to(noload_uT[:1], noload_uT.shape).copy()
 
 
 def regular(
     noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"], *, regular_n: int
 ) -> Float32[np.ndarray, "f ch"]:
-    """Use a new no-load reading only every `regular_n` indentations (paper section 4: "at regular intervals")."""
+    """Return baselines that are replaced by a new no-load reading only every `regular_n` indentations.
+
+    The paper describes this as no-load readings "at regular intervals" (section 4).
+    """
     rank_i = rank(indentation)
     _, first_i = np.unique(rank_i, return_index=True)  # the first row of each indentation
     return noload_uT[first_i[rank_i - rank_i % regular_n]]
 
 
 def each(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Use for each row the no-load reading that was taken before the row's contact."""
+    """Return the baseline of each row: the no-load reading that was taken immediately before the contact of the row."""
     return noload_uT
 
 
@@ -56,11 +70,11 @@ def free(
     *,
     within_uT: float,
 ) -> Float32[np.ndarray, "f ch"]:
-    """Use for each row the latest earlier reading that `follow_free` classifies as free of contact.
+    """Return the baseline of each row: the latest earlier reading that `follow_free` classifies as free of contact.
 
     The first baseline is the first no-load reading. The readings are processed in the order in which a board sends
-    them: for each indentation, first the no-load reading, then the rows in contact. Two readings are similar if their
-    distance is below `within_uT`.
+    them: for each indentation, first the no-load reading, then the rows in contact. `follow_free` treats two readings
+    as similar if their distance is below `within_uT`.
     """
     rank_i = rank(indentation)
     is_first_row = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])  # whether a row is the first of its indentation
@@ -73,12 +87,13 @@ def free(
 
 
 def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Float[np.ndarray, " ch"]]:
-    """Yield the current baseline after each reading; the baseline is inferred from the readings alone.
+    """Yield the current baseline after each reading.
 
-    The first reading must be free of contact. Consecutive similar readings, such as those of a press that is held, form
-    one state, however long it lasts. Different presses give different readings, but all readings without contact are
-    similar. Therefore, a state is classified as free of contact if it is similar to at least `SIMILAR_MIN_N` of the
-    latest states. During a long contact, such as a sliding finger, the baseline does not change.
+    The baseline is the latest reading that was probably free of contact. This is inferred from the readings alone:
+    different presses give different readings, but all readings without contact are similar. Consecutive similar
+    readings, such as those of a press that is held, form one state, however long it lasts. A state is classified as
+    free of contact if it is similar to at least `SIMILAR_MIN_N` of the latest `STATES_N` states. During a long contact,
+    such as that of a sliding finger, the baseline does not change. The first reading must be free of contact.
     """
     states: deque[np.ndarray] = deque(maxlen=STATES_N)
     baseline_uT: np.ndarray | None = None
@@ -104,5 +119,5 @@ def alike_within_uT(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.
 
 
 def _distance_uT(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the root mean square, over the channels, of the difference of two readings."""
+    """Return the distance of two readings, which is the root mean square of their difference over the channels."""
     return float(np.sqrt(np.mean((a - b) ** 2)))

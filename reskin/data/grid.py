@@ -1,6 +1,7 @@
-"""The paper's poking protocol: poke all 65 points of a grid at one depth, then all at the next depth, and so on.
+"""The poking protocol of the paper: a robot pokes the skin at the 65 points of a grid, at several depths.
 
-Places are in the coordinates of the labels: x and y from 0 to 16 mm, with the centre of the skin at (8, 8) mm.
+All points are poked at one depth, then all points at the next depth, and so on. Places are in the coordinates of the
+labels: x and y are from 0 to 16 mm, and the centre of the skin is at (8, 8) mm.
 """
 
 from collections.abc import Sequence
@@ -9,17 +10,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-# The paper: "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)". Its "16cm" is a typo for 16 mm.
+# The paper describes "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)". Its "16cm" must be a
+# typing error for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
 BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns in which no point is excluded
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
-SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
+SKIN_MM = (20.0, 20.0)  # lengths of the sides of the paper's skin, from the CAD files of its authors
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Commanded pokes in order of time, one array element per indentation."""
+    """The pokes that a robot is commanded to make, in order of time. Each array has one element per indentation.
+
+    `pass_i` is the number of the pass, in which all points are poked at all depths.
+    """
 
     indentation: Int32[np.ndarray, " n"]
     pass_i: Int32[np.ndarray, " n"]
@@ -32,7 +37,10 @@ class Protocol:
 
 
 def points_mm() -> Float64[np.ndarray, "65 2"]:
-    """Return x and y of the grid points in mm, row by row; x increases in row 0, decreases in row 1, and so on."""
+    """Return x and y of the grid points in mm, in the order in which they are poked.
+
+    The points are ordered row by row. x increases in row 0, decreases in row 1, increases in row 2, and so on.
+    """
     points = []
     for row_i in range(SIDE_POINTS_N):
         columns = range(SIDE_POINTS_N) if row_i in BETWEEN_CORNERS else BETWEEN_CORNERS
@@ -41,9 +49,10 @@ def points_mm() -> Float64[np.ndarray, "65 2"]:
 
 
 def protocol(depths_mm: Sequence[float], passes_n: int) -> Protocol:
-    """Return all pokes of the paper's protocol in order of time.
+    """Return all pokes of the protocol in order of time.
 
-    In each pass, all points are poked at the first depth, then all points at the second depth, and so on.
+    There are `passes_n` passes. In each pass, all points are poked at the first depth, then all points at the second
+    depth, and so on.
     """
     xy_mm = points_mm()
     points_n, depths_n = len(xy_mm), len(depths_mm)

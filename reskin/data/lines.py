@@ -1,8 +1,8 @@
-"""Pokes along straight lines; the only label of a poke is its rank along the line.
+"""Pokes along straight lines, whose only label is their order along the line.
 
-This is the method of section 5 of the paper: "indent in a straight line and incrementally index these points". Here,
-the indices along a line are derived from the places on a robot's grid. The places are then discarded, so `Lines`
-contains only row numbers, line numbers and indices.
+Such labels need no robot. This is the method of section 5 of the paper: "indent in a straight line and incrementally
+index these points". For pokes that a robot has made on a grid, the index of a poke along a line is derived from its
+place. The places are then discarded, so that `Lines` contains only row numbers, line numbers and indices.
 """
 
 from collections.abc import Sequence
@@ -17,16 +17,18 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: two places are the same if their coordinates are equal after rounding to this step
-PLACES_MIN_N = 2  # a line with a single place has no order
+PLACE_STEP_MM = 0.1  # two places are assumed to be the same if their coordinates, rounded to this step, are equal
+PLACES_MIN_N = 2  # smallest number of places on a line, because a line with a single place has no order
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Rows that are assigned to lines, without places and forces, sorted by line, index along the line, and row number.
+    """Assignment of rows (readings) to lines, without places and forces.
 
-    A row may be part of two lines, because a grid point is on a line along x and on a line along y.
+    Each array has one element per pair of a row and a line. The elements are sorted by line, then by index along the
+    line, then by row number. A row may be part of two lines, because a grid point is on a line along x and on a line
+    along y.
     """
 
     row: Int64[np.ndarray, " p"]  # row number in `Rows` or in a capture
@@ -38,11 +40,13 @@ class Lines:
 
 
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
-    """Assign the chosen rows to the grid lines of each skin along x and along y, with their index along the line.
+    """Assign the chosen rows to the lines of the grid of each skin.
 
-    Of the labels, only the skin and the commanded place are used. The index along a line in x is the rank of the row's
-    x among all distinct values of x in the chosen rows of the skin (for lines in y, likewise). If a line has no row at
-    one of these values, its indices have a gap. Lines with a single place have no order and are left out.
+    Each row is assigned to a line along x and to a line along y. Of its labels, only the skin and the commanded place
+    are used. To compute the index along a line in direction x, all distinct values of x in the chosen rows of the skin
+    are sorted. The index is the rank of the row's x among these values. Lines in direction y are treated in the same
+    way. If a line has no row at one of the values, its indices have a gap. Lines with a single place have no order, and
+    are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -57,11 +61,11 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 
 
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
-    """Assign the readings of a capture of manual pokes to lines: one line per pass.
+    """Assign the readings of a capture of manual pokes to lines, where each pass is one line.
 
-    The index along the line is the number of the indentation within the pass, from 0. If an indentation is missing, the
-    indices have a gap. `Lines.row` is the number of the reading in the capture. Lines with a single indentation have no
-    order and are left out.
+    The index along the line is the number of the indentation within the pass, counted from 0. If an indentation is
+    missing, the indices have a gap. `Lines.row` is the number of the reading in the capture. Lines with a single
+    indentation have no order, and are left out.
     """
     order_i = indentation.astype(np.int64)
     for line in np.unique(pass_i):
@@ -99,19 +103,32 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Increase the row numbers in `lines` by `rows_n`, because `rows_n` other rows were stacked above their rows."""
+    """Increase the row numbers in `lines` by `rows_n`.
+
+    This is needed if the rows to which `lines` refers have been appended to `rows_n` other rows.
+    """
     return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
     rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " d"]:
-    """Draw `indentations_n` indentations of one skin, evenly over the places; return their row numbers, sorted.
+    """Draw indentations of one skin at random, so that they are distributed evenly over the places.
 
-    `pool` contains the row numbers to draw from. Of the labels, only the place of an indentation's first row is used.
-    In the first round, one indentation is drawn for each place; in the second round, another one, and so on. The last
-    round may cover only some places, chosen at random. With the same state of `rng`, a call that draws fewer
-    indentations returns a subset.
+    In the first round, one indentation is drawn at each place; in the second round, another one at each place, and so
+    on. The last round may cover only some of the places, which are chosen at random. With the same state of `rng`, a
+    call that draws fewer indentations returns a subset of the rows.
+
+    Parameters
+    ----------
+    rows : rows of a dataset. Of their labels, only the place of the first row of each indentation is used.
+    pool : numbers of the rows from which indentations are drawn. They must be of one skin.
+    indentations_n : number of indentations
+    rng : random generator
+
+    Returns
+    -------
+    The numbers of all rows of the drawn indentations, sorted
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
@@ -123,7 +140,7 @@ def take_pokes(
 
 
 def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Return for each element the number of earlier elements that have the same place.
+    """Return, for each element, how many earlier elements have the same place.
 
     >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
@@ -136,12 +153,15 @@ def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
 
 
 def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
-    """Return x and y in multiples of `PLACE_STEP_MM`, rounded."""
+    """Return x and y as multiples of `PLACE_STEP_MM`, rounded to integers."""
     return np.round(target[:, [X, Y]].astype(np.float64) / PLACE_STEP_MM).astype(np.int64)
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Create `Lines` from the key of each row's line; drop lines with a single place, and number the others."""
+    """Create `Lines`: drop lines with a single place, and number the other lines.
+
+    `line` contains, for each row, a key of one or several numbers that identifies the line of this row.
+    """
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
     has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # one element per line
@@ -152,7 +172,7 @@ def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], orde
 
 
 def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) -> None:
-    """Raise if the pool has rows of several skins, or fewer than `indentations_n` indentations."""
+    """Raise ParamsError if the pool has rows of several skins, or fewer than `indentations_n` indentations."""
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
         raise ParamsError(

@@ -1,4 +1,7 @@
-"""The rows of a dataset, which are selected readings of several captures."""
+"""The rows of a dataset, which are selected readings of several captures.
+
+A capture is one recording of a skin on a board. Only readings in contact become rows.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,25 +18,34 @@ from reskin.errors import ParamsError
 from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
-UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not change these
+# Columns that `stack` concatenates without changes. Column `indentation` is not among them, because it is renumbered.
+UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")
 SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # targets for recordings with shear forces (paper section 4)
 
 
 class Selection(Strict):
-    """Criterion for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
+    """Criterion by which readings in contact are selected.
+
+    A reading is in contact if its place is known and its force is unknown or at least `force_min_N`.
+    """
 
     force_min_N: float
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The readings in contact from all captures of a scene, one reading per row; captures are sorted by name.
+    """The readings in contact from all captures of a scene, one reading per row. Captures are sorted by name.
 
-    `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
-    and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
-    number of the pass, counted over all captures of a skin. `indentation` is the number of the indentation, counted
-    over all captures of the scene; all readings of an indentation have the same number. `dropped` contains the numbers
-    of readings that were left out because they are not in contact, by reason.
+    Parameters
+    ----------
+    capture, board, skin : names of the capture, of the board and of the skin of each row
+    db_uT : field change relative to the no-load reading before the same indentation
+    target : columns x_mm, y_mm and Fz_N, or the other targets that were passed to `gather`. Fz_N is NaN if a recording
+        has no force.
+    pass_i : number of the pass, counted over all captures of a skin
+    indentation : number of the indentation, counted over all captures of the scene. All readings of an indentation have
+        the same number.
+    dropped : for each reason why readings are not in contact, the number of readings that were left out for it
     """
 
     capture: np.ndarray
@@ -52,9 +64,10 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Create rows for doctests of folds: one row per indentation, whose reading and targets are 0.
+        """Create rows for doctests of folds.
 
-        Without `pass_i`, all rows are in pass 0.
+        There is one row per indentation. Its field change and its targets are 0. Without `pass_i`, all rows are in
+        pass 0.
         """
         f = len(boards)
         zeros, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
@@ -63,14 +76,15 @@ class Rows:
 
 
 def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
-    """Read the captures of a scene from files, and stack their readings in contact."""
+    """Read the captures of a scene from files, and combine their readings in contact to rows (see `gather`)."""
     return gather([io.read_readings(file) for file in files], selection)
 
 
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
-    """Stack the readings in contact from a scene's captures; count the other readings in `Rows.dropped`.
+    """Combine the readings in contact from all captures of a scene to rows.
 
-    `targets` are the columns of `Readings` that become `Rows.target`.
+    The other readings are counted in `Rows.dropped`. `targets` are the names of the columns of `Readings` that become
+    `Rows.target`.
     """
     if not captures:
         raise ParamsError("the scene has no captures. Add one with `reskin add`.")
@@ -105,10 +119,10 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
 
 
 def stack(above: Rows, below: Rows) -> Rows:
-    """Return the rows `above`, followed by the rows `below`.
+    """Append the rows `below` to the rows `above`.
 
-    The row numbers of `above` do not change. The indentations of `below` are renumbered to follow those of `above`.
-    `dropped` is copied from `above`.
+    The row numbers of `above` do not change. The indentations of `below` are renumbered, so that their numbers follow
+    those of `above`. `dropped` is copied from `above`.
     """
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
@@ -122,14 +136,14 @@ def stack(above: Rows, below: Rows) -> Rows:
 
 
 def contacts(readings: Readings, selection: Selection) -> np.ndarray:
-    """Return the mask of the readings in contact, as defined by `selection`."""
+    """Return whether each reading is in contact according to `selection`."""
     placed = ~(np.isnan(readings.x_mm) | np.isnan(readings.y_mm))
     weak = readings.Fz_N < selection.force_min_N  # False for an unknown force (NaN)
     return placed & ~weak
 
 
 def _number_consecutively(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
-    """Number the indentations of all captures from 0; the numbers of a capture follow those of the previous capture."""
+    """Number the indentations of all captures from 0, where each capture continues the numbers of the previous one."""
     before_n, renumbered = 0, []
     for numbers in indentations:
         distinct, index = np.unique(numbers, return_inverse=True)
@@ -139,7 +153,11 @@ def _number_consecutively(indentations: list[np.ndarray]) -> Int64[np.ndarray, "
 
 
 def _check_one_kind(captures: Sequence[Readings]) -> None:
-    """Raise if the captures differ in number of chips or in source, or if a skin is on two boards."""
+    """Raise ParamsError if the captures cannot be in the same scene.
+
+    All captures must have the same number of chips and the same source, which is a recording or a simulation. Each skin
+    must be on only one board.
+    """
     first = captures[0]
     boards: dict[str, str] = {}
     for readings in captures:

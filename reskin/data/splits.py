@@ -1,7 +1,8 @@
-"""Draw folds that hold out boards, skins, readings, indentations or passes; convert folds to and from `folds.json`.
+"""Folds: splits of the rows of a dataset into rows for training and rows for testing.
 
-scikit-learn draws the random splits. In folds that hold out skins, no skin and no board may have both training rows and
-held-out rows. This module checks this condition.
+Depending on the experiment, a fold holds out boards, skins, readings, indentations or passes. In folds that hold out
+skins, no skin and no board may have both training rows and held-out rows. This module checks this condition. Random
+splits are drawn with scikit-learn. Folds are stored in the file `folds.json`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,16 +20,16 @@ from reskin.data.rows import Rows
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
 
-# What each experiment on a single skin holds out at random.
+# Experiments that train and test on a single skin, and what each of them holds out at random.
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}
 SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that train and test on the same skin
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
-DRAW = "-draw"  # text before the number of the draw in the name of a fold
-SEED_LIMIT = 2**32  # scikit-learn accepts only smaller seeds
+DRAW = "-draw"  # in the name of a fold, this text precedes the number of the random draw
+SEED_LIMIT = 2**32  # scikit-learn accepts only seeds below this limit
 
-Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and test
+Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # numbers of the training rows and of the test rows
 
 
 class Split(Strict):
@@ -43,8 +44,10 @@ class Split(Strict):
     transfer_skins_n: Count | None = None
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # adaptation may use this many passes, the first ones, of each held-out skin
-    labels_pool_n: Count | None = None  # this many indentations of each held-out skin may be labelled
+    # Number of passes of each held-out skin that adaptation may use. These are the first passes of the skin.
+    pool_passes_n: Count | None = None
+    # Number of indentations of each held-out skin that may be labelled.
+    labels_pool_n: Count | None = None
     labels_draws_n: Count | None = None
 
     @field_validator("sensors_skins_n")
@@ -57,10 +60,11 @@ class Split(Strict):
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (in `Rows`) of the training rows, the test rows, and the pool.
+    """A split of the rows of a dataset into training rows, test rows and a pool.
 
-    The pool contains those pokes on held-out skins that adaptation may use. All methods are tested on the same rows, so
-    no method is tested on the pool.
+    `train`, `test` and `pool` are row numbers in `Rows`. The pool contains those rows of held-out skins that may be
+    used for adaptation or as labels. No method is tested on the pool, not even a method that does not use it, so that
+    all methods are tested on the same rows.
     """
 
     experiment: str
@@ -71,12 +75,15 @@ class Fold:
 
     @property
     def board(self) -> str:
-        """The held-out board; only for folds of experiment `labels`."""
+        """Name of the held-out board. This property is defined only for folds of experiment `labels`."""
         return self.name.rpartition(DRAW)[0]
 
     @property
     def draw_i(self) -> int:
-        """Number of the fold's random draw of the pool, from 0; only for folds of experiment `labels`."""
+        """Number of the random draw of the pool, counted from 0.
+
+        This property is defined only for folds of experiment `labels`.
+        """
         return int(self.name.rpartition(DRAW)[2])
 
 
@@ -86,11 +93,15 @@ NO_POOL = np.zeros(0, np.int64)
 def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) -> list[Fold]:
     """Draw the folds of every experiment that a scene runs.
 
+    Experiment `lobo` holds out each board in turn. The following example prints, for each fold, its name, its training
+    rows and its test rows:
+
     >>> rows = Rows.of_labels(boards=["b1", "b1", "b2"], skins=["s1", "s2", "s3"])
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
     [('b1', [2], [0, 1]), ('b2', [0, 1], [2])]
 
-    With a pool, the first passes of each held-out skin are used for adaptation, and its later passes for testing:
+    If the split has a pool, the first passes of each held-out skin are in the pool, and its later passes are the test
+    rows. The following example prints, for each fold, its name, its training rows, its pool and its test rows:
 
     >>> rows = Rows.of_labels(["b1"] * 3 + ["b2"] * 2, ["s1"] * 3 + ["s2"] * 2, pass_i=[0, 1, 2, 0, 1])
     >>> def show(folds):
@@ -100,8 +111,8 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     b1 [3 4] [0] [1 2]
     b2 [0 1 2] [3] [4]
 
-    Experiment `sensors` holds out every board in turn, and trains on 1, 2, ... skins of the other boards. Within a
-    draw, each training set contains all smaller training sets:
+    Experiment `sensors` holds out each board in turn, and trains on 1, 2, ... randomly drawn skins of the other boards.
+    Within a draw, the training skins for a smaller number are among those for a larger number:
 
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
@@ -116,7 +127,10 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
 
 
 def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Make one fold per board: train on all other boards, test on the board's skins (paper section 5.1)."""
+    """Make one fold per board, which trains on the skins of all other boards and tests on the skins of this board.
+
+    This is the experiment of section 5.1 of the paper.
+    """
     boards = np.unique(rows.board)
     if len(boards) < 2:
         remedy = "Add another board's recording, or remove lobo from the scene's experiments."
@@ -129,12 +143,15 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins, test on a held-out board that has none of these skins; make one fold per board, k and draw.
+    """Make folds that train on only k skins, and test on a held-out board that has none of these skins.
 
-    This is the experiment of figure 6b of the paper. Every board is held out in turn and has separate random draws.
-    Within a draw, the training skins for a smaller k are a subset of those for a larger k. If k is the number of all
-    skins of the other boards, there is nothing to draw, so the board has a single fold for this k. This fold equals the
-    fold of experiment `lobo` and has the same name, so that the training runs of `lobo` are reused.
+    This is the experiment of figure 6b of the paper. Every board is held out in turn. For each board, the training
+    skins are drawn several times, from the skins of the other boards. Within a draw, the training skins for a smaller k
+    are a subset of those for a larger k. There is one fold for each combination of board, k and draw.
+
+    If k is the number of all skins of the other boards, there is nothing to draw, so the board has a single fold for
+    this k. This fold equals the fold of experiment `lobo` and has the same name, so that the training runs of `lobo`
+    are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -156,10 +173,11 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Hold out a board as in experiment `lobo`, and draw a pool of its indentations; one fold per board and draw.
+    """Make folds that hold out a board as in experiment `lobo`, and that have a random pool of its indentations.
 
     The pool contains the indentations that may be labelled. The whole pool is excluded from the test rows, even if only
-    a part of it is labelled, so that the test rows are the same for all numbers of labels.
+    a part of it is labelled, so that the test rows are the same for all numbers of labels. There is one fold for each
+    combination of board and random draw.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
@@ -184,16 +202,19 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled; with n labels, use the first n."""
+    """Draw the order in which the indentations of a fold's pool are labelled.
+
+    To label n indentations, use the first n.
+    """
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on one skin, test on all skins of other boards; one fold per training skin.
+    """Make folds that train on one skin, and test on all skins of other boards. There is one fold per training skin.
 
-    If a board has a training skin in any fold, none of its skins is tested on, so that all folds have the same test
-    rows. With `split.pool_passes_n`, the passes of the pool are excluded from the test rows in this experiment too, so
-    that all experiments are tested on the same passes.
+    No fold is tested on the skins of a board that has a training skin in any fold, so that all folds have the same test
+    rows. If `split.pool_passes_n` is set, the passes of the pool are excluded from the test rows in this experiment
+    too, so that all experiments are tested on the same passes.
 
     The paper trains on 3 skins, one at a time, and tests on 9 other skins. With 6 boards of 3 skins each, the training
     skins here are the first skins of the first three boards, and the test skins are the 9 skins of the other three
@@ -215,9 +236,11 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
-    """Make a fold from `sides`: the numbers of the training rows and of the held-out rows.
+    """Make a fold that holds out skins.
 
-    The first `split.pool_passes_n` passes of each held-out skin are the pool, and the later passes are the test rows.
+    `sides` contains the numbers of the training rows and the numbers of the held-out rows. Among the held-out rows, the
+    first `split.pool_passes_n` passes of each skin are the pool, and the later passes are the test rows. Without
+    `split.pool_passes_n`, all held-out rows are test rows.
     """
     train, held = sides
     pooled = np.zeros(len(held), bool)
@@ -236,10 +259,11 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
 
 
 def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
-    """Hold out random readings, indentations or passes (at least one) of the first skin; make one fold per repetition.
+    """Make folds that hold out random readings, indentations or passes of the first skin.
 
-    The paper holds out readings (section 4). This overestimates the accuracy, because readings of the same indentation
-    are then in the training rows and in the test rows.
+    The random draw is repeated, and there is one fold per repetition. At least one reading, indentation or pass is held
+    out. The paper holds out readings (section 4). This overestimates the accuracy, because some readings of an
+    indentation are then in the training rows and others in the test rows.
     """
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
@@ -254,7 +278,7 @@ def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -
 
 
 def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on the first passes of a skin and test on its last passes; one fold per skin."""
+    """Make one fold per skin, which trains on the first passes of the skin and tests on its last passes."""
     assert split.temporal_test_fraction is not None
     folds = []
     for skin in np.unique(rows.skin):
@@ -275,12 +299,12 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def draw_sides(
     group: Shaped[np.ndarray, " f"], *, test_fraction: float, repeats_n: int, state: int, what: str, where: str
 ) -> list[Sides]:
-    """Split rows at random into training and test rows, `repeats_n` times.
+    """Split rows at random into training rows and test rows, `repeats_n` times.
 
-    Rows with the same `group` are never separated, and at least one group is in the test rows. `state` is the random
-    seed. In error messages, `what` describes the groups, and `where` the experiment.
+    Rows with the same `group` are never separated. At least one group is in the test rows. `state` is the random seed.
+    In error messages, `what` describes the groups, and `where` names the experiment.
     """
-    # imported late, because it takes a second and few stages need it
+    # scikit-learn is imported only here, because the import takes a second, and few stages need it.
     from sklearn.model_selection import GroupShuffleSplit
 
     groups_n = len(np.unique(group))
@@ -290,7 +314,11 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return the number of test groups among `all_n` groups; raise `ParamsError` if it is 0 or `all_n`."""
+    """Return how many of `all_n` groups are held out for testing.
+
+    Raises ParamsError if no group would be left for training or for testing. In its message, `what` describes the
+    groups, and `where` names the experiment.
+    """
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene."
@@ -301,7 +329,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
 
 
 def _check_disjoint(rows: Rows, fold: Fold) -> None:
-    """Raise if a board or a skin of the training rows also occurs in the test rows or in the pool."""
+    """Raise ParamsError if a board or a skin of the training rows also occurs in the test rows or in the pool."""
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
@@ -327,7 +355,10 @@ SIDES = ("train", "test", "pool")
 
 
 def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
-    """Convert folds to JSON values: row numbers as half-open ranges, and the names of boards and skins."""
+    """Convert folds to the JSON values that are written to `folds.json`.
+
+    Row numbers are written as half-open ranges. The names of the boards and skins of each fold are added for readers.
+    """
     content: list[dict[str, Any]] = []
     for fold in folds:
         sides = {side: getattr(fold, side) for side in SIDES}
@@ -341,7 +372,10 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 
 
 def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
-    """Convert the JSON values of `folds.json` to folds; raise `SchemaError` if they were drawn from other rows."""
+    """Convert the JSON values of `folds.json` to folds.
+
+    Raises SchemaError if the folds were drawn from a different number of rows. `where` is the beginning of its message.
+    """
     if content["rows_n"] != len(rows):
         raise SchemaError(
             f"{where}: the folds were drawn from {content['rows_n']} rows, but the captures have {len(rows)} rows. Run "
@@ -354,7 +388,7 @@ def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
 
 
 def to_ranges(numbers: Int64[np.ndarray, " n"]) -> list[list[int]]:
-    """Convert increasing numbers to half-open ranges.
+    """Convert increasing numbers to half-open ranges, each of which contains consecutive numbers.
 
     >>> to_ranges(np.array([3, 4, 5, 9]))
     [[3, 6], [9, 10]]

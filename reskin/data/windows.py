@@ -1,8 +1,9 @@
-"""Cut captures into windows of time, and apply baseline policies, for experiment `drift` (paper section 4).
+"""Windows of time in captures, for experiment `drift` (paper section 4).
 
-A unit is an indentation or a pass. A window is a range of successive units. A baseline policy chooses the no-load
-reading to subtract from each row (see `reskin.data.baseline`). A part consists of the rows of one window of one
-capture, with the baselines of one policy.
+The experiment trains on the first window of captures, and tests on later windows, with several baseline policies. A
+baseline policy is a rule that chooses the no-load reading to subtract from each row (`reskin.data.baseline`). Windows
+are measured in units. A unit is an indentation or a pass, and a window is a range of successive units. A part consists
+of the rows of one window of one capture, with the baselines of one policy.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,14 +17,16 @@ from reskin.errors import ParamsError
 from reskin.schema import LABELS, Readings
 
 Policy = Callable[[Readings], np.ndarray]  # returns the baseline of each row
-TRAIN = -1  # index of the training window; test windows are numbered from 0
+TRAIN = -1  # index of the training window, whereas test windows are numbered from 0
 
 
 @dataclass(frozen=True)
 class Windows:
     """The training window and the test windows, as half-open ranges of units.
 
-    `left_out_units_n` counts the units after the last complete window, over all captures.
+    After the last test window, another one could begin, but it would not be complete in the shortest capture.
+    `left_out_units_n` is the number of units from the beginning of this incomplete window to the end of each capture,
+    summed over all captures.
     """
 
     train: tuple[int, int]
@@ -33,26 +36,31 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """One window of one capture, with the baselines of one policy, and its position in the stack of all parts."""
+    """One window of one capture, with the baselines of one policy.
+
+    `stack` combines the rows of all parts to one dataset, which is called the stack.
+    """
 
     policy: str
     window_i: int
     readings: Readings
     rows: Rows
-    noload_off_uT: float  # rms, over rows and channels, of the baseline minus the no-load reading before the contact
-    first_row_i: int  # number of the part's first row in the stack
+    # Difference between the baseline and the no-load reading before the contact, as an rms over rows and channels.
+    noload_off_uT: float
+    first_row_i: int  # number that the first row of the part has in the stack
 
     @property
     def row_i(self) -> Int64[np.ndarray, " f"]:
-        """The numbers of the part's rows in the stack of all parts."""
+        """The numbers that the rows of the part have in the stack of all parts."""
         return np.arange(self.first_row_i, self.first_row_i + len(self.rows))
 
 
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Return the training window (the first `train_n` units) and the test windows (`test_n` units each).
+    """Return the training window and the test windows.
 
-    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, and so on. `units_n` contains the length of each
-    capture in units. All windows are within the shortest capture.
+    The training window contains the first `train_n` units. Test windows contain `test_n` units each, and begin at the
+    units `every_n`, 2 `every_n`, 3 `every_n`, and so on. `units_n` contains the length of each capture in units. All
+    windows are within the shortest capture.
 
     >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
@@ -70,13 +78,13 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
 
 
 def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
-    """Return the readings that the mask `rows` selects."""
+    """Return those readings for which `rows` is True."""
     arrays = [name for name in Readings.__dataclass_fields__ if name not in LABELS]
     return replace(readings, **{name: getattr(readings, name)[rows] for name in arrays})
 
 
 def check_one_per_skin(captures: Sequence[Readings]) -> None:
-    """Raise if several captures have the same skin, because their order in time would be unknown."""
+    """Raise ParamsError if several captures have the same skin, because their order in time is unknown."""
     names: dict[str, list[str]] = {}
     for readings in captures:
         names.setdefault(readings.skin, []).append(readings.capture)
@@ -94,10 +102,10 @@ def make_parts(
     windows: Windows,
     selection: Selection,
 ) -> list[Part]:
-    """Make one part per capture, policy and window.
+    """Make one part for each combination of capture, policy and window.
 
-    Each element of `captures` is a pair: a capture, and the unit number of each of its rows. A policy is applied to the
-    whole capture, including rows that are in no window or are not selected by `selection`.
+    Each element of `captures` is a pair, which consists of a capture and the unit number of each of its rows. A policy
+    is applied to the whole capture, including rows that are in no window and rows that `selection` does not select.
     """
     parts: list[Part] = []
     next_i = 0
@@ -114,9 +122,9 @@ def make_parts(
 
 
 def stack(parts: Sequence[Part]) -> Rows:
-    """Stack the rows of all parts.
+    """Combine the rows of all parts to one dataset.
 
-    The dropped rows are counted for only one policy, because they are the same for all policies.
+    Dropped rows are counted for only one policy, because they are the same for all policies.
     """
     arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
     stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}

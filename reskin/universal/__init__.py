@@ -1,1 +1,5 @@
-"""The universal model: a physical law of skins, a map and networks based on it, and calibration of both to one skin."""
+"""The universal model, which estimates places and forces on skins for which it was not trained.
+
+The model consists of a map, which is based on a physical law of skins, and of networks. Both are calibrated to one
+skin.
+"""

@@ -1,8 +1,9 @@
-"""Skins on which networks of the universal model are trained, and random batches of their presses.
+"""Random batches of presses, on which the networks of the universal model are trained.
 
-A batch has presses on some skins. For each skin, an error of the law (`reskin.universal.law`) is drawn at random, and
-so are the presses on which the network is conditioned. `reskin.universal.training` trains on these batches. This module
-does not import PyTorch, because that import takes a second.
+A batch contains presses on several skins, most of them simulated. The simulation (the law, `reskin.universal.law`) does
+not describe real skins exactly. Therefore, a random error of the law is drawn for each skin and added to its field
+changes. The presses on which the network is conditioned are also drawn at random. `reskin.universal.training` trains on
+these batches. This module does not import PyTorch, because that import takes a second.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,19 +20,27 @@ from reskin.universal.map import Residual
 from reskin.universal.network import LOG_N, PLACE_MM
 from reskin.universal.population import DEFAULT_FORCES, PLACES_N, PRESSES_N, Forces, Population
 
-SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # number of skins per step, and of recorded skins among them, if any
-NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; for others, on 1 to 65
-NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading's noise along x, y and z
-RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor between 0 and this value
-# Ranges from which the law's relative rms error is drawn: for simulated skins of a prior made with known boards, for
-# simulated skins of the nominal prior, and for recorded boards.
+# Number of skins in the batch of each training step. If there are recorded skins, the second number of them is among
+# the skins of a batch.
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2
+# For this fraction of the skins, the network is conditioned on no press. For the other skins, it is conditioned on 1 to
+# 65 presses.
+NO_PRESSES_SHARE = 0.25
+NOISE_uT = (3.3, 3.3, 5.0)  # standard deviations of a reading's noise along x, y and z
+# The error of the law that is expected from recorded boards is multiplied by a random factor between 0 and this value.
+RESIDUAL_SCALE_MAX = 2.0
+# Ranges of the relative rms error of the law, from which the error of each skin is drawn. The first range is for
+# simulated skins if recorded boards of the same rig are known, the second for simulated skins if no board is known, and
+# the third for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
-ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # the error's scales in place and log F; number of cosines
+# The random error of the law is a sum of cosine waves: range of its length scale in place, its length scale in log
+# force, and number of waves.
+ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48
 NOMINAL_NAME = "nominal"  # name of the prior that uses no recorded board
 
 
 class TrainingSettings(Strict):
-    """Numbers of simulated skins, of training steps, and of networks."""
+    """Settings of a training run: numbers of simulated skins, of training steps, and of networks (one per seed)."""
 
     skins_n: Annotated[int, Field(ge=1, le=100_000)]
     steps_n: Annotated[int, Field(ge=2, le=1_000_000)]
@@ -40,7 +49,10 @@ class TrainingSettings(Strict):
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """Readings of a recorded board in the board's frame and axes, with the same number of readings for each press."""
+    """Recorded presses on a board, in the frame and along the axes of the board.
+
+    Each of the m presses has the same number r of readings.
+    """
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -50,12 +62,18 @@ class RecordedBoard:
 
 @dataclass(frozen=True)
 class SkinPrior:
-    """Distribution of the skins that networks are trained on.
+    """Distribution of the skins on which networks are trained.
 
-    Skins are simulated with parameters around those of a central law. If boards of the rig were recorded, `recorded`
-    has their readings, and `residual` predicts the law's errors on a new skin from its errors on these boards.
-    follows_law: True if skins follow the law exactly, as in a simulated scene; no errors of the law are then added.
-    forces: distribution of the forces.
+    Parameters
+    ----------
+    name : name of the distribution
+    centre : central law. The parameters of simulated skins are drawn around those of this law.
+    spreads : standard deviation of each parameter that is drawn
+    setup : what is the same for all skins, such as the positions of the chips
+    recorded : presses on recorded boards of the same rig, if there are such boards
+    residual : predicts the errors of the law on a new skin from its errors on recorded boards; None without such boards
+    follows_law : True if skins follow the law exactly, as in a simulated scene. No errors of the law are then added.
+    forces : distribution of the forces of presses
     """
 
     name: str
@@ -70,10 +88,11 @@ class SkinPrior:
 
 @dataclass(frozen=True)
 class Batch:
-    """Skins of one training step, with the presses on each skin.
+    """The skins of one training step, with the presses on each skin.
 
-    The first `PLACES_N` presses of a skin serve for conditioning: the network is conditioned on those for which `kept`
-    is 1. The network is trained to predict `target` (scaled x, y and log F) for the other presses.
+    The first `PLACES_N` presses of a skin are for conditioning: the network is conditioned on those of them for which
+    `kept` is 1. For the remaining presses of the skin, the network is trained to predict `target`, which contains
+    scaled values of x, y and log F.
     """
 
     db_uT: Float32[np.ndarray, "b m ch"]
@@ -83,7 +102,7 @@ class Batch:
 
 
 class Batches:
-    """Draws the batches of a training run."""
+    """Generator of the random batches of a training run."""
 
     def __init__(self, skins: Population, prior: SkinPrior) -> None:
         self.skins, self.recorded = skins, prior.recorded
@@ -94,7 +113,7 @@ class Batches:
             self.error = 0.0, 0.0
 
     def draw(self, rng: np.random.Generator) -> Batch:
-        """Draw simulated skins, and recorded skins if there are any, with noise and errors of the law."""
+        """Draw one batch: skins with presses, to which noise and errors of the law are added."""
         recorded_n = RECORDED_PER_STEP_N if self.recorded else 0
         parts = [self._simulated(SKINS_PER_STEP_N - recorded_n, rng)]
         if recorded_n:
@@ -119,16 +138,20 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw 130 presses of a recorded board (some repeatedly if the board has fewer), and one reading of each press."""
+    """Draw 130 presses of a recorded board at random, and one reading of each of these presses.
+
+    If the board has fewer than 130 presses, some are drawn repeatedly.
+    """
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw which presses of each skin the network is conditioned on (1: yes, 0: no).
+    """Draw on which presses of each of n skins the network is conditioned.
 
-    A fraction `NO_PRESSES_SHARE` of the skins has no such press; the others have 1 to 65.
+    The result is 1 for these presses, and 0 for others. A fraction `NO_PRESSES_SHARE` of the skins has no such press.
+    The other skins have 1 to 65.
     """
     kept_n = np.where(rng.random(n) < NO_PRESSES_SHARE, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
@@ -142,10 +165,11 @@ def add_error(
     size: tuple[float, float],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "b m ch"]:
-    """Add a random error of the law that is smooth in place and log F.
+    """Add a random error of the law to the field changes of each skin.
 
-    Half of a channel's error is proportional to |dB| at its chip, half to |dB| over all chips. size: bounds between
-    which the relative rms error of each skin is drawn uniformly.
+    The error varies smoothly with place and log force. One half of the error of a channel is proportional to |dB| at
+    the chip of this channel, and the other half to |dB| over all chips. The relative rms error of each skin is drawn
+    uniformly between the two values of `size`.
     """
     skins_n, _, channels_n = db_uT.shape
     rms = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
@@ -163,7 +187,7 @@ def add_error(
 
 
 def residual_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
-    """Return the law's expected error in uT for each press of a population."""
+    """Return the error of the law in uT that a residual predicts for each press of a population."""
     added = np.empty_like(skins.db_uT)
     for i in range(len(skins)):
         relative: Float[np.ndarray, "m ch"] = residual.at(skins.place_mm[i], np.log(skins.force_N[i]))

@@ -1,6 +1,10 @@
-"""Calibration data of one skin (validation, file format), and likelihood powers with cross-validation over labels.
+"""Data to which the universal model is calibrated, and the likelihood powers of a calibrated model.
 
-A likelihood power is an exponent of the likelihood. A power below 1 increases the standard deviations of estimates.
+The data of one skin are its no-load field, presses at unknown places, and labelled presses (presses with known places
+and forces). This module checks these data, writes them to a file, and reads them.
+
+A likelihood power is the exponent to which a likelihood is raised. A power below 1 increases the standard deviations of
+estimates. Cross-validation over the labelled presses shows whether the standard deviations match the errors.
 """
 
 import math
@@ -17,14 +21,20 @@ from reskin.errors import SchemaError
 from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
-CHANNELS_N = 15  # of the paper's board: five chips with three axes each
-FIELD_MAX_uT = 1e6  # 20 times the range of a chip; the square of this value fits single precision
+CHANNELS_N = 15  # values in one reading of the paper's board, which has five chips with three axes each
+# Largest accepted field. It is 20 times the range of a chip. Its square can be represented in single precision.
+FIELD_MAX_uT = 1e6
 RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
-LABELS_MAX_N = 2000  # memory grows with the square of the number of labels, and computing time grows faster still
+# Largest number of labels. There is a limit because the memory grows with the square of the number of labels, and the
+# computing time grows even faster.
+LABELS_MAX_N = 2000
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
-    """Return one or several readings as a 2-D array, one row per reading; raise SchemaError for a wrong shape."""
+    """Return one or several readings as a 2-D array with one row per reading.
+
+    Raises SchemaError if the values are not an array of numbers of this shape.
+    """
     needed = f"This model needs {channels_n} numbers per reading: Bx, By, Bz of each of {channels_n // 3} chips."
     try:
         rows_uT = np.atleast_2d(np.asarray(b_uT, float))
@@ -38,7 +48,10 @@ def check_shape(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) ->
 
 
 def check_readings(b_uT: Float[np.ndarray, "..."], channels_n: int = CHANNELS_N) -> Float[np.ndarray, "f ch"]:
-    """Return calibration readings as a 2-D array; raise SchemaError for values that are not finite or too large."""
+    """Return calibration readings as a 2-D array with one row per reading.
+
+    Raises SchemaError if the shape is wrong, if a value is not finite, or if a magnitude exceeds `FIELD_MAX_uT`.
+    """
     rows_uT = check_shape(b_uT, channels_n)
     _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in magnitude"
@@ -54,8 +67,9 @@ def check_labels(
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
     """Return the places and forces of labelled presses as arrays; raise SchemaError if they are invalid.
 
-    Places must be within `reach_mm` (rows: smallest and largest x and y), and forces must be finite and above 0 N.
-    There must be one label for each of the `rows_n` readings, and at most LABELS_MAX_N labels.
+    There must be one place and one force for each of the `rows_n` readings, and at most LABELS_MAX_N labels. Places
+    must be within `reach_mm`, whose first row has the smallest x and y and whose second row has the largest x and y.
+    Forces must be finite and above 0 N.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n})"
@@ -81,7 +95,7 @@ def check_number(labels_n: int) -> None:
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
-    """Raise SchemaError if a labelled force is outside the model's range by a factor of 2 or more."""
+    """Raise SchemaError if the force of a label is outside the model's range by a factor of `RANGE_FACTOR` or more."""
     least_N, most_N = float(range_N.min()), float(range_N.max())
     inside = (force_N > least_N / RANGE_FACTOR) & (force_N < RANGE_FACTOR * most_N)
     if not inside.all():
@@ -90,16 +104,19 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
         raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or omit the press.")
 
 
-# Limit for the detection of field changes that are passed instead of readings, and of readings that are passed instead
-# of field changes. Readings of presses should be near the no-load reading, and field changes near 0. Values are refused
-# if the distance to the wrong one of these two points, divided by the distance to the right one, is below this limit.
-# On the boards of scene lab, the median ratio is 0.15 to 0.22 for values of the wrong kind, and 4 or more for values of
-# the right kind.
+# Users may pass field changes where readings are needed, or readings where field changes are needed. Such mistakes are
+# detected by comparing two distances: readings of presses are near the no-load reading, but field changes are near 0.
+# Values are refused if they are so close to the wrong one of these two points that the distance to it, divided by the
+# distance to the right one, is below this limit. On the boards of scene lab, the median of this ratio is 0.15 to 0.22
+# for values of the wrong kind, and 4 or more for values of the right kind.
 NEAR_MAX = 0.5
 
 
 def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
-    """Return the field changes; raise SchemaError if all are below the noise, for example because they are in mT."""
+    """Return the field changes; raise SchemaError if all of them are smaller than the noise.
+
+    This happens for example if readings are in mT.
+    """
     strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), db_uT.shape[1] // 3, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
         rule = f"{NOISE_uT:g} uT or more at some chip"
@@ -109,14 +126,20 @@ def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]
 
 
 def check_is_reading(where: str, b_uT: Float[np.ndarray, "m ch"], noload_uT: Float[np.ndarray, " ch"]) -> None:
-    """Raise SchemaError if the no-load reading was already subtracted from readings of presses."""
+    """Raise SchemaError if `b_uT` contains field changes instead of readings of presses.
+
+    `where` is the name of the calling function, for the error message.
+    """
     if _median_norm(b_uT) < NEAR_MAX * _median_norm(b_uT - noload_uT):
         problem = f"{where}: the values are nearer to 0 uT than to the no-load reading, like field changes"
         raise SchemaError(f"{problem}. Pass readings, from which the no-load reading is not subtracted.")
 
 
 def check_is_change(where: str, db_uT: Float[np.ndarray, "m ch"], noload_uT: Float[np.ndarray, " ch"]) -> None:
-    """Raise SchemaError if the no-load reading was not subtracted from field changes of presses."""
+    """Raise SchemaError if `db_uT` contains readings of presses instead of field changes.
+
+    `where` is the name of the calling function, for the error message.
+    """
     if _median_norm(db_uT - noload_uT) < NEAR_MAX * _median_norm(db_uT):
         problem = f"{where}: the values are nearer to the no-load reading than to 0 uT, like readings"
         raise SchemaError(f"{problem}. Pass field changes: subtract the no-load reading.")
@@ -132,23 +155,30 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-# Formats of files, newest first. Format 1 does not state which forces are known. Formats 1 and 2 do not state how the
-# skin is mounted; the skin is then assumed not to be turned. Formats 1 to 3 have the data of only one day.
+# Formats of calibration files, newest first. Files in older formats can still be read, but contain less: format 1 does
+# not state which forces are known. Formats 1 and 2 do not state how the skin is mounted; the skin is then assumed not
+# to be turned. Formats 1 to 3 contain the data of only one day.
 FORMAT, FORMAT_3, FORMAT_2, FORMAT_1 = "reskin-skin-4", "reskin-skin-3", "reskin-skin-2", "reskin-skin-1"
-EARLIER_DAY = "earlier_{}_"  # prefix of the names of an earlier day's arrays; the oldest day has the number 0
-DAYS_MAX_N = 5  # a saved skin has at most this number of days
+# Prefix of the array names of an earlier day in a file. The placeholder is the number of the day; the oldest day has
+# the number 0.
+EARLIER_DAY = "earlier_{}_"
+DAYS_MAX_N = 5  # largest number of days in a calibration file, including the current day
 ARRAYS = ("pokes_uT", "even_uT", "area_uT", "labelled_mm", "labelled_N", "labelled_uT", "force_known")
 UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
-FILE_BYTES_MAX_N = 2**23  # five full days with all labels on a board with 64 chips take 4.1 MB
+# Larger files are refused. The largest calibration (five full days with all labels, on a board with 64 chips) has a
+# size of 4.1 MB.
+FILE_BYTES_MAX_N = 2**23
 REMEDY = "Use a file that `save` wrote."
-BOARD, PAPER_BOARD = "board", "reskin"  # key of the board's name in a file; the board if there is no key
+# A file states the name of its board under the first key. If it does not, it is for the board of the second name.
+BOARD, PAPER_BOARD = "board", "reskin"
 
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses with known places (relative to the board's centre), their forces and their field changes.
+    """Presses at known places, with their forces and field changes. Places are relative to the board's centre.
 
-    force_known: which forces are true values; the other forces are estimates. By default, all forces are true values.
+    A force is either a known true value or, if the user stated only the place, an estimate. `force_known` is True for
+    the forces that are true values. By default, all forces are.
     """
 
     place_mm: Float[np.ndarray, "m 2"]
@@ -161,11 +191,11 @@ class LabelledPresses:
 
     @property
     def known(self) -> Bool[np.ndarray, " m"]:
-        """Which forces are true values, not estimates."""
+        """Whether each force is a true value (True) or an estimate (False)."""
         return np.ones(len(self), bool) if self.force_known is None else self.force_known
 
     def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
-        """Select presses."""
+        """Return some of the presses, selected by a slice or by their indices."""
         known = None if self.force_known is None else self.force_known[which]
         return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which], known)
 
@@ -190,12 +220,18 @@ def no_labels(channels_n: int = CHANNELS_N) -> LabelledPresses:
 class CalibrationData:
     """All calibration data of one skin, in the board's frame and axes.
 
-    rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
-    changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
-    the area of presses. labels: presses at known places. turned: whether the skin is turned by a quarter. All fields
-    here then have the opposite sign of the fields on the board, as if the skin were not turned. earlier: the data of
-    earlier days in order of time, each with the presses of only this day. By default, there are no presses, and the
-    board is the paper's board.
+    By default, there are no presses, and the board is the paper's board.
+
+    Parameters
+    ----------
+    rest_uT : no-load field
+    presses_uT : field changes of at most `FULL_SET_N` presses at unknown places
+    even_uT : field changes of presses that are evenly spread over the skin
+    area_uT : field changes of presses at random places all over the area of presses
+    labels : presses at known places
+    turned : whether the skin is turned by a quarter. If it is, all fields in this object have the opposite sign of the
+        fields on the board, as if the skin were not turned.
+    earlier : the data of earlier days in order of time. Each element contains the presses of one day only.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -208,13 +244,13 @@ class CalibrationData:
 
     @classmethod
     def at_rest(cls, rest_uT: Float[np.ndarray, " ch"]) -> "CalibrationData":
-        """Return the data of a skin that was not pressed, on a board with any number of chips."""
+        """Return the data of a skin of which only the no-load field is known, on a board with any number of chips."""
         empty = no_presses(len(rest_uT))
         return cls(rest_uT, empty, empty, empty, no_labels(len(rest_uT)))
 
     @property
     def presses_n(self) -> int:
-        """Number of presses on all days, labelled or not."""
+        """Number of presses on all days, including labelled presses."""
         return len(self.presses_uT) + len(self.labels) + sum(day.presses_n for day in self.earlier)
 
     @property
@@ -223,9 +259,10 @@ class CalibrationData:
         return len(self.labels) + sum(day.labels_n for day in self.earlier)
 
     def next_day(self) -> "CalibrationData":
-        """Return the data at the beginning of a new day, with these data as an earlier day if they have presses.
+        """Return the data with which a new day begins.
 
-        At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the oldest day is dropped.
+        The new day has the same no-load field and no presses. The current day becomes an earlier day, if it has
+        presses. At most `DAYS_MAX_N` - 1 earlier days are kept; if there are more, the oldest day is dropped.
         """
         pressed = len(self.presses_uT) + len(self.labels) > 0
         earlier = (*self.earlier, replace(self, earlier=())) if pressed else self.earlier
@@ -233,10 +270,11 @@ class CalibrationData:
         return replace(data, turned=self.turned, earlier=earlier[-DAYS_MAX_N + 1 :])
 
     def joined_to(self, last: "CalibrationData") -> "CalibrationData":
-        """Return these data and those of the last day as one day, for a skin that slid in the same way on both days.
+        """Join these data and the data `last` of the last day as if all were of one day.
 
-        The presses of the last day come first. The `area_uT` of the last day is kept only if no presses at unknown
-        places followed on this day. Within a day, `Universal.see` also drops `area_uT` if other presses follow.
+        This is used for a skin that slid in the same way on both days. The presses of the last day come first in the
+        result. The `area_uT` of the last day is kept only if the current day has no presses at unknown places, because
+        all presses together must be at random places. `Universal.see` follows the same rule within a day.
         """
         presses_uT = np.concatenate([last.presses_uT, self.presses_uT])[-FULL_SET_N:]
         even_uT = self.even_uT if len(self.even_uT) or len(self.area_uT) else last.even_uT
@@ -262,9 +300,9 @@ def _arrays(day: CalibrationData) -> dict[str, np.ndarray]:
 
 
 def is_calibration(file: Path) -> bool:
-    """Return whether `write_calibration` wrote this file.
+    """Return whether a file is a calibration that `write_calibration` wrote.
 
-    A file that is too large for calibration data is not read. Raises SchemaError if a smaller file is damaged.
+    A file that is too large to be a calibration is not read. Raises SchemaError if a smaller file is damaged.
     """
     formats = FORMAT, FORMAT_3, FORMAT_2, FORMAT_1
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in formats
@@ -273,10 +311,11 @@ def is_calibration(file: Path) -> bool:
 def read_calibration(
     file: Path, reach_mm: Float[np.ndarray, "2 2"], channels_n: int = CHANNELS_N, board: str = PAPER_BOARD
 ) -> CalibrationData:
-    """Read the calibration data that `write_calibration` wrote.
+    """Read calibration data from a file that `write_calibration` wrote.
 
-    Raises SchemaError for other files, for a calibration on a board of another name, and for labelled places outside
-    `reach_mm` (rows: smallest and largest x and y, relative to the board's centre).
+    `reach_mm` contains the edges of the skin relative to the board's centre: the smallest x and y in the first row, the
+    largest x and y in the second row. Raises SchemaError if the file is not a calibration, if the board in the file is
+    not called `board`, or if a labelled place is outside `reach_mm`.
     """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
@@ -307,14 +346,17 @@ def read_calibration(
 
 
 def _take_day(tensors: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Remove the arrays whose names begin with a prefix, and return them under the rest of their names."""
+    """Remove the arrays whose names begin with a prefix from `tensors`.
+
+    Returns these arrays by name, without the prefix.
+    """
     return {name.removeprefix(prefix): tensors.pop(name) for name in list(tensors) if name.startswith(prefix)}
 
 
 def _read_day(
     file: Path, tensors: Mapping[str, np.ndarray], reach_mm: Float[np.ndarray, "2 2"], channels_n: int
 ) -> CalibrationData:
-    """Check the arrays of one day in a file, and return its data."""
+    """Check the arrays of one day that were read from a file, and return the data of this day."""
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
     shapes: dict[str, tuple[int, ...]] = {"labelled_mm": (2,), "labelled_N": (), "force_known": ()}
@@ -343,20 +385,23 @@ def _read_day(
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels
-PRIOR_N = 40.0  # weight of the prior (an inflation of 1), as a number of labelled coordinates (docs/learning.md)
-NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| of a standard normal z
+# The variance inflation is estimated with a prior, according to which it is 1. The prior has the same weight as this
+# number of labelled coordinates, where each label has two coordinates (docs/learning.md).
+PRIOR_N = 40.0
+NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| for a variable z with a standard normal distribution
 
-# Held-out labels: estimates with each power, and true places in mm.
+# Labelled presses of one fold that were held out: their estimates with each likelihood power, and their true places.
 HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]
 
 
 @dataclass(frozen=True)
 class LikelihoodPowers:
-    """Likelihood powers for a misfit of 1, tabulated by numbers of presses and labels; determined on simulated skins.
+    """Tables of likelihood powers, which were determined on simulated skins for a misfit of 1.
 
-    anywhere: powers by number of presses at unknown places, then by number of labels. even: powers by number of labels,
-    for presses that are evenly spread over the skin. Between tabulated numbers of labels, the logarithm of the power is
-    interpolated linearly. A number of presses that is not tabulated is rounded down to the next tabulated number.
+    `anywhere` contains powers by number of presses at unknown places, and for each of these numbers by number of
+    labels. `even` contains powers by number of labels, for presses that are evenly spread over the skin. Between
+    tabulated numbers of labels, the logarithm of the power is interpolated linearly. A number of presses that is not
+    tabulated is rounded down to the next tabulated number.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
@@ -369,17 +414,17 @@ class LikelihoodPowers:
         return float(np.exp(np.interp(labels_n, tabulated_n, np.log([powers[n] for n in tabulated_n]))))
 
     def are_enough(self, presses_n: int) -> bool:
-        """Return whether this number of presses is large enough for their misfit to be used."""
+        """Return whether there are so many presses that their misfit can be used."""
         return any(0 < n <= presses_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
-        """Return the powers as a JSON object for the model's card."""
+        """Convert the powers to a JSON object for the model card."""
         anywhere = {str(presses_n): _named(powers) for presses_n, powers in self.anywhere.items()}
         return {"anywhere": anywhere, "even": _named(self.even)}
 
     @classmethod
     def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
-        """Create the powers from the JSON object that `to_card` returns."""
+        """Convert the JSON object that `to_card` returns to powers."""
         anywhere = {int(presses_n): _numbered(powers) for presses_n, powers in card["anywhere"].items()}
         return cls(anywhere, _numbered(card["even"]))
 
@@ -393,23 +438,31 @@ def _numbered(powers: Mapping[str, float]) -> dict[int, float]:
 
 
 def lower_by_misfit(power: float, misfit: float) -> float:
-    """Divide a power by the misfit of unlabelled presses; the result is at most 1."""
+    """Divide a likelihood power by the misfit of unlabelled presses, and limit the result to 1."""
     return min(1.0, power / misfit)
 
 
 def lower_by_residuals(power: float, inflation: float) -> float:
-    """Divide a power by the variance inflation of held-out labels; the result is at most 1."""
+    """Divide a likelihood power by the variance inflation of held-out labels, and limit the result to 1."""
     return min(1.0, power / inflation)
 
 
 def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
-    """Split labels into folds for cross-validation (label i is in fold i mod 5); return kept and held-out indices."""
+    """Split labels into folds for cross-validation.
+
+    Label i is in fold i modulo `FOLDS_N`. Returns, for each fold, the indices of the labels outside the fold and the
+    indices of the labels in the fold.
+    """
     fold = np.arange(labels_n) % FOLDS_N
     return [(np.flatnonzero(fold != i), np.flatnonzero(fold == i)) for i in range(min(FOLDS_N, labels_n))]
 
 
 def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
-    """Return, for each power, the factor by which squared errors of held-out labels exceed the estimated variances."""
+    """Return the variance inflation for each of `powers_n` likelihood powers, from labels that were held out.
+
+    The variance inflation is the factor by which the squared errors exceed the variances that were estimated with the
+    likelihood power.
+    """
     inflations = []
     for i in range(powers_n):
         errors_sd = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
@@ -418,10 +471,11 @@ def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
 
 
 def variance_inflation(errors_sd: Float[np.ndarray, "m 2"]) -> float:
-    """Return the variance inflation for errors that are divided by their estimated standard deviations.
+    """Return the variance inflation for errors that have been divided by their estimated standard deviations.
 
-    The inflation is the square of (mean absolute error / mean absolute value of a standard normal variable). Absolute
-    errors are used because they are less sensitive to outliers than squared errors. The prior, which has the weight
-    `PRIOR_N`, moves the inflation towards 1.
+    If the standard deviations are right, these ratios have a standard normal distribution. The inflation is therefore
+    the square of the mean absolute ratio, divided by the mean absolute value of a standard normal variable. Absolute
+    values are used because they are less sensitive to outliers than squares. A prior with the weight `PRIOR_N` moves
+    the inflation towards 1.
     """
     return ((PRIOR_N + float(errors_sd.sum()) / NORMAL_MEAN) / (PRIOR_N + errors_sd.size)) ** 2

@@ -1,9 +1,10 @@
-"""Export the estimate of a calibrated skin for programs without Python: as an ONNX file or as C code.
+"""Export a calibrated universal model for programs without Python, as an ONNX file or as C code.
 
-After calibration, the estimate is a fixed function of the field changes. `SkinFunction` contains all numbers of this
-function. `build_onnx` expresses the function with ONNX operators, and `estimate.h` implements it in C99. Both follow
-`Evaluation.combined` and `reskin.universal.kernels`, and use the same numbers as the Python code. However, they compute
-in double precision where the Python code uses single precision. The C code can also be compiled for single precision.
+After calibration to a skin, the model computes its estimates (places, forces and their uncertainty) from field changes
+by a fixed function. `SkinFunction` contains all numbers of this function. `build_onnx` expresses the function with ONNX
+operators, and `estimate.h` implements it in C99. Both follow `Evaluation.combined` and `reskin.universal.kernels`, and
+use the same numbers as the Python code. However, they compute in double precision where the Python code uses single
+precision. The C code can also be compiled for single precision.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,24 +30,39 @@ if TYPE_CHECKING:
 
     from reskin.universal.model import Universal
 
-OPSET, IR = 17, 8  # ONNX versions from 2022, which current runtimes support
+OPSET, IR = 17, 8  # versions of the ONNX operators and of the file format, from 2022; current runtimes support them
 C_CODE = Path(__file__).with_name("estimate.h")
 NUMBERS_PER_LINE = 8
-REAL, SINGLE = "%.16e", "%.8ef"  # formats that preserve all digits of double and single precision
-OUTPUTS = {  # output -> shape after the axis of readings
+REAL, SINGLE = "%.16e", "%.8ef"  # number formats that preserve all digits of double precision and of single precision
+OUTPUTS = {  # name of each output: its shape for a single reading
     "place_mm": [2], "sd_mm": [2], "force_N": [], "sd_log_N": [], "misfit": [], "change_uT": [], "contact": [],
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class SkinFunction:
-    """All numbers of the function from field changes (along the chips' axes) to the estimate of one skin.
+    """All numbers of the function that computes estimates from the field changes of one skin.
 
-    turn: matrix that rotates readings to the board's axes, with the opposite sign if the skin is turned by a quarter.
-    noload_uT: no-load field that is subtracted from readings. hypotheses, unlabelled: Gaussians of the map, and, if
-    only few forces are known, of the map that is not conditioned on these forces (`Evaluation.unlabelled`). few_mm,
-    few_log_N: places and log forces of the presses with these forces. contact_uT: least |dB| of a contact, after
-    multiplication by `suppressor`; None if unknown.
+    Field changes are along the chips' axes.
+
+    Parameters
+    ----------
+    about : texts about the skin, which are written to the exported file
+    turn : matrix that converts field changes to the board's axes. If the skin is turned by a quarter, this matrix also
+        reverses their sign.
+    noload_uT : no-load field that is subtracted from readings
+    centre_mm : the board's centre in the frame of the labels
+    place_mm, log_N : places and log forces of the hypotheses of the map
+    hypotheses : Gaussians of the map (`reskin.universal.kernels`)
+    unlabelled : if only few forces are known, Gaussians of the map that is not conditioned on these forces (see
+        `Evaluation`)
+    few_mm, few_log_N : places and log forces of the presses with these few known forces
+    networks : the networks, conditioned on the skin
+    external_cov : covariance of external fields, or None if none are expected
+    power : likelihood power
+    line : the line that calibrates forces
+    suppressor : matrix by which field changes are multiplied before a contact is detected, or None for no such matrix
+    contact_uT : magnitude above which a field change counts as contact, or None if contacts are not detected
     """
 
     about: Mapping[str, str]
@@ -72,7 +88,10 @@ class SkinFunction:
 
 
 def skin_function(skin: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None) -> SkinFunction:
-    """Collect the numbers of a model's estimate; `quiet_uT` are readings without contact, for the contact threshold."""
+    """Collect all numbers of the function that a calibrated model computes.
+
+    If `quiet_uT` is given, it contains readings without contact, from which the threshold for contacts is computed.
+    """
     noload_uT = skin.noload_uT
     calibrated, few = skin.calibrated, skin.calibrated.few
     turned = -1 if skin.mounting.turned else 1
@@ -111,7 +130,11 @@ def skin_function(skin: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None
 
 
 class Graph:
-    """An ONNX graph under construction. Methods add a node or a constant, and return the name of its value."""
+    """An ONNX graph under construction.
+
+    Each method adds nodes or constants to the graph, and returns the name of the resulting value. In the functions
+    below, values of the graph are represented by such names.
+    """
 
     def __init__(self) -> None:
         from onnx import TensorProto, helper, numpy_helper
@@ -128,7 +151,7 @@ class Graph:
         return name
 
     def single(self, value: Float32[np.ndarray, "..."]) -> str:
-        """Add a constant that is stored in single precision, and converted to double precision."""
+        """Add a constant that is stored in single precision and is converted to double precision for computations."""
         return self.double(self.constant(value, np.float32))
 
     def add(self, operator: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
@@ -140,22 +163,25 @@ class Graph:
         return self.add("Cast", value, to=self._double)
 
     def rounded(self, value: str) -> str:
-        """Round to single precision."""
+        """Round a value to single precision, and convert it back to double precision."""
         return self.double(self.add("Cast", value, to=self._single))
 
     def reshape(self, value: str, *shape: int) -> str:
-        """Reshape all axes after the first one."""
+        """Reshape a value. The first axis is kept, and all others are replaced by axes of the lengths `shape`."""
         return self.add("Reshape", value, self.constant((0, *shape), np.int64))
 
     def squeeze(self, value: str) -> str:
-        """Remove axis 1, whose length is 1."""
+        """Remove axis 1 of a value, which must have the length 1."""
         return self.add("Squeeze", value, self.constant([1], np.int64))
 
     def sum(self, value: str, axis: int, *, keep: bool = False) -> str:
         return self.add("ReduceSum", value, self.constant([axis], np.int64), keepdims=int(keep))
 
     def mean(self, values: Sequence[str]) -> str:
-        """Average values of the same shape; ONNX Runtime has no operator `Mean` in double precision."""
+        """Average values of the same shape.
+
+        The ONNX operator `Mean` is not used, because ONNX Runtime does not implement it in double precision.
+        """
         return self.add("Mul", self.add("Sum", *values), self.constant(1 / len(values)))
 
     def affine(self, value: str, scale: Any, shift: Any) -> str:
@@ -170,14 +196,17 @@ class Graph:
 
 
 def write_onnx(of: SkinFunction, file: Path) -> None:
-    """Write the ONNX model of a skin's estimate; replace an existing file."""
+    """Write the function of a skin to a file as an ONNX model. An existing file is replaced."""
     content = build_onnx(of).SerializeToString()
     with io.replacing(file) as temporary:
         temporary.write_bytes(content)
 
 
 def build_onnx(of: SkinFunction) -> "ModelProto":
-    """Build the ONNX model of a skin's estimate; the input `db_uT` has field changes along the chips' axes [f, ch]."""
+    """Convert the function of a skin to an ONNX model.
+
+    The input `db_uT` of the model has the shape [f, ch]. It contains field changes along the chips' axes.
+    """
     try:
         from onnx import TensorProto, checker, helper
     except ImportError:
@@ -223,7 +252,11 @@ def build_onnx(of: SkinFunction) -> "ModelProto":
 
 
 def _likelihoods(g: Graph, of: Gaussians, db_uT: str) -> tuple[str, str, str]:
-    """Add the deviance under each hypothesis [f, h], the index of the most likely one [f, 1], and its chi^2 [f]."""
+    """Add the evaluation of all hypotheses of a map to the graph.
+
+    Returns the deviance under each hypothesis [f, h], the index of the most likely hypothesis [f, 1], and chi^2 of the
+    most likely hypothesis [f].
+    """
     white, white_mean = _whitening(of)
     hypotheses_n, channels_n = white_mean.shape
     all_white = g.single(white.transpose(2, 0, 1).reshape(channels_n, -1))
@@ -235,7 +268,10 @@ def _likelihoods(g: Graph, of: Gaussians, db_uT: str) -> tuple[str, str, str]:
 
 
 def _whitening(of: Gaussians) -> tuple[Float32[np.ndarray, "h ch ch"], Float32[np.ndarray, "h ch"]]:
-    """Return, for each Gaussian with mean m, its whitening matrix W and W m, from the rows of `Gaussians`."""
+    """Return the whitening matrix W of each Gaussian, and W m, where m is the mean of the Gaussian.
+
+    Both are stored in `Gaussians.row`.
+    """
     hypotheses_n = of.row.shape[1]
     channels_n = int((np.sqrt(9 + 8 * len(of.row)) - 3) / 2)  # rows: channels_n (channels_n + 3) / 2
     white = np.zeros((hypotheses_n, channels_n, channels_n), np.float32)
@@ -249,7 +285,10 @@ def _whitening(of: Gaussians) -> tuple[Float32[np.ndarray, "h ch ch"], Float32[n
 
 
 def _without_external(g: Graph, of: SkinFunction, db_uT: str, best: str) -> str:
-    """Subtract the external field that is expected under the most likely hypothesis (`MapEvaluator`)."""
+    """Add the subtraction of the external field to the graph, as in `MapEvaluator.without_external`.
+
+    `best` is the index of the most likely hypothesis of each reading.
+    """
     if of.external_cov is None:
         return db_uT
     white, white_mean = _whitening(of.hypotheses)
@@ -263,7 +302,10 @@ def _without_external(g: Graph, of: SkinFunction, db_uT: str, best: str) -> str:
 
 
 def _network_estimate(g: Graph, of: SkinFunction, db_uT: str) -> dict[str, str]:
-    """Add the networks' normal distributions: means [f, 3] and standard deviations [f, 3] of x, y and log F."""
+    """Add the estimate of the networks to the graph.
+
+    Returns the means [f, 3] and the standard deviations [f, 3] of x, y and log F.
+    """
     length = g.add("Sqrt", g.sum(g.square(db_uT), 1, keep=True))
     length = g.add("Max", length, g.constant(network.LENGTH_MIN_uT))
     direction = g.add("Div", g.add("Mul", db_uT, g.constant(network.DIRECTION_GAIN)), length)
@@ -281,7 +323,8 @@ def _network_estimate(g: Graph, of: SkinFunction, db_uT: str) -> dict[str, str]:
         log_sd = g.add("Min", g.add("Max", g.columns(values, 3, 6), limits[0]), limits[1])
         variances.append(g.square(g.add("Mul", g.add("Exp", log_sd), scale)))
     mean = g.mean(means)
-    deviations = [g.square(g.add("Sub", one, mean)) for one in means]  # the spread of the networks adds to the variance
+    # The variance over networks is added to the mean of the networks' own variances, as in `network.evaluate`.
+    deviations = [g.square(g.add("Sub", one, mean)) for one in means]
     sd = g.add("Sqrt", g.add("Add", g.mean(variances), g.mean(deviations)))
     sd_min = g.constant([model.SD_MIN_MM, model.SD_MIN_MM, model.SD_MIN_LOG_N])
     return {"mean": mean, "sd": g.add("Max", sd, sd_min)}
@@ -290,7 +333,10 @@ def _network_estimate(g: Graph, of: SkinFunction, db_uT: str) -> dict[str, str]:
 def _products(
     g: Graph, of: SkinFunction, deviance: str, normals: Mapping[str, str], power: float
 ) -> tuple[str, str, tuple[str, str]]:
-    """Add the moments of `kernels.products`: places, standard deviations, and the log force of each estimator."""
+    """Add the combination of map and networks to the graph, as in `kernels.products`.
+
+    Returns the places, their standard deviations, and the log forces of each estimator.
+    """
     places_n, forces_n = len(of.place_mm), len(of.log_N)
     least = g.add("ReduceMin", deviance, axes=[1], keepdims=1)
     likely = _exp(g, g.add("Mul", g.add("Sub", least, deviance), g.constant(0.5 * model.MAP_POWER)))
@@ -325,18 +371,21 @@ def _log_share(g: Graph, likely: str) -> str:
 
 
 def _half_square(g: Graph, values: Float[np.ndarray, " p"], mean: str, sd: str) -> str:
-    """Add half of the squared distance of constant values from the mean, in standard deviations."""
+    """Add half of the square of (values - mean) / sd, where `values` are constants."""
     off = g.add("Div", g.add("Sub", g.constant(values), mean), sd)
     return g.add("Mul", g.square(off), g.constant(0.5))
 
 
 def _mean(g: Graph, weight: str, values: str) -> str:
-    """Add the weighted mean over axis 1 of values [p] or [f, p]."""
+    """Add the weighted mean of values over axis 1. The values have the shape [p] or [f, p]."""
     return g.add("Div", g.sum(g.add("Mul", weight, values), 1, keep=True), g.sum(weight, 1, keep=True))
 
 
 def _line(g: Graph, line: force.ForceLine, log_N: str) -> tuple[str, str]:
-    """Add the calibrated log force and its standard deviation (`ForceLine.apply`)."""
+    """Add the calibration of log forces by a line, as in `ForceLine.apply`.
+
+    Returns the calibrated log forces and their standard deviations.
+    """
     off = g.affine(log_N, 1.0, -force.LOG_CENTRE_N)
     (intercept, slope), ((a, b), (_, c)) = line.mean, line.cov
     var = g.affine(g.add("Mul", off, g.affine(off, c, 2 * b)), 1.0, a + line.scatter_var)
@@ -344,7 +393,10 @@ def _line(g: Graph, line: force.ForceLine, log_N: str) -> tuple[str, str]:
 
 
 def _nearness(g: Graph, of: SkinFunction, place_mm: str, log_N: str) -> str:
-    """Add the largest correlation of a press with a press of known force (`map.kernel`)."""
+    """Add a measure of how near each press is to the presses with known forces.
+
+    The measure is the largest correlation, according to `map.kernel`, with one of these presses.
+    """
     column = [g.columns(place_mm, 0, 1), g.columns(place_mm, 1, 2), g.reshape(log_N, 1)]
     at = [of.few_mm[:, 0], of.few_mm[:, 1], of.few_log_N]
     lengths = [LENGTH_MM, LENGTH_MM, LENGTH_LOG_N]
@@ -357,7 +409,10 @@ def _nearness(g: Graph, of: SkinFunction, place_mm: str, log_N: str) -> str:
 
 
 def write_c(of: SkinFunction, file: Path) -> None:
-    """Write a C99 header with the function `reskin_estimate` for one skin; replace an existing file."""
+    """Write the function of a skin to a C99 header, as the C function `reskin_estimate`. An existing file is replaced.
+
+    The header consists of the file `estimate.h` and the numbers of the skin.
+    """
     about = "; ".join(f"{name} {value}" for name, value in of.about.items() if name != "noload_uT")
     code = C_CODE.read_text(encoding="utf-8").replace('"skin.h"', f'"{file.name}"')
     code = code.replace("@ABOUT@", f"The estimate of one calibrated skin ({about}), written by `export_c`.")
@@ -365,7 +420,7 @@ def write_c(of: SkinFunction, file: Path) -> None:
 
 
 def _c_numbers(of: SkinFunction) -> Iterator[str]:
-    """Yield the definitions of all numbers in `estimate.h`."""
+    """Yield the lines of C code that define the numbers that the functions in `estimate.h` use."""
     line, contact_uT = of.line, of.contact_uT
     widths = [len(of.networks[0].weight[0]), *(len(bias) for bias in of.networks[0].bias)]
     sizes = {
@@ -414,7 +469,7 @@ def _c_numbers(of: SkinFunction) -> Iterator[str]:
 
 
 def _c_array(kind: str, name: str, values: np.ndarray, form: str) -> Iterator[str]:
-    """Yield the lines that define an array of numbers, each number in the format `form`."""
+    """Yield the lines of C code that define an array. `form` is the format of its numbers."""
     texts = [form % value for value in values.ravel().tolist()]
     yield f"static const {kind} reskin_{name}[{len(texts)}] = {{"
     for i in range(0, len(texts), NUMBERS_PER_LINE):

@@ -1,9 +1,9 @@
-"""Calibration of a skin's force: a line from estimated to true log forces, fitted to presses with known forces.
+"""Calibration of the forces of a skin: a straight line from estimated to true forces, on logarithmic scales.
 
-The field change of a press grows slowly with its force, about as F^0.2 to F^0.3 on recorded boards. If the field change
-according to the law (`reskin.universal.law`) has an error, it therefore causes a relative error of the estimated force
-that is several times as large. This error is a similar factor all over one skin. The line corrects this factor and its
-growth with force.
+The field change of a press grows slowly with its force F, about as F^0.2 to F^0.3 on recorded boards. A small relative
+error of the simulated field change (`reskin.universal.law`) therefore causes a relative error of the estimated force
+that is several times as large. The estimated forces of one skin are all wrong by a similar factor, which changes slowly
+with force. The line corrects this factor. It is fitted to presses with known forces.
 """
 
 import math
@@ -14,45 +14,57 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-LOG_CENTRE_N = math.log(2.0)  # log force at which the line's intercept is defined
-SCATTER_LABELS_N = 20  # weight of the scatter's prior, as a number of labels
+LOG_CENTRE_N = math.log(2.0)  # logarithm of the force at which the intercept of the line is defined
+SCATTER_LABELS_N = 20  # the prior of the scatter about the line has the same weight as this number of labels
 NORMAL_90 = 1.645  # half width of a 90 % interval, in standard deviations
 
 
 class LinePrior(NamedTuple):
-    """Prior of the line of one estimator: mean and standard deviation of intercept and slope, and the scatter."""
+    """Prior of the line for one estimator.
+
+    `mean` and `sd` are the means and standard deviations of the intercept and the slope. `scatter_sd` is the standard
+    deviation of log forces about the line.
+    """
 
     mean: tuple[float, float]
     sd: tuple[float, float]
     scatter_sd: float
 
 
-# Estimators of the log force, and priors of their lines. "combined" uses map and networks, "map" the map alone.
-# Lines that are fitted to simulated skins have the following means and standard deviations if the errors of the law are
-# as large as in training (in brackets: twice as large).
+# Two estimators of the log force, each with the prior of its line: "combined" uses map and networks, "map" uses the map
+# alone. Lines were fitted to simulated skins with errors of the law as large as in training, and to skins with errors
+# twice as large. They have the following means and standard deviations, with those for doubled errors in brackets:
 # "combined": intercept -0.1 +- 0.35 (-0.7 +- 0.6), slope 1.0 +- 0.1 (1.0 +- 0.15), scatter 0.36 (0.55).
 # "map": intercept -0.3 +- 0.5 (-1.4 +- 1.1), slope 1.15 +- 0.15 (1.5 +- 0.5).
-# Each prior is between the two cases. The prior mean of "combined" is (0, 1), so that forces are not changed if none is
-# known.
+# The prior of "map" is between the two cases. The prior of "combined" has a mean intercept of 0 and a mean slope of 1,
+# so that forces are not changed as long as no force is known.
 PRIORS = {
     "combined": LinePrior((0.0, 1.0), (0.5, 0.3), 0.4),
     "map": LinePrior((-0.6, 1.2), (0.8, 0.25), 0.4),
 }
 ESTIMATORS = tuple(PRIORS)
-# With `FEW_N` or more known forces, "map" is used unless the labels clearly favour another estimator. With fewer,
-# "combined" is used, because it is more accurate on simulated skins with one known force.
+# With `FEW_N` or more known forces, the estimator "map" is used, unless the labels clearly favour another estimator.
+# With fewer known forces, "combined" is used, because it is more accurate on simulated skins with one known force.
 FEW_N = 5
 FEW_ESTIMATOR, DEFAULT = "combined", "map"
-MARGIN = 3.0  # difference of the labels' log likelihoods by which an estimator must exceed the default; assumed
+# Another estimator than the default is selected only if the log likelihood of the labels is larger by more than this
+# assumed value.
+MARGIN = 3.0
 
 
 @dataclass(frozen=True)
 class ForceLine:
-    """Distribution of a skin's line, which converts estimated log forces to true ones, and the scatter about the line.
+    """The line that converts the estimated log forces of one skin to true log forces, and its uncertainty.
 
-    estimator: which estimate of the log force is calibrated, one of `ESTIMATORS`. mean, cov: mean and covariance of the
-    line's intercept and slope, which have a normal distribution. With c = `LOG_CENTRE_N`, the line is true log force -
-    c = intercept + slope (estimated log force - c). scatter_var: variance of single log forces about the line.
+    With c = `LOG_CENTRE_N`, the line is
+
+        true log force - c = intercept + slope * (estimated log force - c).
+
+    Parameters
+    ----------
+    estimator : the estimator whose log forces the line converts, one of `ESTIMATORS`
+    mean, cov : mean and covariance of intercept and slope, which have a normal distribution
+    scatter_var : variance of the true log force of a single press about the line
     """
 
     estimator: str
@@ -61,18 +73,23 @@ class ForceLine:
     scatter_var: float
 
     def apply(self, log_N: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return calibrated log forces and their standard deviations for estimated log forces."""
+        """Convert estimated log forces to calibrated log forces. Returns these and their standard deviations."""
         row = _row(log_N)
         return LOG_CENTRE_N + row @ self.mean, np.sqrt(((row @ self.cov) * row).sum(axis=1) + self.scatter_var)
 
     def condition(self, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> "ForceLine":
-        """Condition on presses with known forces, given their estimated and true log forces."""
+        """Condition the line on presses with known forces.
+
+        Parameters
+        ----------
+        log_N : estimated log forces of the presses
+        true_log_N : true log forces of the presses
+        """
         row, deviation = _row(log_N), true_log_N - LOG_CENTRE_N
         posterior = self._update(row, deviation, self.scatter_var)
         residual = deviation - row @ posterior.mean
-        squared = float(
-            residual @ residual + ((row @ posterior.cov) * row).sum()
-        )  # expected value under the line's posterior
+        # The sum of the squared residuals, as an expected value over the posterior distribution of the line.
+        squared = float(residual @ residual + ((row @ posterior.cov) * row).sum())
         scatter_var = (SCATTER_LABELS_N * self.scatter_var + squared) / (SCATTER_LABELS_N + len(residual))
         return self._update(row, deviation, scatter_var)
 
@@ -89,16 +106,17 @@ def prior_line(estimator: str = FEW_ESTIMATOR) -> ForceLine:
 
 
 def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[np.ndarray, " m"]) -> ForceLine:
-    """Fit the line to presses with known forces, and select the estimator.
+    """Select the estimator, and fit its line to presses with known forces.
 
-    With fewer than `FEW_N` labels, the estimator is `FEW_ESTIMATOR`. With `FEW_N` labels or more, it is `DEFAULT`,
-    unless the labels are more likely under another estimator by a factor above exp(MARGIN). For this comparison, each
-    label is predicted from the other labels.
+    With fewer than `FEW_N` known forces, the estimator is `FEW_ESTIMATOR`. Otherwise, it is `DEFAULT`, unless the known
+    forces are more likely under another estimator by a factor above exp(`MARGIN`). For this comparison, each known
+    force is predicted with the line that is fitted to the other known forces.
 
     Parameters
     ----------
-    by_estimator : for each of `ESTIMATORS`, log forces that were estimated without the label of the same press
-    true_log_N : true log forces of these presses
+    by_estimator : log forces of the presses, once for each of `ESTIMATORS`. The log force of a press must have been
+        estimated by a model that is not calibrated to the label of this press.
+    true_log_N : true log forces of the presses
     """
     log_forces, selected = dict(zip(ESTIMATORS, by_estimator, strict=True)), FEW_ESTIMATOR
     if len(true_log_N) >= FEW_N:
@@ -109,7 +127,11 @@ def fit_line(by_estimator: Sequence[Float[np.ndarray, " m"]], true_log_N: Float[
 
 
 def _held_out_likelihood(estimator: str, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> float:
-    """Return the sum of the log likelihoods of the labels, each under the line fitted to the other labels."""
+    """Return the log likelihood of the known forces by leave-one-out cross-validation.
+
+    This is a sum over presses. Each term is the log likelihood of one known force under the line that is fitted to all
+    other known forces.
+    """
     total = 0.0
     for i in range(len(log_N)):
         others = np.arange(len(log_N)) != i

@@ -1,8 +1,9 @@
-"""Physics inversion, a reference method: fit the law to one skin, then search for the place and force of each reading.
+"""Physics inversion, which is a reference method with which the universal model is compared.
 
-The law (`reskin.universal.law`) is fitted by least squares to the no-load field and to presses at unknown places,
-starting from nominal parameters. If the law does not describe a skin, the residuals of the search are large. Places are
-in the board's frame, and fields are along its axes.
+The law (`reskin.universal.law`) is a simulation of a press on a skin. Starting from nominal parameters, it is fitted by
+least squares to the no-load field of one skin and to presses at unknown places. Then, for each reading, the place and
+the force are searched for which the law gives the most similar field change. If the law does not describe the skin, the
+residuals of the search are large. Places are in the board's frame, and fields are along its axes.
 """
 
 from dataclasses import dataclass
@@ -16,19 +17,26 @@ from reskin.universal.map import FORCES_N, NOMINAL, lattice_mm
 
 # Modulus and label offset keep their nominal values, because unlabelled presses do not determine them.
 PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
-LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin must be above its chips and be magnetised
-PRIOR_WEIGHT = 0.5  # weight of the prior; assumed, whereas that in `law.fit` was chosen on recorded boards
-ROUNDS_N = 3  # each round finds places with the current law, then fits parameters and places together
+LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # lower limits of a fit: the skin must be above its chips and be magnetised
+# Weight of the priors of the parameters. This value is assumed, whereas the weight in `law.fit` was chosen on recorded
+# boards.
+PRIOR_WEIGHT = 0.5
+# Number of rounds of the fit. Each round first searches for the places with the current law. It then fits parameters
+# and places together.
+ROUNDS_N = 3
 EVALUATIONS_MAX_N = 8  # maximum number of least-squares steps per round
-STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in x or y, and in log force
-REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # largest |x| and |y|; smallest and largest force
-CELL = 1.0  # maximum length of the Gauss-Newton step in each coordinate, in steps of the lattice
-BLOCK_N = 500  # readings are searched in blocks of this size, to bound memory
+STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences: in x and in y, and in log force
+REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # limits of a fit: largest |x| and |y|, and smallest and largest force
+CELL = 1.0  # the Gauss-Newton step of a search is limited to this number of lattice steps along each coordinate
+BLOCK_N = 500  # readings are processed in blocks of this number, which limits the memory
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Field changes simulated with a law on a lattice of places and forces, and their slopes per lattice step."""
+    """Field changes that a law gives on a lattice of places and forces, in which places and forces are searched.
+
+    `slope_uT` is the change of the field change per lattice step in x, in y and in log force.
+    """
 
     place_mm: Float[np.ndarray, "h 2"]
     log_N: Float[np.ndarray, " h"]
@@ -39,7 +47,10 @@ class Chart:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Place and force found for each reading, and the residual |dB - simulated dB| / |dB|."""
+    """The place and the force that a search has found for each reading, and the residual that remains.
+
+    The residual is |dB - simulated dB| / |dB|.
+    """
 
     place_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
@@ -47,7 +58,10 @@ class SearchResult:
 
 
 def chart(law: Law, setup: Setup) -> Chart:
-    """Simulate presses with a law at all places and forces of the lattice (about 2,900 presses, one second)."""
+    """Simulate presses with a law at all places and forces of the lattice.
+
+    These are 4,356 presses, and the simulation takes about one second. The chart contains those that are on the skin.
+    """
     axis_mm, log_N = lattice_mm(), np.log(FORCES_N)
     points = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
     flat = points.reshape(-1, 3)
@@ -59,19 +73,25 @@ def chart(law: Law, setup: Setup) -> Chart:
 
 
 def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
-    """Find the place and force of each reading: the chart's point with the nearest field, then a Gauss-Newton step."""
+    """Find the place and the force of each reading.
+
+    The search begins at that lattice point of the chart whose field change is nearest to the reading. A Gauss-Newton
+    step then moves from this point towards the best place and force.
+    """
     blocks = [_search(known, db_uT[i : i + BLOCK_N]) for i in range(0, max(len(db_uT), 1), BLOCK_N)]
     names = SearchResult.__annotations__
     return SearchResult(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
 
 def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
-    # Squared distances of readings from points, without the term |dB|^2, which is the same for all points.
+    # Squared distance of each reading from the field change at each lattice point. The term |dB|^2 is omitted, because
+    # it is the same for all points.
     distance_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T
     nearest = distance_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[nearest], known.slope_uT[nearest]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
-    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # in case a coordinate has no effect
+    # Without damping, the equations could not be solved if one coordinate had no effect on the field.
+    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     steps = np.linalg.solve(square + damping, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
     steps = np.clip(steps, -CELL, CELL)
     residual_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)
@@ -82,7 +102,10 @@ def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
 
 
 def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, " ch"], setup: Setup) -> Law:
-    """Fit a law to unlabelled presses and the no-load field, from nominal parameters (6 s for 65 presses)."""
+    """Fit a law to the unlabelled presses and the no-load field of a skin, starting from nominal parameters.
+
+    This takes 6 s for 65 presses.
+    """
     law = NOMINAL
     for _ in range(ROUNDS_N):
         law = _JointFit(law, setup, db_uT, rest_uT).solve(search(chart(law, setup), db_uT))
@@ -91,7 +114,10 @@ def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Joint least-squares fit of the law's parameters and of x, y and log F of each press (in this order)."""
+    """A least-squares fit of the parameters of the law together with the places and forces of all presses.
+
+    The vector of unknowns contains the parameters, followed by x, y and log F of each press.
+    """
 
     law: Law
     setup: Setup
@@ -122,8 +148,9 @@ class _JointFit:
         return np.concatenate([changes.ravel(), rest, priors])
 
     def slopes(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "r p"]:
-        # The coordinates of a press affect only the residuals of this press. Therefore three simulations, each with one
-        # coordinate of all presses changed, give the derivatives with respect to all coordinates.
+        # The coordinates of a press (x, y and log F) affect only the residuals of this press. Therefore, three
+        # simulations are sufficient for the derivatives with respect to the coordinates of all presses. In each of
+        # them, one coordinate is changed, for all presses at once.
         n, channels_n = self.db_uT.shape
         first, parameters_n = self.residuals(values), len(PARAMETERS)
         columns = np.zeros((len(first), len(values)))

@@ -1,7 +1,10 @@
-"""Compiled loops of `reskin.universal.map`: likelihoods of hypotheses given readings, and moments over hypotheses.
+"""Compiled loops of `reskin.universal.map`, which compute likelihoods of hypotheses and means over hypotheses.
 
-A hypothesis is a pair of a place and a force; the force index varies fastest. The Gaussian of a hypothesis, with mean m
-and covariance C, is stored as W and W m, where W^T W is the inverse of C. For a reading d, chi^2 = |W d - W m|^2.
+A hypothesis is a pair of a place and a force that a press may have. The hypotheses are ordered by place and then by
+force. Under a hypothesis, a reading d has a normal distribution (here called a Gaussian) with a mean m and a covariance
+C. A Gaussian is whitened: instead of m and C, this module stores W m and W, where W^T W is the inverse of C. It follows
+that chi^2 = (d - m)^T C^-1 (d - m) = |W d - W m|^2, which can be computed fast for many readings.
+
 Likelihoods are computed in single precision. The error of chi^2 is below 0.01 for hypotheses under which a reading is
 likely.
 """
@@ -14,13 +17,16 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from numba import njit
 
-LANES_N = 64  # Gaussians per block (axis `l`), for vector instructions
+# Gaussians are processed in blocks of this number, so that the processor can use vector instructions. The position in
+# a block is called a lane (axis `l` of arrays).
+LANES_N = 64
 
 
 @dataclass(frozen=True)
 class LinearMeans:
-    """Means of Gaussians as linear functions of some parameters, arranged in blocks of `LANES_N` Gaussians.
+    """Means of Gaussians, given as linear functions of some parameters.
 
+    The mean of a Gaussian is `mean + slope @ parameters`. The Gaussians are arranged in blocks of `LANES_N` (axis `k`).
     The last block is filled up with copies of the last Gaussian.
     """
 
@@ -30,10 +36,10 @@ class LinearMeans:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Whitened Gaussians, and the log determinants of their covariances.
+    """Whitened Gaussians: W m and W of each Gaussian, and the logarithm of the determinant of its covariance.
 
-    row: one column per Gaussian (axis `h`). Along axis `f`, each channel has its element of W m, followed by its row of
-    W up to the diagonal, because W is lower triangular.
+    `row` has one column per Gaussian (axis `h`). Each column contains, for one channel after the other, the element of
+    W m and the row of W. A row of W ends at the diagonal, because W is lower triangular.
     """
 
     row: Float32[np.ndarray, "f h"]
@@ -42,13 +48,19 @@ class Gaussians:
     def evaluate(
         self, read: Float32[np.ndarray, "n ch"]
     ) -> tuple[Float32[np.ndarray, "n h"], Float32[np.ndarray, "n h"]]:
-        """Return chi^2 of readings under each Gaussian, and the deviance: chi^2 plus the log determinant."""
+        """Return chi^2 and the deviance of each reading under each Gaussian.
+
+        The deviance is chi^2 plus the logarithm of the determinant. It is -2 log likelihood, up to a constant.
+        """
         chi2 = np.zeros((len(read), len(self.log_det)), np.float32)
         _chi2(self.row, read, chi2)
         return chi2, chi2 + self.log_det
 
     def solve(self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n ch"]:
-        """Return C^-1 (d - m) for each reading d; mean m and covariance C are those of the Gaussian `which`."""
+        """Return C^-1 (d - m) for each reading d.
+
+        The mean m and the covariance C are those of one Gaussian per reading, whose index is in `which`.
+        """
         row, solved, f = self.row[:, which], np.zeros_like(read), 0
         for i in range(read.shape[1]):
             to_mean, white = row[f], row[f + 1 : f + 2 + i].T
@@ -59,7 +71,7 @@ class Gaussians:
 
 
 def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
-    """Arrange means and slopes of Gaussians in blocks of `LANES_N`."""
+    """Arrange the means and slopes of Gaussians in blocks of `LANES_N` Gaussians."""
     blocks_n = -(-len(mean) // LANES_N)
     gaussian_i = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
     return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[gaussian_i], 1, -1)) for part in (mean, slope)))
@@ -70,11 +82,13 @@ def whiten(
     residual: Float32[np.ndarray, "h ch"], share: Float32[np.ndarray, " h"], error_cov: Float32[np.ndarray, "ch ch"],
     noise_cov: Float32[np.ndarray, "ch ch"],
 ) -> Gaussians:  # fmt: skip
-    """Whiten Gaussians for normally distributed parameters.
+    """Compute the Gaussians of all hypotheses, and whiten them.
 
-    `parameters` has the mean of the parameters and the lower Cholesky factor L of their covariance. With
-    M = mean + slope @ (mean of the parameters), a Gaussian has the mean M + |M| residual and the covariance
-    (slope L)(slope L)^T + |M|^2 share error_cov + noise_cov.
+    The parameters are normally distributed. `parameters` contains their mean and the lower Cholesky factor L of their
+    covariance. Let M = mean + slope @ (mean of the parameters) be the expected field change of a hypothesis without the
+    error of the law. The Gaussian of this hypothesis has the mean M + |M| residual and the covariance
+    (slope L)(slope L)^T + |M|^2 share error_cov + noise_cov. Its three terms are the uncertainty of the parameters, of
+    the error of the law, and of the noise. `share` is the fraction of the variance of the error that labels have left.
     """
     channels_n = len(error_cov)
     row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
@@ -117,7 +131,7 @@ def _fill(of, parameters, errors, error_cov, noise_cov, row):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _expect(of, value, errors, first, m, var):
-    # Compute the means m = M + |M| residual of one block (M: see `whiten`), and var = |M|^2 share.
+    # Compute the means m = M + |M| residual of one block, and var = |M|^2 share. `whiten` defines M.
     (mean, slope), (residual, share) = of, errors
     _clear(var)
     for i in range(len(m)):
@@ -158,7 +172,7 @@ def _cov(s, var, error_cov, noise_cov, a):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _root(a, log_det):
-    # Replace the lower triangle of `a` by its Cholesky factor, with the reciprocals of the diagonal elements.
+    # Replace the lower triangle of `a` by its Cholesky factor. The diagonal elements are stored as their reciprocals.
     _clear(log_det)
     for j in range(len(a)):
         for p in range(j):
@@ -174,7 +188,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # Compute the inverse of the Cholesky factor in `a`. The inverse is lower triangular, too.
+    # Compute the inverse of the Cholesky factor in `a`. The inverse is also lower triangular.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -187,7 +201,8 @@ def _inverse(a, b):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _write(b, m, log_det, row):
-    # Write W m and W (here `b`) of one block in the order of `Gaussians.row`, followed by the log determinants.
+    # Write W m and W (here `b`) of one block to `row`, in the order of `Gaussians.row`, followed by the logarithms of
+    # the determinants.
     f, n, white_mean = 0, row.shape[1], np.empty(LANES_N, np.float32)
     for i in range(len(b)):
         _clear(white_mean)
@@ -235,31 +250,40 @@ def _clear(value):
         value[lane] = np.float32(0)
 
 
-CELL_SD_MM = (
-    0.2  # smallest standard deviation of a place, because positions within a lattice cell are not distinguished
-)
-TINY = float(np.finfo(np.float32).tiny)  # smallest probability of a place or force in the map
+# Smallest standard deviation of an estimated place. It is not 0, because the map does not distinguish positions within
+# a cell of its lattice.
+CELL_SD_MM = 0.2
+TINY = float(np.finfo(np.float32).tiny)  # smallest probability of a place or a force; smaller ones are replaced by it
 LEAST = math.log(TINY)
-FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one
+FARTHEST = 200.0  # a log likelihood that is farther below the largest one than this is replaced by this limit
 
 
 class Lattice(NamedTuple):
-    """Places of the hypotheses, and the logarithms of the forces at each place."""
+    """The places of the hypotheses, and the logarithms of the forces, which are the same at each place."""
 
     place_mm: Float[np.ndarray, "p 2"]
     log_N: Float[np.ndarray, " q"]
 
 
-Normals = Float[np.ndarray, "n 6"]  # mean of x, mean of y, sd of x, sd of y, mean of log F, sd of log F
+# Normal distributions of x, y and log F for each of n readings. The columns are: mean of x, mean of y, standard
+# deviation of x, standard deviation of y, mean of log F, standard deviation of log F.
+Normals = Float[np.ndarray, "n 6"]
 Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # places [n 2], their standard deviations [n 2], force in N [n]
 
 
 def means(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, power: float
 ) -> Moments:
-    """Return moments over all hypotheses, weighted by a power of their likelihoods.
+    """Return means and standard deviations of place and force over all hypotheses.
 
-    deviance: -2 log likelihood, up to a constant. best: index of the most likely hypothesis for each reading.
+    The hypotheses are weighted by their likelihoods, raised to `power`.
+
+    Parameters
+    ----------
+    deviance : -2 log likelihood of each hypothesis for each reading, up to a constant
+    best : index of the most likely hypothesis for each reading
+    lattice : places and forces of the hypotheses
+    power : likelihood power
     """
     moments = np.empty((len(deviance), 5))
     _means(deviance, best, tuple(lattice), 0.5 * power, moments)
@@ -270,11 +294,24 @@ def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float, force_power: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Multiply the map's marginal probabilities of place and of force by normal distributions; return the moments.
+    """Combine the map's probabilities of place and of force with normal distributions of place and of force.
 
-    The fourth array contains the mean log forces of the map alone, weighted by the power `force_power` of its
-    probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
-    likelihoods. power: power of the product, which affects only standard deviations.
+    The probability of a place is summed over all forces, and that of a force over all places. Both are then multiplied
+    by the normal distributions, which come from networks.
+
+    Parameters
+    ----------
+    deviance : -2 log likelihood of each hypothesis for each reading, up to a constant
+    best : index of the most likely hypothesis for each reading
+    lattice : places and forces of the hypotheses
+    normals : normal distributions of x, y and log F for each reading
+    map_power : power of the map's likelihoods
+    power : power of the product, which affects only the standard deviations of places
+    force_power : power of the map's probabilities of forces, for the fourth result
+
+    Returns
+    -------
+    The mean places, their standard deviations, the forces, and the mean log forces of the map alone
     """
     moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power, force_power), moments)
@@ -355,8 +392,9 @@ def _margins(likely, of_place, of_force):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _moments(log, place_mm, about_mm, power, likely):
-    # Return the means of x and y and the mean squares of their distances from `about_mm`. The weights are a power of
-    # the probabilities, whose logarithms are `log`. `likely` is a work array.
+    # Return the means of x and y, and the mean squares of their distances from `about_mm`. `log` contains the log
+    # probability of each place. The weights of places are these probabilities, raised to `power`. `likely` is a work
+    # array.
     most, sum_, x, y, xx, yy = _most(log), 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(len(log)):
         likely[p] = _exp(power * (log[p] - most))
@@ -392,8 +430,8 @@ def _most(values):
 @njit(inline="always")
 @no_type_check
 def _exp(x):
-    # Return exp(x) for x <= 0: the Taylor series of exp(x / 512), squared nine times. The library's exp is not used,
-    # because it is not vectorised. The relative error is at most 1e-9 for x >= -100, and 5e-7 at x = -200.
+    # Return exp(x) for x <= 0. This is the Taylor series of exp(x / 512), squared nine times. The function `math.exp`
+    # is not used, because it is not vectorised. The relative error is at most 1e-9 for x >= -100, and 5e-7 at x = -200.
     p = (-FARTHEST if x < -FARTHEST else x) * (1 / 512)
     y = p * (1 / 24 + p * (1 / 120 + p * (1 / 720 + p * (1 / 5040 + p * (1 / 40320)))))
     y = 1.0 + p * (1.0 + p * (1 / 2 + p * (1 / 6 + y)))

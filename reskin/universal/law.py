@@ -1,6 +1,8 @@
-"""The law of a skin: a simulation with eleven fitted parameters that gives the field change for any place and force.
+"""The law of a skin: a physical simulation that gives the field change of a press at any place with any force.
 
-This module also fits the law to the presses of one board. Units: uT, mm, N.
+The simulation has parameters, such as the gap between skin and chips, which differ between skins. This module simulates
+presses, and fits up to eleven of the parameters to the recorded presses of one board. Units are uT, mm and N, unless a
+name states another one.
 """
 
 from dataclasses import asdict, dataclass
@@ -18,15 +20,18 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
 from reskin.universal.presses import RecordedPresses, magnitudes_uT
 
-MARGIN_MM = 0.4  # width of the margin around the area of presses
-HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y| and largest |x| + |y| of the paper's grid
+MARGIN_MM = 0.4  # width of a margin around the area of presses; places in the margin count as inside the area
+# The paper's grid is an octagon about the centre. |x| and |y| are at most `HALF_MM`, and |x| + |y| is at most
+# `CORNER_MM`.
+HALF_MM, CORNER_MM = 8.0, 12.0
 
 
 @dataclass(frozen=True)
 class Area:
-    """The places that are pressed: a rectangle around the board's centre, without its corners if `octagon` is set.
+    """The area in which a skin is pressed: a rectangle or an octagon around the board's centre.
 
-    The octagon has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
+    `half_x_mm` and `half_y_mm` are the largest |x| and |y|. If `octagon` is set, the corners of the rectangle are cut
+    off so that the area has the proportions of the paper's grid: |x| / half_x_mm + |y| / half_y_mm is at most 1.5.
     """
 
     half_x_mm: float = HALF_MM
@@ -35,7 +40,7 @@ class Area:
 
     @property
     def half_mm(self) -> Float[np.ndarray, "2"]:
-        """Largest |x| and |y| without the margin."""
+        """Largest |x| and largest |y| of the area, without the margin around it."""
         return np.array([self.half_x_mm, self.half_y_mm])
 
 
@@ -43,7 +48,10 @@ PAPER_AREA = Area()
 
 
 def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[np.ndarray, " n"]:
-    """Return which places (relative to the board's centre) are within an area, including a margin around it."""
+    """Return whether each place is within an area or in the margin around it.
+
+    Places are relative to the board's centre.
+    """
     x_mm, y_mm = np.abs(place_mm).T
     within = (x_mm <= area.half_x_mm + MARGIN_MM) & (y_mm <= area.half_y_mm + MARGIN_MM)
     if not area.octagon:
@@ -52,30 +60,43 @@ def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[
     return within & (scaled_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
-# Quadrature rule for the skin's field, the same as in scene `quick`: the cheapest rule whose error is below 2 % of the
-# field change (measured by experiment `runtime`).
+# The field of a skin is an integral over its volume, which is computed with a quadrature rule. This is the same rule as
+# in scene `quick`: the cheapest rule whose error is below 2 % of the field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
-COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # for training networks; its error is smaller than that of the law
+# A cheaper rule, with which the skins for training networks are simulated. Its error is smaller than that of the law.
+COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board. The first seven differ between boards; the others are the same for a rig."""
+    """Parameters of one skin on its board.
+
+    The first seven parameters differ between the boards of a rig. The others are the same for all of its boards.
+    """
 
     seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
     rotation_deg: float  # rotation of the skin about z
-    gap_mm: float  # distance from the chips to the skin; a fit determines only a combination of gap and amplitude well
-    amplitude: float  # magnetisation relative to nominal
-    label_x_mm: float  # true place of the tip minus its label, along the board's axes
+    # Distance from the chips to the skin. A fit determines well only a combination of gap and amplitude, because a
+    # larger gap and a larger amplitude have opposite effects.
+    gap_mm: float
+    amplitude: float  # magnetisation of the skin relative to the nominal magnetisation
+    label_x_mm: float  # true place of the tip minus the place that its label states, along the board's axes
     label_y_mm: float
-    modulus_MPa: float
-    away_um_mm: float  # slide of the skin under a press: um towards the centre per mm of distance from the centre
-    give_x_um: float  # displacement of the rig and the skin under a press (compliance of the rig)
+    modulus_MPa: float  # Young's modulus of the skin
+    # A press displaces the skin towards the centre of the skin, by this number of um per mm of distance between the
+    # press and the centre. This displacement and the following one are called the slide of the skin.
+    away_um_mm: float
+    # A press also displaces the skin by this vector, which is the same at all places, because the rig gives way.
+    give_x_um: float
     give_y_um: float
     # The following parameters are not fitted.
-    lets_go_N: float = 8.0  # force at which the slide `away_um_mm` vanishes; chosen on both boards of scene lab
-    grip_N_mm: float = 8.75  # lateral stiffness (7 N/mm) / friction coefficient (0.8), from nominal.yaml: skin.hold
+    # The displacement `away_um_mm` decreases with the force of the press, and vanishes at this force. The value was
+    # chosen on both boards of scene lab.
+    lets_go_N: float = 8.0
+    # Lateral stiffness (7 N/mm) divided by the friction coefficient (0.8), both from nominal.yaml, key skin.hold. It
+    # determines how much of the slide friction can cause when a press is light.
+    grip_N_mm: float = 8.75
     tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
@@ -83,16 +104,17 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """Data that all laws of a scene share: the nominal skin design, the chips' positions, the tip, and the area.
+    """What is the same for all boards of a scene: the nominal skin, the positions of the chips, the tip and the area.
 
-    start_law: the law at which fits start, and the mean of the fits' priors; by default `START`.
+    `start_law` is the law at which fits start. It is also the mean of the priors of the fitted parameters. By default,
+    it is `START`.
     """
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # whether all fields have the opposite sign, as if a checkerboard skin is rotated by 90 degrees
+    skin_flipped: bool  # whether all fields have the opposite sign, as those of a checkerboard skin turned by 90° have
     tip_radius_mm: float
     rule: Quadrature = RULE
     coarse_rule: Quadrature = COARSE
@@ -113,7 +135,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Dipoles of the magnetised, undeformed skin; the skin's centre is at the origin."""
+        """Dipoles that represent the magnetised skin without deformation. The centre of the skin is at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -124,7 +146,10 @@ class Setup:
         )
 
     def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
-        """Tabulate the deformation of a skin that slips on its base, for depths up to the deepest press in `slide`."""
+        """Tabulate the deformation of a skin that slips on its base.
+
+        The table covers all depths up to `slide.DEEPEST` times the thickness.
+        """
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
         return deformation.tabulate(
@@ -141,7 +166,10 @@ class Setup:
 
 
 def at_rest_uT(law: Law, setup: Setup, rest: deformation.RestingDipoles | None = None) -> Float[np.ndarray, "k 3"]:
-    """Return the field of the untouched skin at the chips, in the board's axes (`rest`: see `simulate_uT`)."""
+    """Return the field of the untouched skin at the chips, along the board's axes.
+
+    `rest` has the same meaning as in `simulate_uT`.
+    """
     chips_m, turn = setup.chips_under(law)
     rest = rest or setup.rest
     field_T = magnet.field(rest.nodes_m, rest.moments_A_m2, chips_m)
@@ -155,10 +183,11 @@ def simulate_uT(
     force_N: Float[np.ndarray, " n"],
     rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes at the chips, in the board's axes, for presses with these labelled places and forces.
+    """Return the field changes that presses cause at the chips, along the board's axes.
 
-    The law's label offset and rotation convert labelled places to true ones. `rest` replaces the setup's dipoles (at
-    the same nodes), for example for a skin with uneven filler.
+    `place_mm` and `force_N` are the labels of the presses. The offset and the rotation of the labels, which are
+    parameters of the law, convert labelled places to true places. If `rest` is given, its dipoles replace those of the
+    setup, for example to simulate a skin with uneven filler. They must be at the same nodes.
     """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
@@ -177,7 +206,10 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes of the nominal skin, which does not slide, for forces according to `physics.layer`."""
+    """Return the field changes of the nominal skin, which does not slide.
+
+    The depth of a press follows from its force according to `reskin.physics.layer`.
+    """
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -186,7 +218,10 @@ def nominal_uT(
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count presses with a force above the range of a law, or of the nominal skin if `law` is None."""
+    """Count the presses whose force is too large to be simulated with a law.
+
+    If `law` is None, the presses are counted whose force is too large for the nominal skin.
+    """
     if law is None:
         curve_N, _ = _nominal_curve(setup)
         return int((force_N > curve_N[-1]).sum())
@@ -201,7 +236,10 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
 
 
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return the nominal skin's forces and depths, up to the greatest depth for which fields are tabulated."""
+    """Return the force of the nominal skin as a function of depth, as an array of forces and an array of depths in m.
+
+    The last depth is the greatest one for which the deformation is tabulated.
+    """
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
     curve_N = layer.force(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
@@ -224,33 +262,41 @@ def _changes_T(
 
 
 def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
-    """Return the law with the named parameters replaced by these values."""
+    """Return a copy of the law in which the named parameters have these values."""
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Assumed values for fits. START: start values, which are also the means of the priors. PRIOR: standard deviations of
-# the priors. STEP: scales of the parameters.
+# Assumed values for fits. Each is a `Law` whose fields contain one number per parameter: in START the value at which a
+# fit starts, which is also the mean of the prior; in PRIOR the standard deviation of the prior; in STEP the typical
+# size of a change of the parameter, by which the optimiser scales the parameters.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-# Parameters that may differ between boards. If only these are fitted, the other parameters come from a fit to another
-# board.
+# Parameters that may differ between boards of a rig. If only these are fitted to a board, the other parameters come
+# from a fit to another board.
 SEVEN = (*OF_BOARD, "rotation_deg")
-PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of |dB|^2
-# Weight of the residuals that compare the growth of |dB| with force. Each group of presses has one such residual: the
-# group's mean error of log|dB|, minus the mean over all groups.
+# Weight of the priors in a fit. The value was chosen on both boards of scene lab. With 0.5, one of four fits explains
+# only 79.6 % of |dB|^2.
+PRIOR_WEIGHT = 0.25
+# Weight of the residuals that compare how |dB| grows with force in the simulation and in the recording. Each group of
+# presses (see `RecordedPresses`) has one such residual: the mean error of log|dB| in this group minus the mean over all
+# groups.
 GROWTH_WEIGHT = 10.0
-OFFSET_uT = 200.0  # standard deviation of the no-load field due to chips' offsets (spreads.chip_offset_uT)
-# Maximum number of least-squares steps. The fits of scene lab need 5. A tenfold smaller ftol changes the cosine between
-# simulated and recorded field changes by 0.0001.
+OFFSET_uT = 200.0  # standard deviation of the chips' offsets, which are part of the no-load field
+# Maximum number of least-squares steps. The fits of scene lab need 5. More accurate fits are not needed: with a tenfold
+# smaller `ftol`, the cosine between simulated and recorded field changes changes by only 0.0001.
 EVALUATIONS_MAX_N = 10
 
 
 @dataclass(frozen=True)
 class AlignedPresses:
-    """Presses on a board, with places in the board's frame and fields along the board's axes."""
+    """Recorded presses on a board, converted to the frame and the axes of the board.
+
+    `recorded` contains the presses as they were recorded. `place_mm`, `db_uT` and `rest_uT` are their places, their
+    field changes and the no-load field after the conversion.
+    """
 
     recorded: RecordedPresses
     place_mm: Float[np.ndarray, "n 2"]
@@ -259,7 +305,11 @@ class AlignedPresses:
 
 
 def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law | None = None) -> Law:
-    """Fit the named parameters by least squares; other parameters are those of `start` (default: `setup.start`)."""
+    """Fit the named parameters of the law to the presses on a board by least squares.
+
+    The fit starts at the law `start`, by default `setup.start`. All other parameters keep the values that they have in
+    this law.
+    """
     start = start or setup.start
     magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)
@@ -276,7 +326,8 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
         return np.concatenate([changes.ravel(), rest.ravel(), priors, GROWTH_WEIGHT * (by_group - by_group.mean())])
 
     first = np.array([getattr(start, name) for name in names])
-    # Simulated fields have kinks at the tabulated depths. With a smaller diff_step, kinks would distort derivatives.
+    # As functions of depth, simulated fields have kinks at the tabulated depths. With a smaller `diff_step`, these
+    # kinks would distort the derivatives.
     result = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )
@@ -284,7 +335,7 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
-    # The skin must be above its chips, be magnetised, and have some stiffness.
+    # The lower limits ensure that the skin is above its chips, is magnetised, and has some stiffness.
     least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
 
@@ -295,12 +346,18 @@ TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 
 
 def to_board(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...] = TURNS_DEG) -> Float[np.ndarray, "f ch"]:
-    """Rotate readings from the axes of chips with these rotations to the board's axes."""
+    """Convert readings along the chips' axes to readings along the board's axes.
+
+    `turns_deg` contains the rotation of each chip about z.
+    """
     return b_uT @ _turn(turns_deg)
 
 
 def to_chips(b_uT: Float[np.ndarray, "f ch"], turns_deg: tuple[float, ...] = TURNS_DEG) -> Float[np.ndarray, "f ch"]:
-    """Rotate readings from the board's axes to the axes of chips with these rotations."""
+    """Convert readings along the board's axes to readings along the chips' axes.
+
+    `turns_deg` contains the rotation of each chip about z.
+    """
     return b_uT @ _turn(turns_deg).T
 
 

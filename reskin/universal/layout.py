@@ -1,6 +1,6 @@
-"""The layout of a board for which the universal model is made: chips, skin, tip and area of presses.
+"""The layout of a board for which a universal model is made: its chips, its skin, the tip and the area of presses.
 
-A user writes a layout as a YAML file. In the folder `layouts`, `reskin.yaml` explains each key.
+A user writes a layout as a YAML file. The file `layouts/reskin.yaml` is an example, which explains each key.
 """
 
 import math
@@ -25,19 +25,21 @@ from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import THICKNESSES, TIPS, Forces
 
 FOLDER = Path(__file__).with_name("layouts")  # the layouts that come with the project
-FORCES_N = 9  # number of tabulated forces
-CHIPS_APART_MM = 0.5  # smallest distance between two chips; a chip is larger
+FORCES_N = 9  # number of forces at which the map tabulates fields
+CHIPS_APART_MM = 0.5  # smallest distance between the centres of two chips, which is less than the width of a chip
 EDGE_MM = 0.5  # smallest distance from the area of presses to the edge of the skin
-SIDE_MM = 20.0  # side of the paper's skin; quadrature cells grow in proportion to larger skins
+# Side of the paper's skin. For larger skins, the cells of the quadrature rule are larger in proportion.
+SIDE_MM = 20.0
 
 Coordinate = Annotated[float, Field(ge=-200, le=200)]
 Length = Annotated[float, Field(gt=0, le=200)]
 
 
 class ChipPlace(Strict):
-    """Position of a chip relative to the board's centre, and the rotation of its axes about z.
+    """Position of a chip relative to the board's centre, and rotation of the chip's axes about z.
 
-    The rotation is counterclockwise, seen from above the skin: with 90, the chip's x axis is along the board's y axis.
+    The rotation is counterclockwise if seen from above the skin. With 90, for example, the x axis of the chip points in
+    the direction of the board's y axis.
     """
 
     x_mm: Coordinate
@@ -46,18 +48,19 @@ class ChipPlace(Strict):
 
 
 class SkinStack(Strict):
-    """The nominal skin. The model is also trained on skins that differ from the nominal skin."""
+    """The nominal skin of a board. The model is trained on skins that differ from it at random."""
 
     size_mm: tuple[Length, Length]
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     polarity: Polarity
-    flipped: bool  # the polarity of all magnets is reversed
-    magnetisation: Annotated[float, Field(gt=0, le=100)]  # relative to the filler in nominal.yaml: saturation 0.123 T
+    flipped: bool  # whether the polarity of all magnets is reversed
+    # Magnetisation relative to that of the filler in nominal.yaml, which has a saturation of 0.123 T.
+    magnetisation: Annotated[float, Field(gt=0, le=100)]
     modulus_MPa: Annotated[float, Field(gt=0, le=100)]
 
 
 class PressArea(Strict):
-    """The places that may be pressed: a rectangle around the board's centre, without its corners if `octagon`."""
+    """The places that may be pressed: a rectangle around the board's centre or, if `octagon` is set, an octagon."""
 
     half_x_mm: Length
     half_y_mm: Length
@@ -70,12 +73,14 @@ class BoardLayout(Strict):
     name: Annotated[str, Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     chips: Annotated[tuple[ChipPlace, ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     centre_mm: tuple[Coordinate, Coordinate]  # the board's centre in the coordinates of labels and estimates
-    gap_mm: Annotated[float, Field(ge=0.8, le=20)]  # from the chips' sensing plane to the skin
+    gap_mm: Annotated[float, Field(ge=0.8, le=20)]  # distance from the sensing plane of the chips to the skin
     skin: SkinStack
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     area: PressArea
-    force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]  # least, largest
-    # Standard deviations of the law's parameters, which replace the values in `map.NOMINAL_SPREADS`.
+    # Smallest and largest force.
+    force_N: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
+    # Standard deviations of some parameters of the law (`reskin.universal.law`) over skins. For all other parameters,
+    # the values in `map.NOMINAL_SPREADS` are used.
     spreads: dict[str, Annotated[float, Field(gt=0, le=100)]]
 
     @model_validator(mode="after")
@@ -109,7 +114,7 @@ class BoardLayout(Strict):
 
     @property
     def channels_n(self) -> int:
-        """Number of values of a reading: three per chip."""
+        """Number of values in one reading, which has three values per chip."""
         return 3 * len(self.chips)
 
     @property
@@ -129,12 +134,15 @@ class BoardLayout(Strict):
 
     @property
     def turns_deg(self) -> tuple[float, ...]:
-        """Rotations of the chips about z."""
+        """Rotation of each chip about z in degrees."""
         return tuple(float(chip.turn_deg) for chip in self.chips)
 
     @property
     def reach_mm(self) -> Float[np.ndarray, "2 2"]:
-        """Edges of the skin relative to the board's centre; rows: smallest and largest x and y."""
+        """The edges of the skin relative to the board's centre.
+
+        The first row contains the smallest x and y, the second row the largest x and y.
+        """
         return np.array([[-0.5], [0.5]]) * self.skin.size_mm
 
     @property
@@ -145,14 +153,20 @@ class BoardLayout(Strict):
 
     @property
     def forces(self) -> Forces:
-        """Distribution of forces in training; a fifth of the presses have at most ten times the least force."""
+        """Distribution of the forces of presses in training.
+
+        A fifth of the presses are light: their force is at most ten times the smallest force.
+        """
         least_N, largest_N = self.force_N
         between_N = min(10 * least_N, (least_N * largest_N) ** 0.5)
         return Forces(between_N, largest_N / 0.95, light_N=least_N, light_share=0.2)
 
     @property
     def law(self) -> Law:
-        """The central law: the nominal one, with this layout's gap, magnetisation and modulus."""
+        """The central law, around which the skins for training are drawn.
+
+        This is the nominal law with the gap, the magnetisation and the modulus of this layout.
+        """
         return with_parameters(NOMINAL, *self._own_parameters)
 
     @property
@@ -162,11 +176,11 @@ class BoardLayout(Strict):
 
     @property
     def all_spreads(self) -> dict[str, float]:
-        """Standard deviations of the law's parameters."""
+        """Standard deviations of all parameters of the law over skins."""
         return NOMINAL_SPREADS | self.spreads
 
     def setup(self) -> Setup:
-        """Return the nominal skin on this board, for simulations."""
+        """Return the setup for simulations of the nominal skin on this board."""
         skin = self.skin.model_dump(include={"thickness_mm", "polarity", "flipped"})
         changes = skin | {"tip_radius_mm": self.tip_radius_mm}
         design = parse(SkinDesign, nominal("skin", changes), f"{NOMINAL_FILE}: skin")
@@ -178,20 +192,22 @@ class BoardLayout(Strict):
         )  # fmt: skip
 
     def to_board(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Rotate readings from the chips' axes to the board's axes."""
+        """Convert readings along the chips' axes to readings along the board's axes."""
         return to_board(b_uT, self.turns_deg)
 
     def to_chips(self, b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Rotate readings from the board's axes to the chips' axes."""
+        """Convert readings along the board's axes to readings along the chips' axes."""
         return to_chips(b_uT, self.turns_deg)
 
 
 def read_layout(file: Path | str) -> BoardLayout:
-    """Read a layout from a YAML file, or a layout of the project by its name: reskin, anyskin or eflesh.
+    """Read a layout from a YAML file.
+
+    `file` can also be the name of a layout that comes with the project: reskin, anyskin or eflesh.
 
     Raises
     ------
-    ParamsError : the file is missing or is not YAML, or a key is missing, unknown or wrong
+    ParamsError : the file is missing or is not YAML, or one of its keys is missing, is unknown or has a wrong value
     """
     path = Path(file)
     if path.suffix not in (".yaml", ".yml"):
@@ -207,7 +223,10 @@ def read_layout(file: Path | str) -> BoardLayout:
 
 
 def as_layout(value: Any, where: str) -> BoardLayout:
-    """Create a layout from plain values; raise ParamsError that starts with `where`."""
+    """Create a layout from the content of a YAML or JSON file.
+
+    Raises ParamsError if the content is invalid. `where` is the beginning of its message.
+    """
     return parse(BoardLayout, value, where)
 
 

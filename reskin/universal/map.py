@@ -14,8 +14,10 @@ This module uses the following terms:
 - The map is conditioned on data of a skin: each datum (no-load field, press at an unknown place, labelled press)
   changes the distribution of the skin's parameters and of the error of the law.
 
-The prior of the parameters consists of tables of field changes of the central law, and of their derivatives with
-respect to the parameters.
+Before conditioning, the parameters are normally distributed about those of the central law. A standard deviation of
+this distribution is called the spread of a parameter. Tables contain the field changes of the central law and their
+derivatives with respect to the parameters, so that the field change of other parameters is found by linear
+extrapolation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,10 +47,10 @@ from reskin.universal.law import (
 
 PITCH_MM, STEPS_MAX_N = 0.8, 28  # lattice of places: pitch, and largest number of places along each axis
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
-LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spread is the standard deviation of their logarithm
-# Standard deviations of a skin's parameters. RIG_SPREADS: about the mean of known boards of the same rig.
-# NOMINAL_SPREADS: about nominal parameters, if no board is known. The values are assumed. They are larger than the
-# differences between the two recorded boards.
+LOGARITHMIC = ("amplitude", "modulus_MPa")  # the spread of these parameters is the standard deviation of the logarithm
+# Spreads of the parameters. If other boards of the same rig are known, a skin's parameters differ from the mean of
+# these boards by `RIG_SPREADS`. If no board is known, they differ from the nominal parameters by `NOMINAL_SPREADS`. All
+# values are assumed. They are larger than the differences between the two recorded boards.
 RIG_SPREADS = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
     "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
@@ -58,12 +60,12 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# Nominal parameters. The form of the law, `away_um_mm` and `lets_go_N` come from the recorded boards of scene lab. So
-# does the pair of gap and amplitude, which is one of many pairs that fit a board about equally well. `away_um_mm` is
-# the slide of the skin towards its centre under a press, in um per mm of distance from the centre. The modulus is that
-# of Dragon Skin 10 with filler (150 to 230 kPa).
+# Nominal parameters. The form of the law and the parameters gap, amplitude, `away_um_mm` and `lets_go_N` come from the
+# recorded boards of scene lab. Gap and amplitude are one of many pairs that fit a board about equally well. The modulus
+# is that of Dragon Skin 10 with filler (150 to 230 kPa). See `Law` for the meaning of each parameter.
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
-STEP = 0.4  # step of the finite differences that give the slopes, in units of the parameters' spreads
+# To compute a derivative by finite differences, each parameter is changed by this value times its spread.
+STEP = 0.4
 
 
 @dataclass(frozen=True)
@@ -146,13 +148,14 @@ def perturb(centre: Law, name: str, by: float) -> Law:
 
 
 Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
-# Length scales of the law's errors in place and in log force. The errors' correlation is 0.74 between places that are
-# 2 mm apart, and 0.2 between places that are 6 mm apart.
+# Distances in place and in log force over which the errors of the law are similar (length scales of `kernel`). The
+# errors at places that are 2 mm apart have a correlation of 0.8. For places that are 6 mm apart, it is 0.14.
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
-NOISE = 0.1  # fraction of the variance of the law's error that differs between presses at the same place
+NOISE = 0.1  # fraction of the variance of the law's error that differs from press to press at the same place
 SHARED = 0.55  # fraction of the variance of the law's error that is the same on all boards
-# A few boards are not enough to determine the covariance between channels. The covariance that is used is therefore a
-# weighted mean of the one of the boards and of an isotropic matrix. This is the weight of the isotropic matrix.
+# A few known boards are not enough to determine the covariance of the errors between channels. Therefore, a weighted
+# mean of two matrices is used: the covariance of the errors on the known boards, and an isotropic matrix (equal
+# variances, no correlation). This is the weight of the isotropic matrix.
 EVEN = 0.5
 
 
@@ -205,7 +208,11 @@ def kernel(
     a_mm: Float[np.ndarray, "n 2"], b_mm: Float[np.ndarray, "m 2"], a_log_N: Float[np.ndarray, " n"],
     b_log_N: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n m"]:  # fmt: skip
-    """Return correlations of the law's errors between two sets of presses: squared exponential in place and log F."""
+    """Return the correlation of the law's error between each press of one set and each press of another set.
+
+    The correlation decreases with the distance between the places and between the logarithms of the forces (squared
+    exponential function).
+    """
     distance_mm2 = ((a_mm[:, None] - b_mm[None]) ** 2).sum(axis=2)
     distance_log2 = (a_log_N[:, None] - b_log_N[None]) ** 2
     return np.exp(-distance_mm2 / (2 * LENGTH_MM**2) - distance_log2 / (2 * LENGTH_LOG_N**2))
@@ -222,8 +229,9 @@ class Information:
     The inverse of the information matrix is the covariance of the parameters that this press alone would determine.
     """
 
-    matrix: Float32[np.ndarray, "h tt"]  # information matrix, flattened
-    per_uT: Float32[np.ndarray, "h ch t"]  # information vector, per uT of a channel's deviation from its mean
+    matrix: Float32[np.ndarray, "h tt"]  # information matrix of each hypothesis, flattened
+    # Contribution of each channel to the information vector, if the channel deviates by 1 uT from its expected value.
+    per_uT: Float32[np.ndarray, "h ch t"]
 
 
 @dataclass(frozen=True)
@@ -248,7 +256,9 @@ class Hypotheses:
 
     @cached_property
     def noise_cov(self) -> Float[np.ndarray, "ch ch"]:
-        """Covariance of the parts of a reading that the skin does not cause: noise, and the external field if any."""
+        """Covariance of that part of a reading that the skin does not cause: noise and, if there is one, the external
+        field.
+        """
         noise = NOISE_uT**2 * np.eye(len(self.error_cov))
         return noise if self.external_cov is None else noise + self.external_cov
 
@@ -264,7 +274,10 @@ class Hypotheses:
 
     @cached_property
     def information(self) -> Information:
-        """The information from an unlabelled press. The law's error (before conditioning) is treated as noise."""
+        """What an unlabelled press tells about the parameters under each hypothesis.
+
+        The error of the law is treated like noise, with the covariance that it has before conditioning.
+        """
         slope_uT, h = self.slope_uT.astype(float), len(self.mean_uT)
         squared_uT2 = (self.mean_uT.astype(float) ** 2).sum(axis=1)
         cov = squared_uT2[:, None, None] * self.error_cov + self.noise_cov
@@ -274,7 +287,9 @@ class Hypotheses:
 
     @cached_property
     def expected_uT(self) -> Float32[np.ndarray, "h ch"]:
-        """Expected field changes before conditioning, including the residual from known boards."""
+        """Expected field change of each hypothesis before conditioning: that of the central law plus the law's error
+        that is expected from known boards.
+        """
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
 
@@ -305,7 +320,7 @@ SHARE_MIN = 0.03  # however many labels there are, this fraction of the variance
 # Weight of an unlabelled press. It is below 1 because the law's errors at nearby places are correlated, so that many
 # presses contain less information than the same number of independent ones.
 PRESS_WEIGHT = 0.2
-ROUNDS_N = 3  # default number of rounds of expectation maximisation
+ROUNDS_N = 3  # rounds of expectation maximisation in `condition_on_presses`, unless the caller passes another number
 LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
 # `shift_onto_area` computes the density of presses on a lattice of places. The lattice extends beyond the area by the
 # first value, and its step is the second value. The third value is the largest shift.
@@ -315,7 +330,9 @@ AREA_BEYOND_MM, AREA_STEP_MM, SHIFT_MAX_MM = 4.0, 0.2, 2.0
 DENSITY_MIN = 1e-3
 # The mean place of evenly spread presses is close to the centre of the labels' frame, with this standard deviation.
 EVEN_MM = 0.15
-WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
+# Hypotheses are left out if their weight is below this fraction of the largest weight, because they would not change a
+# sum in single precision.
+WEIGHT_MIN = 1e-9
 
 
 @dataclass(frozen=True)
@@ -329,7 +346,7 @@ class Estimate:
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
-    misfit: Float[np.ndarray, " n"]  # chi^2 per channel: about 1 for a press on this skin
+    misfit: Float[np.ndarray, " n"]  # chi^2 per channel, which is about 1 if the map describes the skin well
     sd_log_N: Float[np.ndarray, " n"]
 
 
@@ -353,7 +370,9 @@ class Likelihoods:
     channels_n: int
 
     def misfit(self) -> Float[np.ndarray, " n"]:
-        """Return chi^2 per channel of each reading's most likely hypothesis."""
+        """Return the misfit of each reading, which is chi^2 of its most likely hypothesis, divided by the number of
+        channels.
+        """
         return self.chi2[np.arange(len(self.chi2)), self.best] / self.channels_n
 
     def probabilities(self) -> Float[np.ndarray, "n h"]:
@@ -368,9 +387,9 @@ class LabelledErrors:
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
-    solved: Float[np.ndarray, "m ch"]  # inverse of the correlation matrix times the errors at these presses
-    inverse: Float[np.ndarray, "m m"]  # inverse of the errors' correlation matrix
-    by_day: Float[np.ndarray, " m"]  # correlation of the errors between each press's day and the current day
+    solved: Float[np.ndarray, "m ch"]  # `inverse` times the errors at these presses
+    inverse: Float[np.ndarray, "m m"]  # inverse of the correlation matrix of the law's errors at these m presses
+    by_day: Float[np.ndarray, " m"]  # correlation of the errors between the day of a press and the current day
 
 
 @dataclass(frozen=True)
@@ -393,7 +412,7 @@ class SkinMap:
 
     @property
     def error_cov(self) -> Float[np.ndarray, "ch ch"]:
-        """Covariance of the law's relative error between channels."""
+        """Covariance of the law's relative error between channels, before conditioning on labels."""
         return self.hypotheses.error_cov
 
     @property
@@ -444,24 +463,34 @@ class MapEvaluator:
         return (expected + k @ labelled.solved).astype(np.float32), share.astype(np.float32)
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Likelihoods:
-        """Return the likelihoods of all hypotheses for each reading."""
+        """Compute the likelihood of every hypothesis for each reading."""
         chi2, deviance = self.gaussians.evaluate(db_uT.astype(np.float32))
         return Likelihoods(chi2, deviance, deviance.argmin(axis=1), db_uT.shape[1])
 
     def without_external(self, db_uT: Float[np.ndarray, "n ch"], likelihoods: Likelihoods) -> Float[np.ndarray, "n ch"]:
-        """Subtract the external field that is expected under the most likely hypothesis about each press."""
+        """Subtract the external field from readings.
+
+        The external field of a reading is not known. What is subtracted is its expected value under the hypothesis that
+        is most likely for this reading.
+        """
         external_cov = self._hypotheses.external_cov
         if external_cov is None:
             return db_uT
         return db_uT - self.gaussians.solve(db_uT.astype(np.float32), likelihoods.best) @ external_cov
 
     def mean(self, likelihoods: Likelihoods, power: float) -> Estimate:
-        """Estimate places and forces as means over all hypotheses, weighted by a power of their likelihoods."""
+        """Estimate places and forces as weighted means over all hypotheses.
+
+        The weights are the likelihoods of the hypotheses, raised to the given power.
+        """
         moments = means(likelihoods.deviance, likelihoods.best, self.lattice, power)
         return Estimate(*moments, likelihoods.misfit(), np.full(len(likelihoods.best), np.nan))
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
-        """Estimate places and forces of readings as means over all hypotheses, weighted by their likelihoods."""
+        """Estimate the places and forces of readings as means over all hypotheses, weighted by their likelihoods.
+
+        The readings are processed in blocks of `block_n`, which limits the memory.
+        """
         starts = range(0, len(db_uT), block_n)
         return concatenate([self.mean(self.evaluate(db_uT[i : i + block_n]), 1.0) for i in starts])
 
@@ -486,11 +515,15 @@ def condition_on_noload(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> S
 
 
 def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds_n: int = ROUNDS_N) -> SkinMap:
-    """Condition the map on presses at unknown places, by expectation maximisation over their places and forces."""
+    """Condition the map on presses at unknown places with unknown forces, by expectation maximisation.
+
+    Each round first computes the probabilities of all hypotheses for each press. It then conditions the parameters on
+    the presses, with each hypothesis weighted by its probability.
+    """
     information, expected_uT, posterior = skin.hypotheses.information, skin.hypotheses.expected_uT, skin
     for _ in range(rounds_n):
         weight = PRESS_WEIGHT * posterior.evaluator.evaluate(db_uT).probabilities()
-        total = weight.sum(axis=0)  # sum over presses for each hypothesis
+        total = weight.sum(axis=0)  # weight of each hypothesis, summed over presses
         kept = np.flatnonzero(total > WEIGHT_MIN * total.max())
         off_uT = weight[:, kept].T @ db_uT.astype(np.float32) - total[kept][:, None] * expected_uT[kept]
         t = len(skin.tables.names)
@@ -501,7 +534,11 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
 
 
 def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -> SkinMap:
-    """Condition the map on evenly spread presses; their mean place is assumed to be the centre of the labels' frame."""
+    """Condition the map on presses that are evenly spread over the skin.
+
+    The mean of their places is assumed to be the centre of the labels' frame. This determines the offset between the
+    labels' frame and the board.
+    """
     label_i = [skin.tables.names.index(name) for name in LABEL_OFFSETS]
     spread_mm = skin.tables.spreads[label_i]
     row = np.zeros((2, len(skin.tables.names)))
@@ -514,7 +551,10 @@ def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -
 
 
 def move_places(skin: SkinMap, by_mm: Float[np.ndarray, "2"]) -> SkinMap:
-    """Move all places that the map estimates, by changing the means of the labels' offsets."""
+    """Move all places that the map estimates.
+
+    The offset of the labels' frame is a parameter of the map. Its mean is changed so that the estimates move.
+    """
     label_i = [skin.tables.names.index(name) for name in LABEL_OFFSETS]
     mean = skin.mean.copy()
     mean[label_i] -= by_mm / skin.tables.spreads[label_i]
@@ -548,9 +588,13 @@ def condition_on_labels(
     db_uT: Float[np.ndarray, "m ch"],
     days_ago: Int64[np.ndarray, " m"] | None = None,
 ) -> SkinMap:
-    """Condition on labelled presses: first the skin's parameters, then the law's errors near these presses.
+    """Condition the map on labelled presses.
 
-    days_ago: number of calls of `begin_day` since each press. By default, all presses are of the current day.
+    First, the parameters of the skin are conditioned on the presses. Then, the law's errors are conditioned on the
+    deviations that remain at these presses.
+
+    `days_ago` is the number of calls of `begin_day` since each press was made. By default, all presses are of the
+    current day.
     """
     if not len(place_mm):
         return skin
@@ -562,8 +606,8 @@ def condition_on_labels(
     root = np.linalg.cholesky(k)
     deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
     slope = _slopes_by_day(skin, slope_uT / magnitude_uT[:, None, None], days_ago)
-    # The law's errors are correlated between presses (k) and between channels (error_cov). Whiten over presses and
-    # channels.
+    # The law's errors are correlated between presses (`k`) and between channels (`error_cov`). Both correlations are
+    # removed, so that `_condition` can treat all elements as independent.
     white = solve_triangular(
         root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
     )
@@ -577,11 +621,12 @@ def condition_on_labels(
 
 
 def begin_day(skin: SkinMap) -> SkinMap:
-    """Return the map for a day on which the skin slides differently; `skin` must not be conditioned on labels.
+    """Return the map for a new day on which the skin slides differently than on the days before.
 
-    The parameters of the slide get new values, which have the correlation `SLIDE_CORRELATION` with the values of the
-    day before. Their prior is the same on all days. The values of earlier days are appended to the parameters, because
-    the labelled presses of these days depend on these values.
+    The parameters of the slide have new values on the new day. Their correlation with the values of the day before is
+    `SLIDE_CORRELATION`, and their prior is the same on all days. The values of the days before are appended to the
+    parameters of the map, because the labelled presses of a day depend on the slide of this day. The map `skin` must
+    not be conditioned on labels.
     """
     slide_i, t, p = _slide_indices(skin), len(skin.tables.names), len(skin.mean)
     transition = np.zeros((p + len(slide_i), p))
@@ -601,7 +646,10 @@ def _slide_indices(skin: SkinMap) -> list[int]:
 def _slopes_by_day(
     skin: SkinMap, slope: Float[np.ndarray, "m ch t"], days_ago: Int64[np.ndarray, " m"]
 ) -> Float[np.ndarray, "m ch p"]:
-    """Return slopes with respect to all parameters of a map; each press depends on the slide of only its own day."""
+    """Return the derivatives of field changes with respect to all parameters of a map, including earlier days.
+
+    A press depends on the slide of its own day only. Its derivatives with respect to the slide of other days are 0.
+    """
     t, slide_i = slope.shape[2], _slide_indices(skin)
     if len(skin.mean) == t:
         return slope
@@ -617,14 +665,18 @@ def _slopes_by_day(
 def _condition(
     skin: SkinMap, row: Float[np.ndarray, "r t"], value: Float[np.ndarray, " r"], var: Float[np.ndarray, " r"]
 ) -> SkinMap:
-    """Condition on linear observations: row @ parameters = value + N(0, var)."""
+    """Condition the parameters on linear observations.
+
+    Each observation states that `row @ parameters` equals `value`, with a normally distributed error of variance `var`.
+    """
     return _add_information(skin, row.T @ (row / var[:, None]), row.T @ (value / var))
 
 
 def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Float[np.ndarray, " t"]) -> SkinMap:
-    """Condition the Gaussian of the parameters on observations, given as information matrix and information vector.
+    """Condition the parameters on observations that are given as information matrix and information vector.
 
-    Matrix and vector may have only the first parameters of the map, if they have no information about the others.
+    Both may be shorter than the number of parameters of the map. The observations then contain no information about the
+    last parameters.
     """
     if more_n := len(skin.mean) - len(vector):
         matrix, vector = np.pad(matrix, (0, more_n)), np.pad(vector, (0, more_n))
@@ -636,7 +688,11 @@ def _add_information(skin: SkinMap, matrix: Float[np.ndarray, "t t"], vector: Fl
 def interpolate(
     skin: SkinMap, place_mm: Float[np.ndarray, "m 2"], force_N: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m ch t"], Relative]:
-    """Interpolate tabulated means and slopes linearly in place and log F; also return the law's expected errors."""
+    """Interpolate the tables at the places and forces of presses.
+
+    Returns the field changes of the central law, their derivatives with respect to the parameters, and the expected
+    relative errors of the law. The interpolation is linear in place and in the logarithm of the force.
+    """
     tables = skin.tables
     axes = tables.axis_mm, tables.axis_mm, np.log(tables.force_N)
     points = np.column_stack([place_mm, np.log(force_N)])
@@ -685,7 +741,10 @@ def _remaining_errors(
     skin: SkinMap, a_mm: Float[np.ndarray, "n 2"], a_log_N: Float[np.ndarray, " n"], b_mm: Float[np.ndarray, "m 2"],
     b_log_N: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n m"]:  # fmt: skip
-    """Return the correlation of the law's errors between two sets of presses, given the labels."""
+    """Return the covariance of the law's errors between two sets of presses that remains after conditioning on labels.
+
+    It is relative to the variance of an error before conditioning, so without labels it is the correlation of `kernel`.
+    """
     prior, labelled = kernel(a_mm, b_mm, a_log_N, b_log_N), skin.labelled
     if labelled is None:
         return prior

@@ -110,7 +110,8 @@ BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 POWER_uT, POWER_PER_LABEL_uT = 110.0, 10.0
 EXTERNAL_MAX_uT = 1000.0  # largest allowed external field; much larger ones would require double precision
 
-FILE = Path(__file__).with_name("universal.safetensors")  # the model's card is universal.json
+# File of the model that comes with the project. Its model card, which describes the model, is universal.json.
+FILE = Path(__file__).with_name("universal.safetensors")
 FORMAT, FORMAT_3 = "reskin-universal-4", "reskin-universal-3"
 # A shift of all places is caused by these two parameters. Their spreads therefore give the standard deviation of the
 # prior of the shift.
@@ -119,10 +120,8 @@ OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")
 # this value, the slide is assumed to be unchanged. Otherwise, a change is assumed, because an unnoticed change costs
 # more accuracy than a wrongly assumed one. The value was chosen on simulated skins.
 SAME_SLIDE_LOG_ODDS_MIN = 2.0
-UNSTORED = (
-    "names",
-    "area",
-)  # fields of `Tables` that model files do not contain, because the model card determines them
+# Fields of `Tables` that model files do not contain, because the model card determines them.
+UNSTORED = ("names", "area")
 CHOICE_EVERY_N = 3  # to propose the next labelled press, only every third place of the lattice is considered
 
 
@@ -151,7 +150,7 @@ class Evaluation:
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
-        """Estimate with the networks alone; the misfit is NaN."""
+        """Estimate with the networks alone. The misfits are NaN, because networks do not determine a misfit."""
         own, unknown = self.network, np.full(len(self.network.log_N), np.nan)
         return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), unknown, unknown)
 
@@ -232,7 +231,7 @@ class CalibratedModel:
         return replace(self, networks=[shift_places(layers, offset_mm) for layers in self.networks], offsets_mm=())
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Estimate places and forces with map and networks, once for each likelihood power."""
+        """Combine map and networks to estimate places and forces, once for each likelihood power."""
         return self.estimate_by(lambda evaluation: [evaluation.combined(power) for power in powers], db_uT)
 
     def estimate_by(
@@ -258,7 +257,7 @@ class CalibratedModel:
         return Evaluation(*own, few, None if few is None else few.skin.evaluator.evaluate(db_uT))
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-        """Estimate places and forces with the networks alone, with the offsets added to the places."""
+        """Estimate places and forces with the networks alone, and add the offsets to the places."""
         estimate = network.evaluate(self.networks, db_uT)
         for offset_mm in self.offsets_mm:
             estimate = replace(estimate, place_mm=estimate.place_mm + offset_mm)
@@ -273,7 +272,7 @@ class HeldOutLabels(NamedTuple):
 
 
 def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
-    """Fit the line that calibrates forces to the labels whose force is known."""
+    """Fit the line that calibrates forces (`reskin.universal.force`) to the labels whose force is known."""
     if not any(fold.labels.known.any() for fold in folds):
         return prior_line()
     log_forces = [[log_N[fold.labels.known] for log_N in fold.evaluation.log_forces()] for fold in folds]
@@ -304,7 +303,7 @@ class PressCalibration:
 
     @cached_property
     def even_mm(self) -> Float[np.ndarray, "e 2"]:
-        """Places that the networks estimate for the evenly spread presses."""
+        """Places of the evenly spread presses as estimated by the networks."""
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
     @cached_property
@@ -325,8 +324,9 @@ class PressCalibration:
 
     @cached_property
     def moved(self) -> SkinMap:
-        """The map; if presses are at random places all over the area of presses, its places are shifted like those of
-        the networks.
+        """The map, with the same shift of places as the networks if the shift was estimated from random presses.
+
+        Random presses are presses at random places all over the area of presses. Without them, this is `skin`.
         """
         return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
 
@@ -371,24 +371,33 @@ class PressCalibration:
         return [(labels, self.layers), *([] if earlier is None else earlier.labels_by_day(earlier.data.labels))]
 
     def held_out(self, labels: LabelledPresses, *, few: bool | None = None) -> Iterator[HeldOutLabels]:
-        """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
+        """Evaluate the labelled presses by cross-validation.
+
+        The labels are split into folds. The presses of each fold are evaluated with a model that is calibrated to the
+        labels of all other folds. `few` has the same meaning as in `with_labels`.
+        """
         few = has_few(reduce(join_labels, (day for day, _ in self.labels_by_day(labels)))) if few is None else few
         for kept, held_out in folds_of_labels(len(labels)):
             model = self.with_labels(labels[kept], few=few).with_offsets_in_biases()
             yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
 
     def held_out_earlier(self, few: bool) -> list[HeldOutLabels]:
-        """Evaluate the labelled presses before the last change of the slide, each group with its own calibration."""
+        """Evaluate the labelled presses from before the last change of the slide, by cross-validation.
+
+        These presses are grouped by period between changes of the slide. The presses of each group are evaluated with
+        the calibration to their own period.
+        """
         if (day := self.earlier) is None:
             return []
         return [*day.held_out(day.data.labels, few=few), *day.held_out_earlier(few)]
 
     def same_slide_log_odds(self, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, " n"]:
-        """Return the log odds, for each press of a later day, that the skin slides in the same way as on this day.
+        """Return, for each press of a later day, the log odds that the skin still slides as on the day of this object.
 
-        The log odds are the log likelihood of the press under the map of this day, minus its log likelihood under the
-        map for a changed slide. Likelihoods are summed over all places and forces. Both maps are conditioned on the
-        labels of this day.
+        Two maps are compared: one for an unchanged slide, and one for a changed slide. The log odds are the log
+        likelihood of the press under the first map minus its log likelihood under the second map. A likelihood is the
+        sum over all places and forces, because those of the press are unknown. Both maps are conditioned on the labels
+        of the day of this object.
         """
         same, changed = (
             logsumexp(-0.5 * skin.evaluator.evaluate(db_uT).deviance.astype(float), axis=1)
@@ -406,10 +415,11 @@ class PressCalibration:
 def calibrate_day(
     noload_map: SkinMap, networks: Sequence[Weights], data: CalibrationData, last: PressCalibration | None
 ) -> PressCalibration:
-    """Calibrate to one day's presses at unknown places, given the calibration to the days before, if any.
+    """Calibrate to the presses at unknown places of one day.
 
-    If the skin slides as on the last day, the presses of both days are treated as presses of one day. Otherwise, the
-    presses of the days before are used only for the skin's constant properties.
+    `last` is the calibration to the days before, or None if there is no earlier day. If the skin slides as on the last
+    of these days, the presses of both days are treated as presses of one day. Otherwise, the earlier presses determine
+    only those properties of the skin that do not change from day to day.
     """
     if last is not None:
         pressed_uT = np.concatenate([data.presses_uT, data.labels.db_uT])
@@ -420,22 +430,37 @@ def calibrate_day(
 def join_day(
     data: CalibrationData, last: PressCalibration | None, *, same: bool
 ) -> tuple[CalibrationData, PressCalibration | None]:
-    """Return the data since the last change of the slide, and the calibration to the days before this change."""
+    """Return the data since the last change of the slide, and the calibration to the days before this change.
+
+    `data` are the data of the current day, and `last` is the calibration to the days before it. If `same` is True, the
+    skin slides on the current day as on the last day, so the data of these two days are joined.
+    """
     return (data.joined_to(last.data), last.earlier) if same and last is not None else (data, last)
 
 
 def start_day(noload_map: SkinMap, earlier: PressCalibration | None) -> SkinMap:
-    """Return the map before it is conditioned on presses after a change of the slide."""
+    """Return the map with which a period after a change of the slide begins.
+
+    The map is not yet conditioned on the presses of this period. If there are earlier days, it contains what their
+    presses tell about the constant properties of the skin.
+    """
     return noload_map if earlier is None else begin_day(earlier.skin)
 
 
 def is_same_slide(log_odds: Float[np.ndarray, " n"]) -> bool:
-    """Return whether presses show that the skin slides as on the last day, from the log odds of each press."""
+    """Return whether the skin is assumed to slide as on the last day.
+
+    `log_odds` contains the log odds from each press (`PressCalibration.same_slide_log_odds`). Their sum is compared
+    with `SAME_SLIDE_LOG_ODDS_MIN`.
+    """
     return float(log_odds.sum()) >= SAME_SLIDE_LOG_ODDS_MIN
 
 
 class Slide(NamedTuple):
-    """Whether the skin slides under presses as on the last day of the calibration, and the log odds for this."""
+    """Comparison of how the skin slides under presses today and on the last day of its calibration.
+
+    `same` is True if the skin is assumed to slide as on that day. `log_odds` are the log odds for this.
+    """
 
     same: bool
     log_odds: float
@@ -448,7 +473,7 @@ def has_few(labels: LabelledPresses) -> bool:
 
 @dataclass(frozen=True)
 class PriorModel:
-    """Map and networks before they are calibrated to a skin."""
+    """Map and networks before they are calibrated to any skin."""
 
     skin: SkinMap
     networks: Sequence[Weights]
@@ -456,13 +481,20 @@ class PriorModel:
     __repr__ = one_line
 
     def calibrate(self, data: CalibrationData) -> PressCalibration:
-        """Calibrate to a skin's no-load field and unlabelled presses (labels: `PressCalibration.with_labels`)."""
+        """Calibrate to the no-load field and the unlabelled presses of a skin.
+
+        The labels in `data` are not used here. `PressCalibration.with_labels` adds them to the result.
+        """
         noload_map = condition_on_noload(self.skin, data.rest_uT)
         return PressCalibration(condition_on_unlabelled(noload_map, data), self.networks, data)
 
 
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
-    """Condition a map on presses at unknown places, then on the presses that are evenly spread over the skin."""
+    """Condition a map on presses at unknown places.
+
+    If the data contain evenly spread presses, the map is then also conditioned on the fact that the mean of their
+    places is the centre.
+    """
     skin = noload_map
     if len(data.presses_uT):
         skin = condition_on_presses(skin, data.presses_uT)
@@ -474,11 +506,12 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 def network_offsets_mm(
     centre_mm: Float[np.ndarray, "2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return two corrections to add to the places that the networks estimate.
+    """Return two corrections that are to be added to the places that the networks estimate.
 
-    The first correction is `centre_mm`, which follows from unlabelled presses, divided by a number that grows with the
-    number of labels. The second correction is the mean error that then remains for labelled presses, shrunk by a
-    Gaussian prior with mean zero. These presses are estimated at `estimated_mm` and are truly at `place_mm`.
+    The first correction is the shift `centre_mm`, which was estimated from unlabelled presses, divided by a number that
+    grows with the number of labels. The second correction is computed from the labelled presses, whose estimated and
+    true places are `estimated_mm` and `place_mm`. It is the mean error that the first correction leaves, shrunk towards
+    zero by a Gaussian prior.
     """
     centre_mm = centre_mm / (1 + FADES_PER_LABEL * len(place_mm))
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -487,7 +520,7 @@ def network_offsets_mm(
 
 @dataclass
 class Universal:
-    """The universal model for the board of one layout; it can be calibrated during use.
+    """The universal model for the board of one layout. It can be calibrated to a skin during use.
 
     First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
     presses at known places, in any order and any number of times. Each of these three methods changes the model in
@@ -495,11 +528,11 @@ class Universal:
 
     Parameters
     ----------
-    tables : the map's prior
-    networks : weights of the networks
-    powers : likelihood powers by numbers of presses and labels
+    tables : tables of simulated fields, which are the prior of the map
+    networks : weights of each network
+    powers : likelihood powers, tabulated by the number of presses and the number of labels
     layout : the board and the skin that the model was made for
-    card : how the model was trained, and what the model must not be used for
+    card : model card, which states how the model was trained and what it must not be used for
     external_uT : expected size of external fields (see `load_universal`)
     """
 
@@ -518,12 +551,14 @@ class Universal:
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
         self._turned_given = False  # whether the user stated the orientation of the skin
-        self._saved_uT: Float[np.ndarray, " ch"] | None = None  # no-load reading in the file of a saved calibration
+        # If a saved calibration was loaded, this is the no-load reading in its file.
+        self._saved_uT: Float[np.ndarray, " ch"] | None = None
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
-        # Calibration to the earlier days; log odds, for each press of the current day, that the slide is the same as on
-        # the last day; and whether it is assumed to be the same.
+        # `_last` is the calibration to the earlier days. For each press of the current day, `_press_odds` (presses at
+        # unknown places) and `_label_odds` (labelled presses) are the log odds that the skin slides as on the last day.
+        # `_same_slide` tells whether the skin is assumed to slide as on the last day.
         self._last: PressCalibration | None
         self._press_odds: np.ndarray
         self._label_odds: np.ndarray
@@ -531,7 +566,8 @@ class Universal:
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        self._folds: list[HeldOutLabels] | None  # held-out labels; None until they are computed
+        # The following three results of cross-validation are None until they are needed.
+        self._folds: list[HeldOutLabels] | None
         self._power: float | None
         self._line: ForceLine | None
         self._restart(self._prior_map, CalibrationData.at_rest(self.tables.rest_uT))
@@ -550,7 +586,7 @@ class Universal:
 
     @property
     def channels_n(self) -> int:
-        """Number of values of a reading: three per chip."""
+        """Number of values in one reading, which has three values per chip."""
         return self.layout.channels_n
 
     @property
@@ -569,10 +605,12 @@ class Universal:
         return external.covariance(self.layout.chips_mm, self.external_uT) if self.external_uT else None
 
     def suppressor(self, noise_uT: float) -> Float[np.ndarray, "ch ch"] | None:
-        """Return a matrix that shrinks external fields in readings to the size of noise; None if `external_uT` is 0.
+        """Return a matrix that shrinks the external fields in readings to the size of noise.
 
-        Multiply field changes along the chips' axes, one per row, by this matrix. The length of the result
-        distinguishes contacts from external fields; |dB| does not.
+        Multiply field changes along the chips' axes (one per row) by this matrix to detect contacts. The magnitude |dB|
+        alone is not sufficient, because an external field can make it as large as a contact does. After the
+        multiplication, the part of an external field is as small as the noise. The result is None if `external_uT` is
+        0.
         """
         cov = self.external_cov
         return (
@@ -581,14 +619,17 @@ class Universal:
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
-        """The baseline (no-load field that is subtracted) along the chips' axes; raises SchemaError before `zero`."""
+        """The baseline, which is the no-load field that is subtracted from readings, along the chips' axes.
+
+        Raises SchemaError if `zero` has not been called yet.
+        """
         if self._noload_uT is None:
             raise SchemaError("the model has no no-load reading: call zero(...) with readings without contact first.")
         return self._noload_uT
 
     @property
     def zeroed(self) -> bool:
-        """Whether `zero` has been called (or a calibration loaded)."""
+        """Whether the model has a no-load reading, from a call of `zero` or from a saved calibration."""
         return self._noload_uT is not None
 
     @property
@@ -603,22 +644,28 @@ class Universal:
 
     @property
     def mounting(self) -> Mounting:
-        """Orientation of the skin on the board, and its log odds; raises SchemaError before `zero`."""
+        """The orientation of the skin on the board, and the log odds of this orientation.
+
+        Raises SchemaError if `zero` has not been called yet.
+        """
         if not self.zeroed:
             raise SchemaError("mounting: the model has no no-load reading. First call zero.")
         return find_mounting(self.tables, self._sign * self._data.rest_uT, turned=self._data.turned)
 
     @property
     def label_frame(self) -> LabelFrame | None:
-        """Most probable orientation of the axes of the current day's labels other than the given one, and its log odds.
+        """The best alternative to the orientation of the labels' axes that the user has given.
 
-        None if there are fewer than `LABELS_MIN_N` labels on the current day. The axes of earlier days' labels are
-        assumed to be right.
+        If the user has turned or mirrored the axes by mistake, the labelled places fit the estimated places better in
+        another orientation. This is the most probable of the other orientations, with its log odds. It is determined
+        from the labels of the current day, and is None if there are fewer than `LABELS_MIN_N` of them. The axes of
+        earlier days' labels are assumed to be right.
         """
         labels, data = self._data.labels, self._calibration.data
         if len(labels) < LABELS_MIN_N:
             return None
-        # If the slide is the same, `data` has labels of earlier days, followed by those of the current day.
+        # If the slide has not changed since the last day, `data` contains the labels of earlier days, followed by those
+        # of the current day.
         earlier = data.labels[: len(data.labels) - len(labels)]
         power = self.powers.power_for(len(data.presses_uT), len(earlier), even=len(data.even_uT) > 0)
         without_current = self._calibration.with_labels(earlier)
@@ -649,39 +696,49 @@ class Universal:
 
     @property
     def reach_mm(self) -> Float[np.ndarray, "2 2"]:
-        """Edges of the skin, in the coordinates of places; rows: smallest and largest x and y."""
+        """The edges of the skin in the frame of the labels.
+
+        The first row contains the smallest x and y, the second row the largest x and y.
+        """
         return self._centre_mm + self.layout.reach_mm
 
     @property
     def presses_n(self) -> int:
-        """Number of presses that the model is calibrated to, labelled or not, on all days."""
+        """Number of presses to which the model is calibrated: labelled or not, on all days."""
         return self._data.presses_n
 
     @property
     def slide(self) -> Slide | None:
-        """Whether the skin slides as on the last day, from presses of the current day; None without earlier days."""
+        """Whether presses of the current day show that the skin slides as on the last day of the calibration.
+
+        None if the calibration has no earlier day.
+        """
         if self._last is None:
             return None
         return Slide(self._same_slide, float(self._press_odds.sum() + self._label_odds.sum()))
 
     @property
     def labels_n(self) -> int:
-        """Number of labelled presses that the model is calibrated to, on all days."""
+        """Number of labelled presses to which the model is calibrated, on all days."""
         return self._data.labels_n
 
     @property
     def misfit(self) -> float:
-        """Median chi^2 per channel of unlabelled presses: about 1 for skins like those in training.
+        """Median of the misfits (chi^2 per channel) of the unlabelled presses.
 
-        The value is 1 if there are too few presses.
+        The misfit is about 1 if the skin is like the skins in training, and larger otherwise. If there are too few
+        presses to determine it, this property is 1.
         """
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
     def power(self) -> float:
-        """Power of the combined likelihood, from the misfit of unlabelled presses and cross-validated labels.
+        """The likelihood power for this skin, which determines how large the standard deviations of places are.
 
-        With a power of 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
+        With a power of 1, map and networks are trusted fully. With a smaller power, standard deviations are larger. The
+        model card gives a power for each number of presses and labels. This power is divided by `misfit` and, if there
+        are labels, by their variance inflation (see `variance_inflations`). It is reduced further if external fields
+        are expected.
         """
         if self._power is None:
             data = self._calibration.data
@@ -696,7 +753,7 @@ class Universal:
 
     @property
     def line(self) -> ForceLine:
-        """Calibration of forces, from the labelled presses whose force is known."""
+        """The line that calibrates the forces, fitted to the labelled presses whose force is known."""
         if self._line is None:
             labels = [day for day, _ in self._calibration.labels_by_day(self._calibration.data.labels)]
             earlier = self._calibration.held_out_earlier(has_few(reduce(join_labels, labels)))
@@ -704,17 +761,23 @@ class Universal:
         return self._line
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False, turned: bool | None = None) -> "Universal":
-        """Set the no-load field to the mean of readings without contact, and condition the map on it.
+        """Set the no-load field to the mean of readings without contact, and condition the map on this field.
 
-        Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
-        already calibrated to. The no-load field also shows whether the skin is turned by 90° (see `mounting`);
-        set `turned` if you know the orientation. The model is changed in place and returned.
+        The model is changed in place and returned.
+
+        Parameters
+        ----------
+        b_uT : readings without contact
+        keep : whether presses from earlier calls of `see` and `label` are kept. By default, they are discarded. Set
+            `keep` to correct the drift of a skin to which the model is already calibrated.
+        turned : whether the skin is turned by 90°. If this is None, the orientation is determined from the no-load
+            field (see `mounting`), unless presses are kept, whose orientation is then kept as well.
 
         Raises
         ------
-        SchemaError : there is no reading, or a reading is not finite, out of range or from another board; `turned` is
-            set, but a quarter turn does not reverse the fields of the layout's skin; or `keep` is set, and `turned`
-            contradicts the earlier calibration
+        SchemaError : there is no reading, or a reading is not finite, is out of range, or has the wrong number of
+            values; `turned` is True, but a quarter turn does not reverse the fields of the layout's skin; or `keep` is
+            True, and `turned` contradicts the earlier calibration
         """
         noload_uT = check_readings(b_uT, self.channels_n)
         if not len(noload_uT):
@@ -723,7 +786,9 @@ class Universal:
             problem = f"a quarter turn does not reverse the fields of skin {self.layout.name}"
             raise SchemaError(f"zero: {problem}. Call it without `turned`.")
         kept = keep and self.zeroed
-        bound = kept and (self.presses_n > 0 or self._turned_given)  # otherwise, this may be another skin
+        # If there are presses to keep, or the user has stated the orientation, the orientation must stay the same.
+        # Otherwise, this may be another skin, whose orientation is determined again.
+        bound = kept and (self.presses_n > 0 or self._turned_given)
         if bound and turned not in (None, self._data.turned):
             raise SchemaError(
                 "zero: the presses to keep are from a skin in the other orientation. Call it without keep."
@@ -742,12 +807,18 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
-        The readings are fields as the board sends them, not field changes: the no-load reading is subtracted here.
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
-        expectation maximisation with its presses. Each later call makes one round. Set `even` if these and all earlier
-        presses together are evenly spread over the skin (for example a grid with one press per place), so that their
-        mean place is the skin's centre. Set `area` if these and all earlier presses are at random places all over the
-        layout's area of presses (paper's board: an octagon 16 mm wide). Estimated places are then moved onto this area.
+        expectation maximisation with its presses. Each later call makes one round. The model is changed in place and
+        returned.
+
+        Parameters
+        ----------
+        b_uT : fields as the board sends them. They are not field changes, because this method subtracts the no-load
+            reading.
+        even : set this if these and all earlier presses together are evenly spread over the skin, for example on a grid
+            with one press per place. The mean of their places is then assumed to be the centre of the skin.
+        area : set this if these and all earlier presses are at random places all over the layout's area of presses. For
+            the paper's board, this area is an octagon 16 mm wide. Estimated places are then moved onto this area.
         """
         if even and area:
             raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
@@ -776,17 +847,23 @@ class Universal:
         *,
         keep: bool = False,
     ) -> "Universal":
-        """Calibrate to one or several presses at known places with known forces.
+        """Calibrate to one or several labelled presses, which have known places and known forces.
 
-        Earlier labels of the same day are discarded, unless `keep` is set. If only places are known, pass `None` as
-        forces. A single press of known force, such as a weight on the middle of the skin, calibrates the forces of the
-        whole skin.
+        A single press of known force, such as a weight on the middle of the skin, calibrates the forces of the whole
+        skin. The model is changed in place and returned.
+
+        Parameters
+        ----------
+        place_mm : places of the presses in the frame of the labels
+        force_N : forces of the presses, or None if only the places are known
+        b_uT : fields as the board sends them, one reading per press
+        keep : whether earlier labels of the same day are kept. By default, they are discarded.
 
         Raises
         ------
         SchemaError : `zero` was not called; no field change exceeds the noise; a place is outside the skin; a force is
-            not above 0 N, or outside the model's range by a factor of 2; there are too many labels. The model is then
-            unchanged.
+            not above 0 N; a force is outside the model's range by a factor of 2 or more; or there are too many labels.
+            The model is not changed if this error is raised.
         """
         readings_uT = check_readings(b_uT, self.channels_n)
         known = force_N is not None
@@ -809,13 +886,15 @@ class Universal:
         if self._decide(self._press_odds, label_odds) != self._same_slide:
             return self._begin(data)
         self._label_odds, press_map = label_odds, self._calibration.skin
-        if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
+        if len(before):  # use all unlabelled presses again, so that the order of `see` and `label` does not matter
             joined, earlier = join_day(data, self._last, same=self._same_slide)
             press_map = condition_on_unlabelled(start_day(self._noload_map, earlier), joined)
         return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
-        """Return the place in mm where a labelled press with about this force would be most informative.
+        """Return the place in mm at which the next labelled press should be made.
+
+        This is the place at which a press with about this force would reduce the uncertainty about the whole skin most.
 
         Raises
         ------
@@ -833,14 +912,17 @@ class Universal:
         return np.column_stack([estimate.place_mm, estimate.force_N])
 
     def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
-        """Estimate places with standard deviations, forces and misfits.
+        """Estimate places and forces with their standard deviations, and misfits.
 
-        Misfits far above 1 mean that the skin is unlike those that the model was trained on.
+        Misfits far above 1 mean that the skin is unlike the skins on which the model was trained.
         """
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return the estimates for each likelihood power; they differ only in the standard deviations of places."""
+        """Return one estimate of all readings for each likelihood power.
+
+        The estimates differ only in the standard deviations of places.
+        """
         estimates = self.calibrated.estimate(self._change(b_uT), powers)
         return [replace(estimate, place_mm=estimate.place_mm + self._centre_mm) for estimate in estimates]
 
@@ -885,18 +967,20 @@ class Universal:
         export.write_onnx(export.skin_function(self, quiet_uT), Path(file))
 
     def export_c(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
-        """Write the estimate of this skin as a C99 header without dependencies, such as `skin.h` (docs/robots.md).
+        """Write the calibrated model as C99 code for programs without Python (docs/robots.md).
 
-        Inputs, outputs and `quiet_uT` are those of `export_onnx`. Raises SchemaError before `zero`.
+        The code is a header file without dependencies, such as `skin.h`. Inputs, outputs and `quiet_uT` are those of
+        `export_onnx`. Raises SchemaError if `zero` was not called before.
         """
         from reskin.universal import export
 
         export.write_c(export.skin_function(self, quiet_uT), Path(file))
 
     def remember(self, file: Path | str, *, new_day: bool = False) -> "Universal":
-        """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`.
+        """Replace all calibration data by those in a file that `save` wrote.
 
-        new_day: see `load_universal`.
+        Afterwards, call `zero(b_uT, keep=True)` with new readings without contact, to correct the drift since the file
+        was written. `new_day` has the same meaning as in `load_universal`.
         """
         data = read_calibration(Path(file), self.layout.reach_mm, self.channels_n, self.layout.name)
         if data.turned and not self.turnable:
@@ -907,7 +991,10 @@ class Universal:
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data.next_day() if new_day else data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and force_N from field changes, with the interface of a trained network."""
+        """Predict x_mm, y_mm and force_N from field changes.
+
+        The project's trained networks can be called in the same way.
+        """
         return self.predict(check_shape(db_uT, self.channels_n) + self.noload_uT).astype(np.float32)
 
     @property
@@ -915,11 +1002,18 @@ class Universal:
         return np.array(self.layout.centre_mm)
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Return field changes along the board's axes; raise SchemaError before `zero`."""
+        """Subtract the no-load reading from readings, and return the field changes along the board's axes.
+
+        Raises SchemaError if `zero` has not been called yet.
+        """
         return self._sign * self.layout.to_board(check_shape(b_uT, self.channels_n) - self.noload_uT)
 
     def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Return the field changes of presses; raise SchemaError if the readings are in mT or are field changes."""
+        """Return the field changes of presses along the board's axes.
+
+        Raises SchemaError if the values are probably in another unit, or if they are field changes instead of readings.
+        `where` is the name of the calling method, for the error message.
+        """
         db_uT = check_presses(self._change(b_uT))
         check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
         return db_uT
@@ -929,14 +1023,17 @@ class Universal:
         return -1 if self._data.turned else 1
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate to all days from scratch, starting with a map that is conditioned on the no-load field only."""
+        """Calibrate to all days from scratch.
+
+        `noload_map` is a map that is conditioned on the no-load field only.
+        """
         self._noload_map, self._last = noload_map, None
         for day in data.earlier:
             self._last = calibrate_day(noload_map, self.networks, day, self._last)
         return self._begin(data)
 
     def _begin(self, data: CalibrationData) -> "Universal":
-        """Calibrate to the current day from scratch, starting with the calibration to the earlier days."""
+        """Calibrate to the current day from scratch, starting from the calibration to the earlier days."""
         self._press_odds, self._label_odds = self._log_odds(data.presses_uT), self._log_odds(data.labels.db_uT)
         self._same_slide = self._decide(self._press_odds, self._label_odds)
         joined, earlier = join_day(data, self._last, same=self._same_slide)
@@ -947,14 +1044,14 @@ class Universal:
         return np.zeros(len(db_uT)) if self._last is None else self._last.same_slide_log_odds(db_uT)
 
     def _decide(self, press_odds: Float[np.ndarray, " n"], label_odds: Float[np.ndarray, " m"]) -> bool:
-        """Return whether the skin slides as on the last day."""
+        """Return whether the skin is assumed to slide as on the last day, from the log odds of today's presses."""
         return self._last is not None and is_same_slide(np.concatenate([press_odds, label_odds]))
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
         """Replace the calibration; `press_map` is conditioned on all data except the labels, which are added here."""
         joined, earlier = join_day(data, self._last, same=self._same_slide)
         missing = np.isnan(self._misfits)
-        if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
+        if missing.any():  # the misfit of a press is computed only once, with the first map that is conditioned on it
             self._misfits[missing] = press_map.evaluator.evaluate(joined.presses_uT[missing]).misfit()
         self._data = data
         self._calibration = PressCalibration(press_map, self.networks, joined, earlier)
@@ -970,22 +1067,28 @@ def load_universal(
     external_uT: float = 0.0,
     new_day: bool = False,
 ) -> Universal:
-    """Load a universal model, calibrated to a skin if `calibration` is a file from `save`.
+    """Load a universal model and, if a calibration is given, calibrate it to the skin of this calibration.
 
-    new_day: set it if the skin may slide under presses in another way than when the file was saved, for example a day
-    later. The presses in the file are then presses of an earlier day, and new presses are compared with them (see
-    `Universal.slide`). If the skin slides in the same way, all presses are used together. If it does not, the presses
-    of the earlier day are used only for the skin's constant properties. Until there are new presses, a change is
-    assumed.
-    file: a model from `reskin model make`; by default, the model for the paper's board, which comes with the project.
-    external_uT: for a skin on a moving robot, the standard deviation of each component of the external field's change
-    since the no-load reading: about 30 for the earth's field, 100 or more if other skins or magnets move nearby. Each
-    reading may then contain an unknown external field, nearly uniform over the board (`reskin.physics.external`). With
-    0, no external field is expected, and estimates are more accurate if there is none.
+    Parameters
+    ----------
+    calibration : file that `Universal.save` wrote. If it is None, the model is not calibrated to any skin.
+    file : file of a model that `reskin model make` wrote. By default, this is the model for the paper's board, which
+        comes with the project.
+    external_uT : for a skin on a moving robot, the expected change of the external field since the no-load reading,
+        given as the standard deviation of each component. Use about 30 for the earth's field, and 100 or more if other
+        skins or magnets move nearby. Each reading is then assumed to contain an unknown external field that is nearly
+        uniform over the board (`reskin.physics.external`). With 0, no external field is expected. If there is indeed
+        none, estimates are more accurate with 0.
+    new_day : set this if the skin may slide under presses in another way than when the calibration was saved, for
+        example because it was saved on an earlier day. New presses are then compared with those of the calibration (see
+        `Universal.slide`). If the skin slides in the same way, all presses are used together. If it does not, the
+        earlier presses are used only for the constant properties of the skin. Until there are new presses, the skin is
+        assumed to slide in another way.
 
     Raises
     ------
-    SchemaError : a file is damaged, or `external_uT` is not from 0 to `EXTERNAL_MAX_uT`
+    SchemaError : a file is damaged, `external_uT` is not from 0 to `EXTERNAL_MAX_uT`, or `new_day` is set without a
+        calibration
     """
     model = Universal(*_read_parts(Path(file)), external_uT=external_uT)
     if calibration is not None:
@@ -998,7 +1101,10 @@ def load_universal(
 
 
 def is_model(file: Path) -> bool:
-    """Return whether the card of a file states that it is a universal model; False if there is no card."""
+    """Return whether a file is a universal model, according to its model card.
+
+    The model card is the JSON file of the same name. The result is False if there is no model card.
+    """
     card_file = file.with_suffix(".json")
     if file.suffix != FILE.suffix or not card_file.is_file():
         return False
@@ -1041,7 +1147,11 @@ def write(
     about: Mapping[str, Any],
     file: Path = FILE,
 ) -> None:
-    """Write the map's prior (in single precision), the networks, and the card (`about`, layout, powers, spreads)."""
+    """Write a universal model to a file, and its model card to a JSON file of the same name.
+
+    The model file contains the prior of the map (in single precision) and the networks. The card contains the items of
+    `about`, the layout, the likelihood powers, and the spreads of the parameters.
+    """
     names = [field.name for field in fields(tables) if field.name not in UNSTORED]
     map_arrays = {name: getattr(tables, name).astype(np.float32) for name in names}
     io.write_tensors(file, map_arrays | network.to_tensors(networks), {})

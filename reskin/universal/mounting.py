@@ -1,10 +1,14 @@
-"""Find the orientation of a skin from the no-load field, and that of the labels' axes from presses at known places.
+"""Check how a skin is mounted on its board, and how the axes of the labels are oriented.
 
 The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after one or three
 quarter turns, every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
-down, fields have the same sign and are about 1.3 times as large. Without a check, the universal model would estimate
-wrong places on a turned skin, without a warning. The reason is that the field change of a press on a turned skin
-resembles that of a press on the opposite side of a skin that is not turned.
+down, fields have the same sign and are about 1.3 times as large.
+
+The no-load field shows whether a skin is turned. Without this check, the universal model would estimate wrong places on
+a turned skin, because the field change of a press on a turned skin resembles that of a press on the opposite side of a
+skin that is not turned.
+
+Presses at known places show whether the axes of the labels are oriented as the user has stated.
 """
 
 from collections.abc import Mapping
@@ -19,24 +23,24 @@ from scipy.linalg import cho_factor, cho_solve
 from reskin.universal.map import Estimate, OFFSET_uT, Tables
 
 LOG_ODDS_MIN = 2.0  # an orientation with smaller log odds is reported as uncertain (odds of 7 to 1)
-NOLOAD_MISFIT_MAX = (
-    12.0  # a no-load field with a larger chi^2 per channel is reported as unusual; few skins exceed this
-)
+# A no-load field is reported as unusual if chi^2 per channel exceeds this value, which happens on few skins.
+NOLOAD_MISFIT_MAX = 12.0
 LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
-FRAME_LOG_ODDS_MIN = 5.0  # another orientation of the labels' axes is reported if its log odds are at least this
-FRAME_SD_MM = 1.0  # standard deviation of place errors that the estimated uncertainty does not include
-OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0  # share of presses whose estimates are useless: anywhere on an area of this size
+FRAME_LOG_ODDS_MIN = 5.0  # another orientation of the labels' axes is reported if its log odds are at least this value
+FRAME_SD_MM = 1.0  # standard deviation of that part of the errors in place that the estimated uncertainty omits
+# This fraction of the estimated places is assumed to be useless. They may be anywhere on an area of this size.
+OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0
 
 TURNED = "turned by a quarter"
 
 
 @dataclass(frozen=True)
 class Mounting:
-    """Orientation of a skin on its board.
+    """Orientation of a skin on its board: turned by a quarter, or not turned.
 
-    turned: whether the signs of all fields are opposite to those on the recorded boards. log_odds: logarithm of the
-    probability of this orientation divided by that of the other orientation; negative if the other orientation fits
-    better. misfit: chi^2 per channel of the no-load field.
+    `turned` is True if all fields have the opposite sign of the fields on the recorded boards. `log_odds` is the
+    logarithm of the probability of this orientation divided by that of the other orientation. It is negative if the
+    other orientation fits better. `misfit` is chi^2 per channel of the no-load field.
     """
 
     turned: bool
@@ -45,13 +49,14 @@ class Mounting:
 
     @property
     def probability(self) -> float:
-        """Probability of this orientation, if both are equally probable before the no-load reading."""
+        """Probability of this orientation, if both orientations are equally probable before the no-load reading."""
         return float(1 / (1 + np.exp(-self.log_odds)))
 
     def warnings(self, *, turnable: bool = True) -> list[str]:
-        """Return sentences for the user if the no-load field is unusual, or the orientation is uncertain or unlikely.
+        """Return warnings if the no-load field is unusual, or if the orientation is uncertain or unlikely.
 
-        turnable: whether a quarter turn of the skin reverses the sign of its fields.
+        `turnable` states whether a quarter turn of the skin reverses the sign of its fields. If it does not, there are
+        no warnings about the orientation.
         """
         sentences = []
         if self.misfit > NOLOAD_MISFIT_MAX:
@@ -75,10 +80,12 @@ class Mounting:
 
 
 def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: bool | None = None) -> Mounting:
-    """Find the orientation of a skin from its no-load field along the board's axes, unless `turned` is given.
+    """Find the orientation of a skin from its no-load field, which must be along the board's axes.
 
-    A skin is taken as turned only if the log odds for this orientation are at least `LOG_ODDS_MIN`. The no-load field
-    has a normal distribution under the map's prior. Before the no-load reading, both orientations are equally probable.
+    If `turned` is given, it is used as the orientation, and only its log odds and the misfit are computed. Otherwise, a
+    skin is assumed to be turned only if the log odds for this are at least `LOG_ODDS_MIN`. The no-load field has a
+    normal distribution under the prior of the map (`reskin.universal.map`). Before the no-load reading, both
+    orientations are equally probable.
     """
     covariance = _noload_covariance(tables)
     chi2 = {}
@@ -92,16 +99,17 @@ def find_mounting(tables: Tables, rest_uT: Float[np.ndarray, " ch"], *, turned: 
 
 
 def _noload_covariance(tables: Tables) -> tuple[Float[np.ndarray, "ch ch"], bool]:
-    """Return the Cholesky factor of the no-load field's covariance under the map's prior."""
+    """Return the Cholesky factor of the covariance of the no-load field under the prior of the map."""
     slope_uT = tables.rest_slope_uT
     return cho_factor(slope_uT @ slope_uT.T + OFFSET_uT**2 * np.eye(len(slope_uT)))
 
 
 @cache
 def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
-    """Return the eight possible orientations of the labels' axes by name: four turns, each with and without mirroring.
+    """Return the eight possible orientations of the labels' axes, each with its name and a matrix.
 
-    The matrix of an orientation converts labelled places to true places, if the labels' axes have this orientation.
+    There are four turns, each with and without mirroring. The matrix converts labelled places to true places if the
+    labels' axes have this orientation.
     """
     quarter, mirror_x = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
@@ -115,17 +123,17 @@ def frames() -> Mapping[str, Float[np.ndarray, "2 2"]]:
 
 @dataclass(frozen=True)
 class LabelFrame:
-    """Most probable orientation of the labels' axes other than the given one.
+    """The most probable orientation of the labels' axes among those that the user has not stated.
 
-    log_odds: logarithm of the probability of this orientation divided by that of the given one; above 0 if this one
-    fits better.
+    `name` is the name of this orientation (see `frames`). `log_odds` is the logarithm of its probability divided by
+    that of the stated orientation. It is above 0 if this orientation fits better.
     """
 
     name: str
     log_odds: float
 
     def warning(self) -> str | None:
-        """Return a sentence for the user if the labels' axes are probably not as given."""
+        """Return a warning if the labels' axes are probably not oriented as the user has stated."""
         if self.log_odds < FRAME_LOG_ODDS_MIN:
             return None
         return (
@@ -135,11 +143,14 @@ class LabelFrame:
 
 
 def find_label_frame(estimate: Estimate, place_mm: Float[np.ndarray, "m 2"]) -> LabelFrame:
-    """Find the most probable orientation of the labels' axes other than the given one.
+    """Find the most probable orientation of the labels' axes among those that the user has not stated.
 
-    `estimate` has the estimates of the labelled places by a model that is not calibrated to these labels. Estimated and
-    labelled places are relative to the board's centre. Errors are assumed to be normally distributed, with a share of
-    outliers.
+    The errors of the estimated places are assumed to be normally distributed, except for a fraction of outliers.
+
+    Parameters
+    ----------
+    estimate : estimated places of the labelled presses, from a model that is not calibrated to these labels
+    place_mm : labelled places. Both these and the estimated places are relative to the board's centre.
     """
     log_p = {name: _log_likelihood(estimate, place_mm @ matrix.T) for name, matrix in frames().items()}
     as_given = log_p.pop("as given")

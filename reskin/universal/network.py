@@ -1,7 +1,9 @@
-"""The network of the universal model, evaluated in NumPy.
+"""The network of the universal model, evaluated with NumPy and Numba.
 
-A set encoder computes a code from a skin's no-load field and unlabelled presses. This code conditions a regressor,
-which estimates the place and the force of readings. `reskin.universal.training` trains the weights with PyTorch.
+The network has two parts. A set encoder computes a code, which is a vector that describes a skin, from the no-load
+field and the unlabelled presses of this skin. A regressor estimates the place and the force of a reading. It is
+conditioned on the code by FiLM layers, which compute a gain and a shift of each hidden unit from the code.
+`reskin.universal.training` trains the weights with PyTorch.
 """
 
 import math
@@ -15,18 +17,24 @@ from numba import njit
 
 Weights = Mapping[str, np.ndarray]
 
-LAYERS_N = 3
-DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale the inputs dB/|dB|, log|dB| and no-load field to about 1
-LENGTH_MIN_uT = 1.0  # if |dB| is smaller, dB is divided by this value instead, so that tiny changes have no direction
-PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
-LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
-OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
-FILM_SD = 0.02  # standard deviation of initial FiLM weights; small, so that the code has little effect at first
+LAYERS_N = 3  # number of hidden layers of the regressor
+# The inputs are the direction dB/|dB| of the field change, log|dB|, and the no-load field. These constants scale them
+# to values of about 1: dB/|dB| is multiplied by the first, the second is subtracted from log|dB|, and the no-load field
+# is divided by the third.
+DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0
+# If |dB| is smaller than this value, dB is divided by this value instead of |dB|. Otherwise, the direction of tiny
+# field changes would consist of noise.
+LENGTH_MIN_uT = 1.0
+PLACE_MM, LOG_N = 8.0, 3.0  # the outputs are multiplied by these values to get places in mm and log forces
+LOG_SD = (-5.0, 2.0)  # smallest and largest log standard deviation of the outputs, before this scaling
+OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each of these three
+# Standard deviation of the initial weights of FiLM layers. It is small, so that the code has little effect at first.
+FILM_SD = 0.02
 FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled presses
 
 
 class Layers(NamedTuple):
-    """Weights and biases of the layers of a network that is conditioned on a skin."""
+    """The regressor of a network that is conditioned on one skin: weights and biases of its layers."""
 
     weight: tuple[Float32[np.ndarray, "_ _"], ...]
     bias: tuple[Float32[np.ndarray, " _"], ...]
@@ -43,7 +51,11 @@ class NetworkEstimate:
 
 
 def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw initial weights uniformly within 1/sqrt(fan in), as PyTorch does; FiLM weights are close to zero."""
+    """Draw the initial weights of a network.
+
+    Weights and biases are uniformly distributed within +- 1/sqrt(number of inputs), as in PyTorch. Only the weights of
+    FiLM layers are close to zero.
+    """
     inputs_n = 2 * channels_n + 1
     shapes = {"set1": (SET_WIDTH, inputs_n), "set2": (SET_WIDTH, SET_WIDTH), "code": (CODE_WIDTH, SET_WIDTH + 1)}
     shapes |= {f"layer{i}": (WIDTH, WIDTH if i else inputs_n) for i in range(LAYERS_N)}
@@ -60,7 +72,7 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
 
 
 def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: Float[np.ndarray, "c ch"]) -> Layers:
-    """Condition a network on a skin's no-load field and on unlabelled presses (possibly none)."""
+    """Condition a network on the no-load field and the unlabelled presses of a skin. There may be no presses."""
     rest = (rest_uT / REST_uT).astype(np.float32)
     code, reading_n = _encode(weights, rest, presses_uT), len(rest) + 1
     layer_weights, layer_biases = [], []
@@ -77,7 +89,11 @@ def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: F
 
 
 def evaluate(networks: Sequence[Layers], db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-    """Estimate places and forces as means over networks; the spread of the networks adds to the standard deviations."""
+    """Estimate places and forces as means over several networks.
+
+    The more the networks differ, the larger the standard deviations are: the variance over networks is added to the
+    mean of the variances that the networks state.
+    """
     outputs = np.empty((len(networks), len(db_uT), OUTPUTS_N))
     for layers, output in zip(networks, outputs, strict=True):
         _forward(db_uT, *layers, output)
@@ -95,7 +111,7 @@ def predict(
     rest_uT: Float[np.ndarray, " ch"],
     presses_uT: Float[np.ndarray, "c ch"],
 ) -> NetworkEstimate:
-    """Condition networks on a skin, and estimate places and forces of readings with them."""
+    """Condition networks on a skin, and use them to estimate the places and forces of readings."""
     return evaluate([condition(weights, rest_uT, presses_uT) for weights in networks], db_uT)
 
 
@@ -113,7 +129,7 @@ def to_tensors(networks: Sequence[Weights]) -> dict[str, np.ndarray]:
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> list[Weights]:
-    """Return the weights of each network from the named arrays of a file, in the networks' order."""
+    """Return the weights of each network from the named arrays of a file that `to_tensors` made."""
     networks: dict[int, dict[str, np.ndarray]] = {}
     for key, value in tensors.items():
         i, _, name = key.partition(".")
@@ -143,7 +159,7 @@ def _linear(weights: Weights, name: str) -> tuple[np.ndarray, np.ndarray]:
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _fill_inputs(db_uT, values):
-    # Write the direction and the log length of a field change to `values`, scaled to about 1.
+    # Write the inputs for one field change to `values`: its direction and the logarithm of its magnitude, both scaled.
     length2 = 0.0
     for i in range(len(db_uT)):
         length2 += db_uT[i] ** 2
@@ -162,7 +178,8 @@ def _forward(db_uT, weight, bias, output):
         for layer in range(len(weight)):
             previous, values = values, bias[layer].copy()
             for i in range(len(previous)):
-                if layer == 0 or not previous[i] <= 0:  # ReLU that propagates NaN
+                # ReLU: values at or below 0 of hidden layers are left out. NaN is kept, so that it reaches the outputs.
+                if layer == 0 or not previous[i] <= 0:
                     for o in range(len(values)):
                         values[o] += previous[i] * weight[layer][i, o]
         for i in range(3):
@@ -171,4 +188,5 @@ def _forward(db_uT, weight, bias, output):
             output[r, 3 + i] = scale * math.exp(min(max(values[3 + i], LOG_SD[0]), LOG_SD[1]))
 
 
-SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192  # units in the encoder's layers, in the code, in the regressor's layers
+# Number of units in each layer of the encoder, in the code, and in each hidden layer of the regressor.
+SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192

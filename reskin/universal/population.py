@@ -1,7 +1,9 @@
-"""Simulated skins with random parameters around those of a central law, and presses on each skin.
+"""Simulated skins with random properties, and presses on each skin, for the training of networks.
 
-Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here, because each
-training step draws new errors. A skin therefore never has the same field changes twice.
+The law (`reskin.universal.law`) is a simulation of a skin. The parameters of each skin are drawn around those of a
+central law. Each skin also has its own thickness, tip, filler and chips. The law does not describe real skins exactly,
+but its errors are not drawn here: `reskin.universal.batches` draws new errors in each training step, so that a skin
+never has the same field changes twice.
 """
 
 from collections.abc import Mapping
@@ -15,32 +17,38 @@ from reskin.physics.deformation import RestingDipoles
 from reskin.universal.law import HALF_MM, PAPER_AREA, Area, Law, Setup, at_rest_uT, inside, simulate_uT
 from reskin.universal.map import LOGARITHMIC, perturb
 
-PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most this number of presses
-PRESSES_N = 2 * PLACES_N  # presses per skin: half for conditioning, half for training
-PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of presses about grid places, along each axis
+PLACES_N = 65  # number of places on the paper's grid; a network is conditioned on at most this number of presses
+PRESSES_N = 2 * PLACES_N  # number of presses on each skin: the first half is for conditioning, the second for training
+# Distance between neighbouring places of the grid, and standard deviation along each axis with which presses deviate at
+# random from the places of the grid.
+PITCH_MM, JITTER_MM = 2.0, 0.05
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
-# Variation of boards and skins in addition to that of the law's parameters. These values and the parameters' spreads
-# are assumed. Thickness and tip radius are relative to those of the setup.
-THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: probability
-TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: probability
-# In fits to the boards of scene lab, a larger gap comes with a larger amplitude, because the effects of both compensate
-# each other.
+# The following constants describe how boards and skins vary, in addition to the parameters of the law. These values and
+# the spreads of the parameters are assumed. Thickness and tip radius are relative to those of the setup.
+THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: its probability
+TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: its probability
+# Increase of the logarithm of the amplitude per mm of gap. In fits to the boards of scene lab, a larger gap comes with
+# a larger amplitude, because the effects of both compensate each other.
 LOG_AMPLITUDE_PER_MM = 0.95
-# Local variation of the log magnetisation, a sum of cosines: standard deviation, length scale, number of cosines.
+# The magnetisation of the filler varies from place to place. Its logarithm is a sum of cosine waves with this standard
+# deviation, this length scale, and this number of waves.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
-# Standard deviations over chips: relative gain, cross-talk, rotation about each axis, and offset.
+# Standard deviations over chips of: the relative gain of an axis, the cross-talk between axes, the rotation of the chip
+# about each axis, and the offset of an axis.
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
-# Least values of drawn parameters: chips must not be inside the skin, and the skin must not slide away from its centre.
+# Smallest values of drawn parameters. They prevent that chips are inside the skin, that the skin slides away from its
+# centre, and that the slide of the skin vanishes at a very small force.
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}
 
 
 @dataclass(frozen=True)
 class Forces:
-    """Distribution of the forces of presses: log-uniform from `least_N` to `largest_N`.
+    """Distribution of the forces of presses.
 
-    A fraction `light_share` of the presses has a force that is log-uniform from `light_N` to `least_N` instead.
-    weight_N: force of an additional press at the centre, if any.
+    A fraction `light_share` of the presses is light: the logarithms of their forces are uniformly distributed between
+    those of `light_N` and `least_N`. The logarithms of the other forces are uniformly distributed between those of
+    `least_N` and `largest_N`. If `weight_N` is given, each skin has one additional press at the centre with this force.
     """
 
     least_N: float = 0.5
@@ -63,7 +71,10 @@ DEFAULT_FORCES = Forces(light_share=0.2)
 
 @dataclass(frozen=True)
 class Population:
-    """Simulated skins and presses in the board's frame and axes; the first `PLACES_N` presses are on the grid."""
+    """Simulated skins, and the presses on each skin, in the frame and along the axes of the board.
+
+    The first `PLACES_N` presses of each skin are on the grid, one at each place.
+    """
 
     db_uT: Float32[np.ndarray, "s m ch"]
     rest_uT: Float32[np.ndarray, "s ch"]
@@ -78,9 +89,10 @@ def draw_population(
     centre: Law, spreads: Mapping[str, float], setup: Setup, skins: int | slice, rng: np.random.Generator,
     forces: Forces = DEFAULT_FORCES,
 ) -> Population:  # fmt: skip
-    """Simulate skins around a central law, with 130 presses each (40 ms per skin).
+    """Simulate skins with parameters around those of a central law, and 130 presses on each skin.
 
-    `skins` is the number of skins, or a slice that selects some skins of a longer sequence.
+    The simulation takes 40 ms per skin. `skins` is the number of skins, or a slice. With a slice, only the selected
+    skins of a longer sequence of skins are simulated.
     """
     own_mm = setup.design.thickness_mm
     setups = {
@@ -101,7 +113,10 @@ def draw_population(
 
 
 def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator) -> Law:
-    """Draw the parameters of a skin around those of a central law; the amplitude is correlated with the gap."""
+    """Draw the parameters of a skin around those of a central law.
+
+    The amplitude is correlated with the gap (see `LOG_AMPLITUDE_PER_MM`).
+    """
     law = centre
     for name, spread in spreads.items():
         law = perturb(law, name, spread * rng.standard_normal())
@@ -113,7 +128,10 @@ def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator
 def draw_skin(
     law: Law, setup: Setup, rng: np.random.Generator, forces: Forces = DEFAULT_FORCES
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Simulate one skin on imperfect chips: field changes, no-load field, places and forces."""
+    """Simulate one skin on imperfect chips.
+
+    Returns the field changes of its presses, its no-load field, and the places and forces of the presses.
+    """
     place_mm = draw_places(rng, setup.area)
     force_N = forces.draw(PRESSES_N, rng)
     if forces.weight_N is not None:
@@ -128,9 +146,10 @@ def draw_skin(
 
 
 def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.ndarray, "m 2"]:
-    """Draw places of presses in mm from the board's centre.
+    """Draw the places of the presses on one skin, in mm from the board's centre.
 
-    The order is: all places of the grid, half of them again, and places anywhere in the area.
+    The result begins with all places of the grid, for conditioning. It continues with about half of these places again
+    and with places anywhere in the area, for training.
     """
     grid_mm = grid(area)
     anywhere_n = int(PLACES_N * ANYWHERE_SHARE)
@@ -138,14 +157,15 @@ def draw_places(rng: np.random.Generator, area: Area = PAPER_AREA) -> Float[np.n
     near_mm = np.concatenate([grid_mm, repeated_mm])
     near_mm = near_mm + JITTER_MM * rng.standard_normal(near_mm.shape)
     limit_mm = np.abs(grid_mm).max(axis=0) + 0.3
-    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # 85 % or more of these are in the area
+    # 85 % or more of these places are in the area, so 8 times the needed number are more than enough.
+    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))
     return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm, area)][:anywhere_n]])
 
 
 def grid(area: Area = PAPER_AREA) -> Float[np.ndarray, "65 2"]:
-    """Return the places of the paper's grid, scaled to an area, in mm from its centre.
+    """Return the places of the paper's grid, scaled to the size of an area, in mm from the centre of the area.
 
-    The grid has 9 x 9 places, except four places in each corner.
+    The grid has 9 x 9 places without the four places in each corner.
     """
     step = np.arange(-4, 5)
     steps = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
@@ -153,7 +173,11 @@ def grid(area: Area = PAPER_AREA) -> Float[np.ndarray, "65 2"]:
 
 
 def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:
-    """Make a skin's filler uneven: multiply its moments by a log-normal factor that varies smoothly with x and y."""
+    """Make the filler of a skin uneven.
+
+    The magnetic moments are multiplied by a random factor, which has a log-normal distribution and varies smoothly with
+    x and y.
+    """
     waves_per_m = rng.standard_normal((2, FILLER_WAVES_N)) / (FILLER_MM * 1e-3)
     phase = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     waves = np.cos(rest.nodes_m[:, :2] @ waves_per_m + phase).sum(axis=1) * np.sqrt(2 / FILLER_WAVES_N)
@@ -161,7 +185,10 @@ def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:
 
 
 def draw_gains(chips_n: int, rng: np.random.Generator) -> Float[np.ndarray, "k 3 3"]:
-    """Draw each chip's response matrix: gains of the axes, cross-talk, and rotation of the chip on its board."""
+    """Draw the response matrix of each chip, which converts the true field to the field that the chip measures.
+
+    It contains random gains of the axes, cross-talk between axes, and a rotation of the chip on its board.
+    """
     gain = np.exp(GAIN_SD * rng.standard_normal((chips_n, 3)))[:, :, None] * np.eye(3)
     gain = gain + CROSS_SD * rng.standard_normal((chips_n, 3, 3))
     return gain @ Rotation.from_rotvec(CHIP_TURN_DEG * rng.standard_normal((chips_n, 3)), degrees=True).as_matrix()

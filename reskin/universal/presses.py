@@ -1,6 +1,11 @@
-"""Presses on a recorded board: mean field changes, noise, and statistics to compare them with a simulation.
+"""Presses on a recorded board, and statistics that compare them with a simulation.
 
-The statistics are cosine, explained fraction, growth of the field change with force, and memory of the last press.
+The statistics are:
+
+- the cosine of the angle between recorded and simulated field changes;
+- the fraction of the recorded field change that the simulation explains;
+- the growth of the field change with force;
+- the memory of the skin, which is the fraction of the field change of a press that remains after the press.
 """
 
 from collections.abc import Sequence
@@ -13,21 +18,36 @@ from jaxtyping import Bool, Float, Int
 from reskin.errors import SchemaError
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-# Degree of the polynomial for drift. In scene lab, the estimated memory is 10 % smaller with degree 8 and 50 % smaller
-# with degree 12, because the polynomial then also fits the memory.
+# The drift of the no-load reading over a capture is described by a polynomial of this degree. In scene lab, the
+# estimated memory is 10 % smaller with degree 8 and 50 % smaller with degree 12, because such polynomials also fit a
+# part of the memory.
 DRIFT_DEGREE = 4
 SERIES_MIN_N = 20  # captures with fewer presses are not used to estimate the memory
-DEPTHS_MAX_N = 10  # in captures with more depths, depths are arbitrary, so that few presses have the same depth
-SPREAD_MIN = 0.2  # places with a smaller range of log F (F: force) are not used to estimate the growth
+# If a capture has more depths than this, the depths were arbitrary, so only few presses have the same depth.
+DEPTHS_MAX_N = 10
+SPREAD_MIN = 0.2  # places with a smaller range of the logarithm of the force are not used to estimate the growth
 
 
 @dataclass(frozen=True)
 class RecordedPresses:
-    """Presses of one skin on its board; values are means over the readings of a press, and fields are along the chips'
-    axes.
+    """Recorded presses of one skin on its board.
 
-    group_i: index of the press's group. A group is a capture or, if depths are known, one depth of a capture. If a
-        capture has more than `DEPTHS_MAX_N` depths, its groups are the thirds of its presses by depth.
+    All values are means over the readings of a press. Fields are along the chips' axes. Presses belong to groups: a
+    group consists of the presses of one capture or, if depths are known, of the presses at one depth of a capture. If a
+    capture has more than `DEPTHS_MAX_N` depths, its presses are divided into three groups of equal size by depth.
+
+    Parameters
+    ----------
+    board : name of the board
+    groups : names of the groups
+    group_i, capture_i : indices of the group and of the capture of each press
+    place_mm, force_N : place and force of each press
+    db_uT, noload_uT : field change of each press, and the no-load reading before it
+    noise_uT : standard deviation of readings from the mean of their press, along x, y and z; NaN if presses have only
+        one reading
+    excluded_n : number of presses that were excluded, because their place is unknown, or because their force is unknown
+        or is not above 0 N
+    forces_known : False if no press has a known force. In this case, `force_N` is NaN.
     """
 
     board: str
@@ -38,10 +58,9 @@ class RecordedPresses:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    # Standard deviation of readings from the mean of their press, along x, y and z; NaN if presses have one reading.
     noise_uT: Float[np.ndarray, "3"]
-    excluded_n: int  # number of excluded presses: unknown place, or force unknown or not above 0 N
-    forces_known: bool = True  # if False, no press has a known force, and force_N is NaN
+    excluded_n: int
+    forces_known: bool = True
 
     def __len__(self) -> int:
         return len(self.force_N)
@@ -50,8 +69,8 @@ class RecordedPresses:
 def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPresses:
     """Combine the presses of all captures of one skin on one board, in the order of the captures.
 
-    with_force: whether at least one press must have a known force. If not, and no force is known, all presses with a
-    known place are kept.
+    Presses without a known place and a known force are excluded. If `with_force` is False and no force is known at all,
+    all presses with a known place are kept. Raises SchemaError if no press is left.
     """
     parts = [_means(readings) for readings in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
@@ -78,7 +97,11 @@ def _noise_uT(var_uT2: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "3"]:
 
 
 def _means(readings: Readings) -> tuple[np.ndarray, ...]:
-    """Return for each press: group, place, force, field change, no-load field, and variance of its readings."""
+    """Return means over the readings of each press.
+
+    The result contains, for each press, the name of its group, its place, its force, its field change, its no-load
+    reading, and the variance of its readings.
+    """
     _, first, press_i, counts = np.unique(
         readings.indentation, return_index=True, return_inverse=True, return_counts=True
     )
@@ -100,7 +123,7 @@ def _means(readings: Readings) -> tuple[np.ndarray, ...]:
 
 
 def _name_groups(capture: str, depths_mm: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Return the name of each press's group; see `RecordedPresses`."""
+    """Return the name of the group of each press. `RecordedPresses` explains groups."""
     known = np.isfinite(depths_mm)
     names = [f" {mm:g} mm" for mm in depths_mm]
     if len(np.unique(depths_mm[known])) > DEPTHS_MAX_N:
@@ -111,22 +134,29 @@ def _name_groups(capture: str, depths_mm: Float[np.ndarray, " n"]) -> np.ndarray
 
 
 def magnitudes_uT(db_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Return |dB| of each press, the norm of its field change over all channels."""
+    """Return |dB| of each press, which is the norm of the field change over all channels."""
     return np.linalg.norm(db_uT.reshape(len(db_uT), -1), axis=1)
 
 
 def cosines(one_uT: Float[np.ndarray, "n k 3"], other_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Return for each press the cosine of the angle between two field changes, over all channels."""
+    """Return the cosine of the angle between two field changes of each press, as vectors of all channels."""
     return (one_uT * other_uT).sum(axis=(1, 2)) / (magnitudes_uT(one_uT) * magnitudes_uT(other_uT))
 
 
 def explained(simulated_uT: Float[np.ndarray, "n k 3"], recorded_uT: Float[np.ndarray, "n k 3"]) -> np.ndarray:
-    """Return for each press the explained fraction of the recorded field change: 1 - |sim - rec|^2 / |rec|^2."""
+    """Return the fraction of the recorded field change of each press that the simulation explains.
+
+    This fraction is 1 - |simulated - recorded|^2 / |recorded|^2.
+    """
     return 1 - (magnitudes_uT(simulated_uT - recorded_uT) / magnitudes_uT(recorded_uT)) ** 2
 
 
 def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Return the median over places of d log|dB| / d log F, or None if the force F varies too little at all places."""
+    """Return how the field change |dB| grows with the force F: the exponent n in |dB| ~ F^n.
+
+    At each place, n is the slope of log|dB| against log F. The result is the median over places. Places at which the
+    force varies too little are skipped. The result is None if all places are skipped.
+    """
     log_F, log_uT = np.log(presses.force_N), np.log(magnitudes_uT(db_uT))
     slopes = []
     for place in np.unique(presses.place_mm.round(2), axis=0):
@@ -140,19 +170,19 @@ def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float
 def memory(
     presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]
 ) -> float | None:
-    """Return the fraction of a press's field change that remains in the next no-load reading.
+    """Return the fraction of the field change of a press that remains in the next no-load reading.
 
-    For each capture, no-load readings are regressed on the field change of the previous press, the field change of the
-    next press, and a polynomial for drift. The result is the mean over captures of the first coefficient. Captures are
-    skipped if they are too short or if successive presses have the same no-load reading. The result is None if all
-    captures are skipped.
+    In each capture, a linear regression explains the no-load readings by the field change of the previous press, the
+    field change of the next press, and a polynomial in time for the drift. The result is the mean over captures of the
+    coefficient of the previous press. A capture is skipped if it is too short, or if it does not have a new no-load
+    reading before each press. The result is None if all captures are skipped.
     """
     coefficients = []
     for capture_i in np.unique(presses.capture_i):
         own = np.flatnonzero(presses.capture_i == capture_i)
         rest = noload_uT[own].reshape(len(own), -1)
         if len(own) < SERIES_MIN_N or (np.diff(rest, axis=0) == 0).all(axis=1).any():
-            continue  # too short, or without a no-load reading before each press
+            continue  # the capture is too short, or has no new no-load reading before some press
         drift = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(own) - 1), DRIFT_DEGREE)
         db = db_uT[own].reshape(len(own), -1)
         residuals = [part - drift @ np.linalg.lstsq(drift, part)[0] for part in (rest[1:], db[:-1], db[1:])]

@@ -1,4 +1,8 @@
-"""Train the networks of the universal model on simulated skins and, if available, on recorded boards."""
+"""Training of the networks of the universal model, with PyTorch.
+
+The networks are trained on simulated skins and, if available, on recorded boards (`reskin.universal.batches`).
+`reskin.universal.network` describes the network, and evaluates it without PyTorch.
+"""
 
 import numpy as np
 import torch
@@ -22,14 +26,19 @@ from reskin.universal.network import (
 )
 from reskin.universal.population import Population, draw_population
 
-# AdamW with a one-cycle schedule: largest rate, weight decay, share of steps with a rising rate, limit of the gradient.
+# Settings of the optimiser AdamW with a one-cycle schedule: largest learning rate, weight decay, fraction of the steps
+# in which the learning rate rises, and largest norm of the gradient (larger gradients are scaled down).
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
-# Loss: threshold and weight of the Huber loss, and weight of the likelihood that trains the standard deviations.
+# The loss is the sum of a Huber loss, which trains the estimates, and a likelihood, which trains the standard
+# deviations. These are the threshold of the Huber loss, its weight, and the weight of the likelihood.
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
 
 
 class Network(nn.Module):
-    """Set encoder and regressor in PyTorch; the names of the weights are those from `draw_weights`."""
+    """The set encoder and the regressor of `reskin.universal.network` as a PyTorch module.
+
+    The weights have the names that `draw_weights` gives them.
+    """
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
@@ -39,9 +48,9 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Compute the code of each skin from the presses for which `kept` is 1.
+        """Compute the code of each skin from its no-load field and from those presses for which `kept` is 1.
 
-        If there are no such presses, the pooled features are 0.
+        The features of these presses are averaged. If there are no such presses, the averages are 0.
         """
         features = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
         features = torch.relu(self._linear("set2", features)) * kept[..., None]
@@ -53,7 +62,10 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"],
         code: Float[torch.Tensor, "b 64"],
     ) -> tuple[Float[torch.Tensor, "b n 3"], Float[torch.Tensor, "b n 3"]]:  # fmt: skip
-        """Return scaled x, y and log F, and their log standard deviations."""
+        """Estimate scaled values of x, y and log F for presses on skins with these codes.
+
+        Returns the estimates and the logarithms of their standard deviations.
+        """
         values = inputs(db_uT, rest_uT)
         for i in range(LAYERS_N):
             gain, shift = self._linear(f"film{i}", code)[:, None].chunk(2, -1)
@@ -66,10 +78,11 @@ class Network(nn.Module):
 
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Return direction and log magnitude of each field change, and the skin's no-load field, scaled to about 1.
+    """Compute the inputs of the network, which are scaled to values of about 1.
 
-    NumPy is used because the results of `torch.log` differ between processors. The result has no gradients; training
-    needs none, because inputs do not depend on weights.
+    The inputs for a press are the direction of its field change, the logarithm of the magnitude, and the no-load field
+    of the skin. They are computed with NumPy, because the results of `torch.log` differ between processors. The result
+    has no gradients, but training needs none, because the inputs do not depend on weights.
     """
     db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
     length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
@@ -79,7 +92,10 @@ def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b
 
 
 def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
-    """Simulate skins of a prior, train networks on them one after the other, and return the networks' weights."""
+    """Simulate skins, train `settings.seeds_n` networks on them one after the other, and return their weights.
+
+    `prior` is the distribution of the skins.
+    """
     rng = rng_for(seed, "universal", prior.name, "skins")
     skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng, prior.forces)
     names = ("universal", prior.name, "network")
@@ -88,7 +104,8 @@ def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> l
 
 def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Train one network and return its weights."""
-    torch.set_num_threads(1)  # with several threads, the order of summation and thus the result would vary
+    # With several threads, the order in which numbers are added would vary, and thus the result.
+    torch.set_num_threads(1)
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
     optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
@@ -104,7 +121,11 @@ def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Gene
 
 
 def loss_of(network: Network, batch: Batch) -> torch.Tensor:
-    """Return the loss of a batch: Huber loss of the means plus Gaussian negative log likelihood."""
+    """Return the loss of a batch.
+
+    The loss is the sum of the Huber loss of the estimates and the negative log likelihood of their errors, which are
+    assumed to be normally distributed.
+    """
     db_uT, rest_uT = torch.from_numpy(batch.db_uT), torch.from_numpy(batch.rest_uT)
     target, kept = torch.from_numpy(batch.target), torch.from_numpy(batch.kept)
     set_n = kept.shape[1]
