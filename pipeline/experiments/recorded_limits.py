@@ -714,9 +714,10 @@ class ContactPresses:
 
 
 def contact_presses(recordings: Sequence[Recording]) -> ContactPresses:
-    """Average the readings of each press of a board; field changes are relative to the no-load reading before the press.
+    """Average the readings of each press of a board.
 
-    Presses whose mean force is not positive are left out.
+    Field changes are relative to the no-load reading before the press. Presses whose mean force is not positive are
+    left out.
     """
     means = []
     for recording in recordings:
