@@ -220,7 +220,7 @@ def test_unlicensed_data_need_consent(root, example):
     write_source(root, source_of(example.files, example.url, example.commit, licence=None))
     assert_refused(root, "the use of files without a licence was not confirmed. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
-    assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
+    assert "rig: 2 files, 0.0 MB; licence: none (you may not pass the files on)" in output
     assert f"home: {example.url}, commit {example.commit}" in output
     assert fetched_files(root) == example.files
 
