@@ -35,7 +35,7 @@ FETCHED = "data/fetched"
 # The free disk space must suffice for this many copies of each file. Three copies are written: the fetched file, and
 # copies in data/raw and in DVC's cache. The fourth is a reserve.
 COPIES_N = 4
-USE_FROM = "With --from, the files are taken from a git mirror or a folder of your choice."
+USE_FROM = "to take the files from elsewhere, name a git mirror or a folder with --from."
 PART = "pad"  # option of layout leaphand, whose files contain several captures; it selects one of them
 Say = Callable[[str], None]
 
@@ -194,7 +194,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     """Read a file, convert an archive of pickled samples to CSV, and check the hash of the result."""
     path = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if path is None:
-        remedy = f"Is this the right source? {USE_FROM}"
+        remedy = f"Check whether this is the right source; {USE_FROM}"
         raise CaptureError(f"{origin.name}: no file {file.at} or {file.path}. {remedy}")
     content, name = origin.read(path), f"{origin.name} {path}"
     if path.endswith(".npz"):
@@ -202,7 +202,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
         rule, got = f"{file.sha256} ({file.bytes_n} bytes)", f"{digest} ({len(content)} bytes)"
-        problem = "The file is changed, truncated, or a different file with that name; nothing was kept."
+        problem = "The file was changed or truncated, or is another file with this name. Nothing was kept."
         remedy = f"{problem} Run the command again; {USE_FROM}"
         raise CaptureError(name, "sha256", rule, got, remedy)
     return content
@@ -335,7 +335,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
         except subprocess.CalledProcessError as error:
             remedy = (
                 "Perhaps the history of the repository was rewritten, or it is a clone that was made with --depth. "
-                f"Use a complete clone. {USE_FROM}"
+                f"Use a complete clone; {USE_FROM}"
             )
             what = f"the repository does not have commit {commit}, at which the files are pinned ({_reason(error)})"
             raise CaptureError(f"{url}: {what}. {remedy}") from None
