@@ -2,8 +2,8 @@
 
 The model combines a map with networks. The map is a Gaussian model of the reading for each place and force, and gives
 the likelihood of each place and force for a reading. Errors of the channels are not independent, so the likelihood
-itself would usually be too certain. It is therefore raised to a power, the likelihood power. In this module, the likelihood
-power affects only the standard deviations of estimates, and thus the width of their 90 % intervals.
+itself would usually be too certain. It is therefore raised to a power, the likelihood power. In this module, the
+likelihood power affects only the standard deviations of estimates, and thus the width of their 90 % intervals.
 """
 
 from collections.abc import Callable, Mapping, Sequence
