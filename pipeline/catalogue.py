@@ -1,4 +1,4 @@
-"""Catalogue of experiments: the stage that runs each experiment, and what the experiment requires of a scene."""
+"""Catalogue of experiments: which stage runs each experiment, and what a scene needs to run it."""
 
 from collections.abc import Mapping
 from functools import cache

@@ -1,4 +1,4 @@
-"""Commands for the recordings, scenes and results of the checkout in the working directory.
+"""The commands of `reskin` that need a checkout of this project: they manage recordings, scenes and results.
 
 `reskin.cli` adds these commands to `reskin` if the working directory is a checkout. Most imports are inside the
 commands, so that `reskin --help` starts quickly.
@@ -29,13 +29,16 @@ models = typer.Typer(no_args_is_help=True, help="Make a universal model for your
 app.add_typer(models, name="model", rich_help_panel=BOARD)
 
 Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
-LAYOUT = "Format: table for your own CSV, capture for a folder written by `record`; for the others, see data/README.md."
+LAYOUT = (
+    "Format of the recordings: table for your own CSV files, or capture for a folder that `reskin record` wrote. "
+    "data/README.md describes all formats."
+)
 Board = Annotated[str, Option(help="Name of the circuit board.")]
 Marks = Annotated[
     list[str] | None,
     Option(
-        help="Layouts capture, serial-*: the time of one event in seconds, first on the stream's clock, then on the "
-        "robot's clock, as STREAM_S,PROBE_S; may be repeated."
+        help="Layouts capture, serial-*: two times of the same event in seconds, as STREAM_S,PROBE_S. The first is on "
+        "the clock of the readings, and the second is on the clock of the robot's log. The option may be repeated."
     ),
 ]
 
@@ -52,16 +55,20 @@ def new(
     scene: Annotated[str, Argument(help="Name of the new scene.")],
     boards: Annotated[str, Option(help="Names of your boards, separated by commas: b1,b2,b3.")],
     presses_n: Annotated[int, Option("--presses", help="Indentations of each skin in one pass.", min=4)],
-    passes_n: Annotated[int, Option("--passes", help="Passes over all places in the recordings of a skin.", min=1)] = 1,
+    passes_n: Annotated[
+        int, Option("--passes", help="How often each skin is pressed at all places, one pass after the other.", min=1)
+    ] = 1,
     layout: Annotated[
         str | None,
         Option(
-            help="Layout of the boards: reskin (the paper's board), anyskin, eflesh, or a YAML file, which is copied. "
-            "Default: the paper's, written into the scene's file for you to edit."
+            help="Layout of your boards, which states where the chips are: reskin (the paper's board), anyskin, "
+            "eflesh, or a YAML file, which is copied into the scene's file. Default: the layout of the paper's board "
+            "is written into the scene's file, and you edit it there."
         ),
     ] = None,
     simulated: Annotated[
-        bool, Option("--simulated", help="For recordings of emulated boards (`reskin record --simulated`).")
+        bool,
+        Option("--simulated", help="The recordings will be of emulated boards, made by `reskin record --simulated`."),
     ] = False,
 ) -> None:
     """Write a scene for two or more boards of your own, each of which is held out in turn."""
@@ -88,7 +95,8 @@ def add(
         Option(help="Name of the skin; a skin that moved to another board needs a new name. Default: BOARD_SKIN."),
     ] = None,
     like: Annotated[
-        str | None, Option(help="If SCENE is new: copy the settings of this recorded scene (ini, lab, ...).")
+        str | None,
+        Option(help="If the scene is new: name of the recorded scene (ini, lab, ...) whose settings are copied."),
     ] = None,
     name: Annotated[str | None, Option(help="Name of the capture. Default: board and skin.")] = None,
     probe: Annotated[Path | None, Option(help="Layouts capture, serial-*: log of the robot (CSV).")] = None,
@@ -105,7 +113,12 @@ def add(
     mark: Marks = None,
     rows_late: Annotated[
         int | None,
-        Option(help="Layout ini: number of rows by which fields lag behind labels. Default: detected.", min=0, max=5),
+        Option(
+            help="Layout ini: number of rows by which the fields lag behind the labels. Default: the number is found "
+            "from the readings.",
+            min=0,
+            max=5,
+        ),
     ] = None,
     force_axis: Annotated[
         Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
@@ -118,7 +131,7 @@ def add(
         Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
     ] = False,
 ) -> None:
-    """Add recordings to a scene; if one is refused, none is added. The next `dvc repro` uses them."""
+    """Add recordings to a scene. If one recording is refused, none is added. The next `dvc repro` uses them."""
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.scenes import read_plan
@@ -162,7 +175,7 @@ def add(
 
 
 def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None:
-    """Raise `ParamsError` if several recordings are given together with an option that is for one recording."""
+    """Raise `ParamsError` if an option that names or describes one recording is given with several recordings."""
     given = [option for option, value in options.items() if value is not None]
     if len(recordings) > 1 and given:
         raise ParamsError(f"{given[0]} is for one recording, but there are {len(recordings)}. Add them one by one.")
@@ -181,11 +194,18 @@ def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) 
 
 @app.command(rich_help_panel=RECORDINGS)
 def fetch(
-    source: Annotated[str | None, Argument(help="lab, ini, eflesh, eflash7 or leaphand. Default: list them.")] = None,
-    origin: Annotated[
-        str | None, Option("--from", help="Take the files from this git mirror or folder instead of their home.")
+    source: Annotated[
+        str | None,
+        Argument(help="Set of recordings: lab, ini, eflesh, eflash7 or leaphand. Default: describe all sets."),
     ] = None,
-    scene: Annotated[str | None, Option(help="Add the recordings to this scene. Default: the source's scene.")] = None,
+    origin: Annotated[
+        str | None,
+        Option("--from", help="Git mirror or folder from which the files are taken, instead of their public address."),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        Option(help="Scene to which the recordings are added. Default: the scene that belongs to the recordings."),
+    ] = None,
     yes: Annotated[bool, Option("--yes", help="Do not ask before using data that has no licence.")] = False,
 ) -> None:
     """Fetch public recordings, verify them, and add them to a scene."""
@@ -211,7 +231,10 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
-    """Resolve the conflicts of merging a branch with recordings, in data/captures.yaml, plan, dvc.lock and reports."""
+    """Resolve the git conflicts that arise when a branch with other recordings is merged.
+
+    The conflicts are in the files that commands write: data/captures.yaml, pipeline/plan.yaml, dvc.lock and reports.
+    """
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))
@@ -219,7 +242,7 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write training runs and reports that MLflow lacks, for example because its store was deleted or unreachable."""
+    """Write to MLflow the training runs and reports that it lacks, for example because its server was unreachable."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import published_results, write_scene
 
@@ -240,7 +263,7 @@ def compare(
     scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
     against: Annotated[str, Option(help="Compare with the reports of this git revision or folder.")] = "HEAD",
 ) -> None:
-    """Compare the reports in reports/ with the committed ones; exit status 1 if any value differs."""
+    """Compare the reports in reports/ with the committed reports. The exit status is 1 if any value differs."""
     from pipeline.manage.compare import compare_scene
 
     names = [scene] if scene else checked_plan().scenes
@@ -261,14 +284,22 @@ def summary(
 def score(
     predictions: Annotated[Path, Argument(help="A .csv or .parquet file in the format of docs/benchmark.md.")],
     enter: Annotated[
-        bool, Option("--enter", help="Write the scores to benchmark/entries, as an entry; needs the next four options.")
+        bool,
+        Option(
+            "--enter",
+            help="Write the scores to benchmark/entries, as an entry of the benchmark. Needs --method, --by, "
+            "--trained-on and --code.",
+        ),
     ] = False,
     method: Annotated[str | None, Option(help="Name of your method.")] = None,
     by: Annotated[str | None, Option(help="Names of the authors.")] = None,
-    trained_on: Annotated[str | None, Option(help="What your method learned from, such as: labels.")] = None,
+    trained_on: Annotated[
+        str | None, Option(help="Data on which your method was trained, such as: labels, or other boards.")
+    ] = None,
     code: Annotated[str | None, Option(help="Where your code or paper is, such as a URL.")] = None,
     data: Annotated[
-        Path | None, Option(help="Folder of the recordings. Default: the one to which `reskin fetch` writes them.")
+        Path | None,
+        Option(help="Folder of the recordings. Default: the folder to which `reskin fetch` writes recordings."),
     ] = None,
 ) -> None:
     """Check a file of predictions for the benchmark; print its scores and write them as JSON beside the file."""
@@ -289,10 +320,13 @@ def verify_reports(
     ] = None,
     against: Annotated[
         Path | None,
-        Option(help="Folder with reports of an earlier rerun, to compare instead of running the scenes again."),
+        Option(help="Folder with the reports of an earlier rerun. If it is given, the scenes are not run again."),
     ] = None,
 ) -> None:
-    """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""
+    """Run scenes again in a fresh clone of the last commit, and compare their reports with the committed reports.
+
+    The exit status is 1 if any value differs.
+    """
     from pipeline.manage.verify import verify
 
     sys.exit(verify(ROOT, names or list(checked_plan().scenes), against, typer.echo))
@@ -308,7 +342,9 @@ def check_cache() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def readme(
-    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a page is out of date.")] = False,
+    check: Annotated[
+        bool, Option("--check", help="Write nothing. The exit status is 1 if a page is out of date.")
+    ] = False,
 ) -> None:
     """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
     from pipeline.report.readme import fill_pages
@@ -322,7 +358,7 @@ def readme(
 
 @scenes.command("list")
 def list_scenes() -> None:
-    """List all scenes; a star marks those that `dvc repro` runs."""
+    """List all scenes. A star marks the scenes that `dvc repro` runs."""
     from pipeline import plan
 
     planned = checked_plan().scenes
@@ -331,7 +367,7 @@ def list_scenes() -> None:
 
 
 @scenes.command()
-def use(names: Annotated[list[str], Argument(help="Scenes to run, instead of those that run now.")]) -> None:
+def use(names: Annotated[list[str], Argument(help="Names of the scenes. All other scenes no longer run.")]) -> None:
     """Set the scenes that `dvc repro` runs."""
     from pipeline import plan
     from pipeline.manage import tidy as tidying
@@ -358,7 +394,7 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check the planned scenes and params.yaml, and whether pipeline/plan.yaml is up to date."""
+    """Check the settings of the planned scenes and params.yaml, and whether pipeline/plan.yaml is up to date."""
     from pipeline import plan
 
     names = list(checked_plan().scenes)
@@ -372,11 +408,14 @@ def make_model(
     layout: Annotated[
         Path,
         Option(
-            help="YAML file of your board, like reskin/universal/layouts/reskin.yaml, or of a scene with a layout; or "
-            "reskin, anyskin, eflesh."
+            help="Layout of your board: a YAML file in the form of reskin/universal/layouts/reskin.yaml, or the YAML "
+            "file of a scene with a layout, or one of the names reskin, anyskin, eflesh."
         ),
     ],
-    out: Annotated[Path, Option(help="The model to write (.safetensors); its card is beside it (.json).")],
+    out: Annotated[
+        Path,
+        Option(help="File to which the model is written (.safetensors). Its description is written beside it (.json)."),
+    ],
 ) -> None:
     """Simulate skins on your board and train a universal model for it. Takes a few minutes; needs PyTorch."""
     from pipeline.training import shipping

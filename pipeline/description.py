@@ -15,10 +15,10 @@ from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
-NEAR = 0.2  # largest relative difference between a reading's force and the force in `FORCES_N` for which it counts
+NEAR = 0.2  # a reading belongs to a force in `FORCES_N` if the relative difference of the forces is at most this
 LARGEST = "force_max_N"
-ENOUGH_N = 20  # minimum number of readings for a statistic
-LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between two compared no-load readings
+ENOUGH_N = 20  # a statistic is computed only if there are at least this many readings
+LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
 STEP_READINGS_N = 2000  # number of readings that determine the chips' resolution
 PRESSED_N = 0.5  # below this force, the field change of a weak chip is mostly noise
 
@@ -48,8 +48,8 @@ def without_rest(described: Mapping[str, float]) -> dict[str, float]:
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Summarise every quantity over skins: mean, standard deviation, minimum and maximum.
 
-    described: pairs of a skin's name and the description of one capture. The captures of a skin are averaged first,
-    except that the largest force is that of all captures.
+    described: pairs of a skin's name and the description of one of its captures. The descriptions of a skin's captures
+    are averaged first. Only the largest force is not averaged; it is the largest force in all captures of the skin.
     """
     rows = pd.DataFrame([numbers for _, numbers in described])
     by_skin = rows.groupby([skin for skin, _ in described], sort=False)
@@ -75,9 +75,10 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 def _wander(readings: Readings) -> dict[str, float]:
     """Return the rms difference between the fields at rest before two contacts, for each lag in `LAGS_N`.
 
-    The lag is the number of contacts from one field at rest to the other. A random walk of the field causes a
-    difference that grows as the square root of the lag. After-effects of contacts cause a difference that has its full
-    size at lag 1, and that repeats when the scan repeats.
+    The lag is the number of contacts between the two fields at rest. The result helps to distinguish two causes of a
+    difference. If the field at rest is a random walk, the difference grows as the square root of the lag. If contacts
+    have after-effects, the difference has its full size already at lag 1, and it repeats when the rig presses the same
+    places again in the same order.
     """
     _, first_i = np.unique(rank(readings.indentation), return_index=True)
     rest_uT = readings.noload_uT[first_i].astype(np.float64)
@@ -90,8 +91,8 @@ def _wander(readings: Readings) -> dict[str, float]:
 
 def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
     """Return the standard deviation of one reading's noise (median over chips), for x and y together and for z."""
-    # The tip does not move during a stop of an indentation, so deviations from the stop's mean are noise. The variance
-    # of the noise is pooled over all stops.
+    # An indentation has stops, during which the tip does not move. Deviations of readings from the mean of their stop
+    # are therefore noise. The variance of the noise is pooled over all stops.
     stops = [column[touched] for column in (readings.indentation, readings.x_mm, readings.y_mm)]
     by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
     dof_n = int(touched.sum()) - by_stop.ngroups

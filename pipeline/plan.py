@@ -1,4 +1,4 @@
-"""Generate pipeline/plan.yaml: the scenes that each DVC stage iterates over."""
+"""Generate pipeline/plan.yaml, which lists the scenes that DVC runs and the items for which each DVC stage runs."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,16 +21,18 @@ HEADER = """\
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
 MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
-NOT_INGESTED = {"walk"}  # kinds of protocols without a probe log, whose experiments read raw captures
+NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the robot; their experiments read the raw captures
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
     """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
 
-    Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures; each
-    protocol of a scene has one folder. `ingest` iterates over recorded captures. An experiment such as `drift` has its
-    own protocol in simulated scenes, and may also run in recorded scenes. The stage of such an experiment iterates over
-    pairs of a scene and the folder that contains the scene's captures.
+    DVC runs a stage once for each of its items:
+    - For most stages, the items are names of scenes.
+    - For `simulate` and `ingest_simulated`, the items are folders of captures. Each protocol of a scene has one folder.
+    - For `ingest`, the items are recorded captures.
+    - An experiment such as `drift` reads the captures of its own protocol in a simulated scene, and the main captures
+      in a recorded scene. The items of such an experiment are pairs of a scene and the folder with these captures.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():

@@ -1,4 +1,4 @@
-"""Provenance of results: checkout, commit of the code, machine, and costs in seconds of run time."""
+"""Provenance of results: the checkout, the commit of the code, the machine, and the run times of stages."""
 
 import os
 import platform
@@ -40,8 +40,8 @@ def is_experiment() -> bool:
 def code_version() -> str:
     """Return the last commit that changed the two packages; `unknown` outside git.
 
-    `+dirty` is appended if the packages have uncommitted changes. HEAD is not used, because equal results would look
-    different after a later commit of results.
+    `+dirty` is appended if the packages have uncommitted changes. The newest commit (HEAD) is not used, because it may
+    contain only results. Equal results would then seem to come from different code.
     """
     code_paths = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
     commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *code_paths)

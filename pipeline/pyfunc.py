@@ -34,7 +34,9 @@ FOLDER = "model"  # folder of a model among the artifacts of a run
 COLUMNS = ("x_mm", "y_mm", "force_N")
 EXAMPLE, SERVING_EXAMPLE = "input_example.json", "serving_input_example.json"
 LABEL_N = len(COLUMNS)  # values of a label
-EXAMPLE_N, EXAMPLE_OF_N = 3, 2000  # the example has the readings with the largest change among the first of a capture
+# The example of a model's input consists of EXAMPLE_N readings: those with the largest field changes among the first
+# EXAMPLE_OF_N readings of a capture.
+EXAMPLE_N, EXAMPLE_OF_N = 3, 2000
 PARAMS = ("noload_uT", "presses_uT", "labelled_uT", "labels")
 
 

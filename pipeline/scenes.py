@@ -18,11 +18,12 @@ from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recip
 from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
-# The rows of table 2 and their experiments. If a scene runs all four, stage table2 writes the table before the report.
+# The rows of table 2, each with the experiment that provides its scores. If a scene runs all four experiments, stage
+# table2 writes this table as soon as they are done, before the report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
-WHOLE = "the scene"  # place of sections in messages about a scene's settings
-KEPT = {"pool_passes_n"}  # settings with an effect even without the experiment that needs them
+WHOLE = "the scene"  # in messages about unused settings: the place of settings that are whole sections of the scene
+KEPT = {"pool_passes_n"}  # settings that have an effect even if the scene does not run the experiment that needs them
 
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
 ANALYSES = tuple(experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "analysis")
@@ -66,9 +67,10 @@ class Simulation(Strict):
 
 
 class Scene(Strict, extra="allow"):
-    """A scene: recorded or simulated captures, the experiments to run on them, and the settings of each experiment.
+    """A scene: captures (recorded or simulated readings), experiments on them, and the settings of the experiments.
 
-    A simulated scene has a section `simulate`, or consists of recordings of emulated boards that were added to it.
+    The captures of a simulated scene are simulated according to section `simulate`. A simulated scene without this
+    section consists of recordings of emulated boards, which were added to the scene.
     """
 
     source: Source
@@ -130,7 +132,7 @@ class Scene(Strict, extra="allow"):
 
     @property
     def _settings_by_place(self) -> dict[str, tuple[Set[str], Set[str]]]:
-        """The settings that the scene has, and those that its experiments need, by their place in the file."""
+        """The settings that the scene has, and the settings that its experiments need, by place in the scene's file."""
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
         # Adaptation draws its pokes from the first `pool_passes_n` passes.
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
@@ -199,7 +201,14 @@ class Shared(Strict):
 
 
 class Plan(Strict):
-    """Content of `pipeline/plan.yaml`: experiments of the planned scenes, recorded captures, items of each stage."""
+    """Content of `pipeline/plan.yaml`, which states what `dvc repro` runs.
+
+    - scenes: the experiments of each planned scene.
+    - captures: the recorded captures of each scene.
+    - held_out: the experiments of each scene for which folds are drawn.
+    - models: the stages of each scene that write models.
+    - stages: the items (scenes, captures or folders) for which each stage runs.
+    """
 
     scenes: dict[str, tuple[str, ...]]
     captures: dict[str, tuple[str, ...]]
@@ -230,7 +239,10 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and whether the scene has the sections that they need; do not parse the sections."""
+    """Check a scene's experiments, and whether the scene has the sections of settings that they need.
+
+    The sections are not parsed.
+    """
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))

@@ -1,6 +1,7 @@
-"""Settings of a scene, from the scene's file, `params.yaml` and the library's nominal skin; each file is read once.
+"""Settings of a scene: they come from the scene's file, from `params.yaml`, and from the library's nominal skin.
 
-The `params` of a stage in `dvc.yaml` are the sections that the stage parses (tests/test_settings.py compares both).
+Each file is read once. In `dvc.yaml`, the `params` of a stage must be the sections of settings that the stage parses;
+tests/test_settings.py checks this.
 """
 
 import inspect
@@ -30,19 +31,26 @@ class Seeded(Strict):
 
 
 class SectionWithRows(Strict):
-    """Base class of sections that refer to rows of `params.yaml`, such as recipes, by name."""
+    """Base class of sections that refer to shared settings by name.
+
+    `params.yaml` contains settings that several scenes share, in named rows, such as training recipes. A section of a
+    scene's file contains only the name of a row.
+    """
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
-        """Replace the names of rows in a section by the content of the rows; called before the section is parsed."""
+        """Replace the names of shared rows in a section by the content of these rows.
+
+        This method is called before the section is parsed.
+        """
         raise NotImplementedError
 
 
 class Training(SectionWithRows):
-    """Training recipes by name; each recipe is trained on every fold with `seeds_n` seeds.
+    """Training recipes by name; for each recipe, one network is trained on every fold with each of `seeds_n` seeds.
 
-    `paper` is the headline recipe. The scene's file sets `recipe` (the name of a shared recipe), `steps_n` and, for
-    each variant of the recipe, the values that differ.
+    Recipe `paper` is the headline recipe. In the scene's file, the section states `recipe` (the name of a recipe in
+    `params.yaml`), `steps_n` and `variants`. A variant lists only the values that differ from the headline recipe.
     """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
@@ -63,10 +71,11 @@ class SectionWithTraining(SectionWithRows):
 
 
 class Adaptations(SectionWithRows):
-    """Settings of adaptations by name; each adapts networks with `pokes_n` unlabelled indentations of a held-out skin.
+    """Settings of adaptations by name.
 
-    The scene's file sets `adaptation` (the name of a shared adaptation), `base` (a recipe of section train_triplet),
-    `steps_n` and the variants.
+    An adaptation continues the training of networks with `pokes_n` unlabelled indentations of a held-out skin. In the
+    scene's file, the section states `adaptation` (the name of a row in `params.yaml`), `base` (the recipe of section
+    train_triplet whose networks are adapted), `steps_n` and `variants`.
     """
 
     pokes_n: Count
@@ -89,10 +98,14 @@ class Adaptations(SectionWithRows):
 class Settings:
     """The settings of a scene; each section is parsed into a typed model when it is first read.
 
-    where: the path of the scene's file, for error messages. of_scene: the content of that file. shared: the content of
-    `params.yaml` and of the library's nominal skin. captures: names of the scene's recorded captures; empty for a
-    simulated scene. held_out: experiments of the scene for which folds are drawn. models: stages of the scene that
-    write models. parsed: sections that have been parsed, by settings model and name.
+    - scene: name of the scene.
+    - where: path of the scene's file, for error messages.
+    - of_scene: content of the scene's file.
+    - shared: content of `params.yaml` and of the library's nominal skin.
+    - captures: names of the scene's recorded captures; empty for a simulated scene.
+    - held_out: experiments of the scene for which folds (divisions into training and test rows) are drawn.
+    - models: stages of the scene that write models.
+    - parsed: sections that have been parsed, by settings model and name.
     """
 
     scene: str
@@ -150,7 +163,8 @@ class Settings:
     def captures_in(self, indentations: Path) -> list[str]:
         """Return the names of the captures in a folder of readings.
 
-        For a recorded scene, the names come from the registry, so that a file that a removed capture left is not read.
+        For a recorded scene, the names come from the registry rather than from the folder. A file of a capture that has
+        been removed from the scene is therefore not read.
         """
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
 
@@ -184,9 +198,11 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and each of its variants.
+    """Replace the keys `steps_n` and `variants` of a section by the key `recipes`.
 
-    shared: the row of `params.yaml` that the section names. This row, together with `steps_n`, is the headline recipe.
+    `recipes` contains the headline recipe and each of its variants, by name. `shared` is the row of `params.yaml` that
+    the section names. This row, together with `steps_n`, is the headline recipe. A variant is the headline recipe with
+    the changes that the section lists.
     """
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}

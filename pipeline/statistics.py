@@ -1,8 +1,8 @@
 """The table of scores of all training runs, and the statistics over boards that reports compute from it.
 
-A row of the table has the scores of one network on one skin, or on all skins that it was tested on. The unit of
-inference is the board, because the skins of one board are not independent. They share the board, and they are tested
-with the same networks, which were trained without this board.
+A row of the table contains the scores of one network on one skin, or its joint scores on all skins on which it was
+tested. In statistical tests, one board counts as one observation. The skins of a board are not independent
+observations, because they share the board and are tested with the same networks, which were trained without this board.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -20,9 +20,10 @@ COUNTS = (
     "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
-UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that give an uncertainty
-ALL_SKINS = ""  # value in column `skin` of a joint row for all skins that a network was tested on
-# Values of column `places`; registered: positions are corrected by one offset per board, estimated from its labels.
+UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that state an uncertainty
+ALL_SKINS = ""  # value of column `skin` in joint rows, which are for all skins on which a network was tested
+# Values of column `places`. In rows AS_LABELLED, predicted positions are scored without a correction. In rows
+# REGISTERED, the mean error of each board, which is estimated from its labels, was first subtracted from the positions.
 AS_LABELLED, REGISTERED = "as_labelled", "registered"
 METHODS = {
     "triplet": "network + triplet",
@@ -32,7 +33,7 @@ CONFIDENCE = 0.95  # confidence level of intervals; convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
-BOARDS_MIN = 4  # fewest boards for an interval; for fewer boards, their values are given
+BOARDS_MIN = 4  # with fewer boards, no interval is computed; the value of each board is given instead
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
@@ -60,10 +61,10 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     Parameters
     ----------
     cards
-        Model cards. If networks are adapted to one skin each, the networks of a fold and seed also have a joint row for
-        all skins.
+        Model cards, which are the JSON descriptions of trained networks. If each network is adapted to one skin, the
+        networks of the same fold and seed also have a joint row for all their skins.
     points
-        Points of sweeps, by experiment; each point has the scores of one training run.
+        Points of the curves of sweeps, by experiment. Each point has the scores of one training run.
 
     Returns
     -------
@@ -77,7 +78,7 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
         for point in experiment_points
     ]
     rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
-    # Joint rows by fold and seed: one row, or several if networks are adapted to one skin each.
+    # Joint rows by fold and seed. There are several rows for a fold and seed if each network is adapted to one skin.
     groups: dict[Hashable, list[dict[str, Any]]] = {}
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
         groups.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
@@ -103,7 +104,11 @@ def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the rows of a training run: joint rows with positions as labelled and registered, then a row per skin."""
+    """Return the rows of one training run.
+
+    The first two rows are joint rows for all skins, one with positions as labelled, and one with registered positions.
+    One row for each skin follows.
+    """
     boards = {*scores["board_of"].values()}
     joint = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
     rows = [joint | {"places": AS_LABELLED} | scores["all"], joint | {"places": REGISTERED} | scores["registered"]]
@@ -154,9 +159,10 @@ def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count all training runs, collapsed runs, and collapsed runs that were kept because every repeat collapsed too.
+    """Count all training runs, including repeated ones, and the collapsed training runs among them.
 
-    A training run has collapsed if the output of its network is nearly constant.
+    A training run has collapsed if the output of its network is nearly constant. It is then repeated. If every repeat
+    also collapses, the last network is kept, and counted in `kept_collapsed_n`.
 
     >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
     {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
@@ -170,7 +176,9 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def interval(values: Values, metric: str = "") -> list[float] | None:
-    """Compute the two-sided 95 % interval of a mean by Student's t; None for fewer than two values. See `t_interval`.
+    """Compute the two-sided 95 % interval of a mean by Student's t (see `t_interval`).
+
+    Returns None if there are fewer than two values.
 
     >>> interval([1.0]) is None
     True
@@ -234,11 +242,12 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
-    """Summarise values: `mean` and `n`, and for two or more values the standard deviation `sd` (n - 1).
+    """Summarise values by their mean, their number and their spread.
 
-    boards: whether each value belongs to one board. If so, the summary of two or more values also has an interval
-    `ci95`. For fewer than `BOARDS_MIN` values, it has the `values` themselves, in the order of the boards, instead of
-    the interval.
+    The summary has the keys `mean` and `n` and, if there are two or more values, the standard deviation `sd` (with
+    divisor n - 1). If each value belongs to one board (`boards`), the summary of two or more values also has the 95 %
+    confidence interval `ci95`. If there are fewer than `BOARDS_MIN` values, it has `values` instead of the interval:
+    the values themselves, in the order of the boards.
     """
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
@@ -253,7 +262,8 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
     """Summarise each column over its values that are not NaN.
 
-    differences: whether the columns are differences of metrics; the bounds of a metric do not hold for its differences.
+    differences: whether the columns are differences of metrics. Intervals of metrics are limited to possible values,
+    such as 0 to 100 %. These limits do not hold for differences of a metric.
     """
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
@@ -266,8 +276,8 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
     """Summarise every metric over units, which are the groups of rows with equal values in the columns `unit`.
 
-    The value of a unit is the mean of its rows. Unless the units are several boards, the summary also has `sd_seeds`,
-    the mean standard deviation within a unit.
+    The value of a unit is the mean of its rows. The summary also has `sd_seeds`, the standard deviation within a unit,
+    averaged over units. `sd_seeds` is left out if the units are two or more boards.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
@@ -315,12 +325,13 @@ def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
-    """Compute the standard error, and its degrees of freedom, of the mean of a table with random rows and columns.
+    """Compute the standard error of a table's mean, and its degrees of freedom, if both rows and columns are samples.
 
-    Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
-    row means divided by the number of rows, plus the variance of the column means divided by the number of columns. The
-    squared error is slightly too large, because the residual variance of cells is counted twice. The degrees of freedom
-    are Satterthwaite's. Returns None for fewer than two rows or fewer than `BOARDS_MIN` columns.
+    Rows are training skins and columns are test boards; cells may be missing. The squared standard error is the sum of
+    two terms: the variance of the row means divided by the number of rows, and the variance of the column means divided
+    by the number of columns. This sum is slightly too large, because the residual variance of the cells is in both
+    terms. The degrees of freedom are Satterthwaite's. Returns None if there are fewer than two rows or fewer than
+    `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -331,7 +342,7 @@ def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
 
 
 def board_means(rows: pd.DataFrame) -> pd.DataFrame:
-    """Average networks on each skin, then the skins of each board; return one row per board."""
+    """Average scores over the networks on each skin, then over the skins of each board; return one row per board."""
     return _skin_means(rows).groupby("board").mean()
 
 
@@ -347,7 +358,10 @@ def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def paired(method: pd.DataFrame, other: pd.DataFrame) -> dict[str, Any]:
-    """Summarise differences between two methods on the same skins over boards; `by_board` has each board's value."""
+    """Summarise the differences between two methods on the same skins over boards.
+
+    Key `by_board` of the result contains the difference of each board.
+    """
     return summarise_differences(differences(method, other))
 
 
@@ -363,10 +377,11 @@ def differences(method: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
 
 
 def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
-    """Summarise differences over boards; `by_board` has each board's value.
+    """Summarise differences over boards.
 
-    With `BOARDS_MIN` boards or more, `p` is the p-value under the null hypothesis of no difference. The p-value follows
-    from the standard error `se` and the degrees of freedom `df`.
+    Key `by_board` of the result contains the differences of each board. If there are `BOARDS_MIN` boards or more, the
+    summary of each metric has the standard error `se`, the degrees of freedom `df`, and the p-value `p` that follows
+    from them under the null hypothesis of no difference.
     """
     summary = summarise(by_board, boards=True, differences=True)
     means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
@@ -377,10 +392,11 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 
 
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Summarise `method` minus `single` on the test skins of `single`, whose networks are trained on one skin each.
+    """Summarise the differences between `method` and `single`, each of whose networks is trained on only one skin.
 
-    The result has the same form as the result of `paired`. Its interval and `p` use `two_way_error`, because both the
-    boards and the training skins of `single` are samples.
+    The differences are computed on the skins on which `single` was tested. The result has the same form as the result
+    of `paired`. Its interval and p-value are computed with `two_way_error`, because both the test boards and the
+    training skins of `single` are samples.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
@@ -426,7 +442,7 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
 
 
 def verdict_within(stat: Stat, margin: float) -> str:
-    """Judge from the 95 % interval whether a mean over boards is nearer to 0 than `margin` (equivalence)."""
+    """Judge from the 95 % interval whether a mean over boards is nearer to 0 than `margin` (a test of equivalence)."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
@@ -436,5 +452,8 @@ def verdict_within(stat: Stat, margin: float) -> str:
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
-    """Judge a claim with several parts: contradicted if any part is contradicted, supported if all are supported."""
+    """Judge a claim with several parts from the verdicts on its parts.
+
+    The claim is contradicted if any part is contradicted, and supported if all parts are supported.
+    """
     return next((verdict for verdict in (CONTRADICTED, FEW_BOARDS, UNDECIDED) if verdict in verdicts), SUPPORTED)

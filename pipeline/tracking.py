@@ -1,6 +1,7 @@
-"""Write training runs and reports to MLflow, from the files that finished stages wrote.
+"""Write training runs and reports to MLflow, from the files that finished stages of the pipeline wrote.
 
-No result depends on MLflow. A server that does not respond delays a stage only briefly.
+MLflow only displays results; no result depends on it. If the MLflow server does not respond, a stage waits only briefly
+and then continues without it.
 """
 
 import hashlib
@@ -41,9 +42,9 @@ PARENT = "mlflow.parentRunId"
 CHAMPION = "champion"  # alias of the version of a registered model that users should load
 UNIVERSAL = "reskin-universal"  # name under which the universal model is registered
 UNIVERSAL_EXPERIMENT = "universal model"
-LAYOUT = 4  # version of the format of MLflow runs; runs of older versions are written again
+LAYOUT = 4  # version of the form in which runs are written to MLflow; runs of older versions are written again
 DIGITS_N = 6  # significant digits of metrics, as in numbers.json; MLflow's page shows all digits
-METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
+METRICS_MAX_N = 1000  # largest number of metrics that are sent in one call to MLflow
 TIMEOUT_S = 2.0  # time in which an HTTP server must answer
 LOCK_TIMEOUT_S = 5.0  # longest wait for a locked SQLite store; UIs and other writers lock it only briefly
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
@@ -81,8 +82,9 @@ class Span(NamedTuple):
 class Times:
     """Times at which the training runs and the stages of a scene ran, as far as this checkout knows them.
 
-    trainings: spans by stage and name of the training run. stages: spans by stage. by_key_s: seconds of training runs
-    by their key.
+    - trainings: when each training run ran, by stage and name of the training run.
+    - stages: when each stage ran, by stage.
+    - by_key_s: duration of each training run in seconds, by the key of the training run.
     """
 
     trainings: Mapping[tuple[str, str], Span] = field(default_factory=dict)
@@ -91,7 +93,10 @@ class Times:
 
 
 def read_times(scene: str) -> Times:
-    """Read the times that stages recorded in the working directory; results of other machines have no times."""
+    """Read the times that stages recorded in the working directory.
+
+    Stages that ran on another machine have no times here, because times are not part of a stage's outputs.
+    """
     trainings: dict[tuple[str, str], Span] = {}
     stages: dict[str, Span] = {}
     by_key_s: dict[str, float] = {}
@@ -108,11 +113,15 @@ def read_times(scene: str) -> Times:
 
 @dataclass(frozen=True)
 class Results:
-    """What the stages of a scene wrote.
+    """The results of a scene's stages that are written to MLflow.
 
-    models: folders of models and model cards, by stage. curves: points of sweeps and experiments, by stage. reports:
-    folder of the scene's report. scores: mean scores of the paper's recipe, by stage. final: weights of the final
-    model. readings: tables of readings, for examples of a model's input.
+    - models: folders with models and their model cards (JSON descriptions), by stage.
+    - curves: points of sweeps and experiments, by stage.
+    - reports: folder of the scene's report.
+    - scores: mean scores of the paper's recipe, by stage.
+    - final: file with the weights of the final model, if there is one.
+    - readings: tables of readings, from which an example of a model's input is taken.
+    - times: when stages and training runs ran.
     """
 
     models: Mapping[str, Path]
@@ -146,7 +155,10 @@ def tracking_uri(root: Path) -> str:
 
 
 def probe(uri: str | None) -> None:
-    """Raise `TrackingUnavailable` if an HTTP server does not answer within two seconds, or a SQLite file is locked."""
+    """Check that MLflow can be used; raise `TrackingUnavailable` if not.
+
+    An HTTP server must answer within two seconds, and a SQLite file must not be locked.
+    """
     if uri is None:
         return
     if uri.startswith(SQLITE):
@@ -242,9 +254,10 @@ def scores_link(scene: str, root: Path) -> str:
 
 
 class Publisher:
-    """Writes each MLflow run of a scene once, and remembers the keys of the runs that contain current results.
+    """Writes the results of a scene to MLflow, each result only once.
 
-    Tag `run_key`, which is a digest of a run's content, identifies the run.
+    Tag `run_key` of an MLflow run identifies its content, of which it is a digest. A publisher remembers the keys of
+    all runs that contain current results, so that all other runs can be marked as superseded.
     """
 
     def __init__(self, client: Any, scene: str, root: Path, results: Results, *, runs_n: int) -> None:
@@ -258,7 +271,10 @@ class Publisher:
 
     @cached_property
     def marked(self) -> dict[str, Any]:
-        """The runs that were current before, by key; one query reads all runs, because each query takes 10 ms."""
+        """The MLflow runs that were marked as current before this publisher started, by key.
+
+        All runs are read at once, because a query for each run would take 10 ms.
+        """
         runs, token = [], None
         while True:
             page = self.client.search_runs(
@@ -306,7 +322,7 @@ class Publisher:
         return str(run.info.run_id), True
 
     def set_tags(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set those tags of a run whose values differ from `tags`."""
+        """Set tags of a run, except those that already have the given value."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
@@ -320,9 +336,10 @@ class Publisher:
         params: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
     ) -> None:
-        """Write metrics, given as rows (name, value, step), parameters and tags to a run.
+        """Write metrics, parameters and tags to a run.
 
-        Metrics are rounded. The points of a curve are spread over the run's duration, in proportion to their steps.
+        Each element of `rows` is one value of a metric: (name, value, step). Values are rounded. MLflow needs a time
+        for each value, so the points of a curve are spread over the run's duration, in proportion to their steps.
         """
         from mlflow.entities import Metric, Param, RunTag
 
@@ -350,7 +367,10 @@ class Publisher:
         self.client.set_terminated(run_id, end_time=span.end_ms)
 
     def write_trainings(self, stage: str, cards: Mapping[Path, dict[str, Any]]) -> int:
-        """Write a stage's training runs as children of an MLflow run of the stage; return how many are new."""
+        """Write one MLflow run for a stage, and one child run for each of its training runs.
+
+        Returns the number of training runs that MLflow did not have before.
+        """
         scores = self.results.scores.get(stage, {})
         keys = [run_key(card) for card in cards.values()]
         parent_key = _digest([*sorted(keys), scores, LAYOUT])
@@ -373,7 +393,10 @@ class Publisher:
         return (stage, file.stem) in self.results.times.trainings
 
     def write_training(self, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
-        """Write one training run: settings, scores, loss curve, datasets and model; return whether it is new."""
+        """Write one training run with its settings, scores, loss curve, datasets and model.
+
+        Returns whether MLflow did not have this training run before.
+        """
         span = self.results.times.trainings.get((stage, file.stem), Span.now())
         tags = {"cell": card["key"], "board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
         tags |= {"mlflow.source.name": f"python -m pipeline {stage}"}
@@ -393,7 +416,7 @@ class Publisher:
     def write_model(
         self, run_id: str, weights: Path, card: Mapping[str, Any], rows: Iterable[tuple[str, float, int]], span: Span
     ) -> None:
-        """Write a network, its settings, loss curve and datasets, and metrics `rows` to a run, and end the run."""
+        """Write a network with its settings, loss curve, datasets and the metrics `rows` to a run, and end the run."""
         curve = zip(_curve_steps(card), card["curve"], strict=True)
         rows = [*rows, *(("loss", value, step) for step, value in curve)]
         about = self.write_artifacts(run_id, weights, self.example_uT(card["input"]["channels_n"]), span)
@@ -428,10 +451,11 @@ class Publisher:
         return example_uT
 
     def write_final(self, weights: Path, *, register: bool) -> None:
-        """Write the final model of a scene, which is trained on all boards; register it as `reskin-SCENE`.
+        """Write the final model of a scene, which is trained on all boards.
 
-        The scores in the run are means over boards. They are scores of networks of the same recipe that were trained
-        without the tested board.
+        If `register`, the model is also registered, under the name `reskin-SCENE`. The final model itself cannot be
+        tested, because no board is held out. The scores in the run are therefore scores of other networks of the same
+        recipe, each of which was trained without the tested board. They are means over boards.
         """
         card = io.read_json(weights.with_suffix(".json"))
         train_s = self.results.times.by_key_s.get(card["key"])
@@ -516,10 +540,11 @@ class Publisher:
             self.end(run_id, span)
 
     def write_report(self, reports: Path) -> None:
-        """Write the report's numbers and files to a run; its key depends on numbers, figures and tables, not on costs.
+        """Write the numbers and the files of the report to a run.
 
-        Tag `inputs` identifies the results that a report shows. `dvc checkout` restores earlier results without their
-        report. The run of their report then becomes current again.
+        The key of the run depends on the numbers, figures and tables, but not on run times and other costs. Tag
+        `inputs` identifies the results that the report shows. `dvc checkout` can restore earlier results without their
+        report; the earlier run with the same tag `inputs` then becomes current again.
         """
         inputs = _digest(sorted(self.current))
         earlier = self.find("report", inputs=inputs)
@@ -546,9 +571,9 @@ class Publisher:
                 self.end(run_id, span)
 
     def mark_superseded(self) -> int:
-        """Set tag `current` of superseded runs to false, so that `tags.current = 'true'` shows each result once.
+        """Set tag `current` to false in all runs that no longer contain a current result; return their number.
 
-        Return the number of these runs.
+        The filter `tags.current = 'true'` of MLflow's page then shows each result only once.
         """
         superseded = [run for key, run in self.marked.items() if key not in self.current]
         for run in superseded:
@@ -570,13 +595,19 @@ def _settings_of(card: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _curve_steps(card: Mapping[str, Any]) -> list[int]:
-    """Return the training step at which each point of the loss curve ends; cards of earlier versions lack it."""
+    """Return the training step at which each point of the loss curve ends.
+
+    Model cards of earlier versions do not contain these steps. The points are then numbered from 1.
+    """
     points_n = len(card["curve"])
     return list(card.get("curve_steps", range(1, points_n + 1)))
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Return a digest of a model card without its commit, so that equal results of two commits are the same run."""
+    """Return a digest of a model card, which identifies the MLflow run of the model.
+
+    The commit in the card is ignored, so that equal results of two commits belong to the same run.
+    """
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 
@@ -645,9 +676,9 @@ def _datasets(card: Mapping[str, Any]) -> list[Any]:
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
-    """Flatten numbers.json to rows (name, value, step).
+    """Flatten the nested content of numbers.json to rows (name, value, step), one for each value of a metric.
 
-    If the first key of the rows in a list is a count, the list becomes a curve over this count. Other lists, texts,
+    A list of rows whose first key is a count becomes a curve, in which this count is the step. Other lists, texts,
     costs, counts and the content of training runs are left out.
     """
     published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}

@@ -457,7 +457,7 @@ def test_scene_with_too_little_data_is_an_error(root, lab_file):
 def test_new_scene_holds_out_each_board_of_a_layout(root, tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     created = output_of(["new", "mine", "--boards", "b1,b2,b3", "--presses", "60", "--passes", "2"])
-    assert "left out: calibrated" in created
+    assert "experiment calibrated is left out" in created
     assert "describe your boards in this file" in created
     scene = read_scene(root, "mine")
     assert scene.experiments == ("transfer", "lobo", "triplet", "adapt", "labels", "audit", "compare")

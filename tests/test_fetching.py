@@ -196,7 +196,8 @@ def test_wrong_checksum_is_an_error(root, example):
     # If no commit is given, the newest one is fetched. One of its files differs.
     write_source(root, source_of(example.files, example.url, None))
     other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
-    assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
+    problem = f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes"
+    assert_refused(root, f"{problem}.*name a git mirror or a folder with --from")
 
 
 def test_truncated_or_missing_file_is_an_error(root, example, tmp_path):
@@ -220,7 +221,7 @@ def test_unlicensed_data_need_consent(root, example):
     write_source(root, source_of(example.files, example.url, example.commit, licence=None))
     assert_refused(root, "the use of files without a licence was not confirmed. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
-    assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
+    assert "rig: 2 files, 0.0 MB; licence: none (you may not pass the files on)" in output
     assert f"home: {example.url}, commit {example.commit}" in output
     assert fetched_files(root) == example.files
 

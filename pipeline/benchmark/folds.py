@@ -1,8 +1,9 @@
-"""Folds of the benchmark: the frozen files that list presses by role, and the arrays of each task.
+"""Folds of the benchmark: which presses a method may learn from and which presses it must predict.
 
-A fold file (`benchmark/v1/*.json`) contains the numbers of presses, and the SHA-256 of the files that contain the
-presses. Presses of a board are numbered from 0, in the order of the board's recordings and then of the presses in each
-recording. A published fold file never changes: a correction needs a new version.
+Each dataset has a fold file (`benchmark/v1/*.json`). It lists the presses by role, as numbers, and contains the SHA-256
+of the recorded files to which these numbers refer. The presses of a board are numbered from 0, in the order of the
+board's recordings and then in the order of the presses in each recording. A published fold file never changes: a
+correction needs a new version. This module also makes the arrays of each task, which methods receive.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,11 +40,14 @@ PressNumbers = tuple[Annotated[int, Field(ge=0)], ...]
 
 
 class Recording(Strict):
-    """A recording in a fold file, with the SHA-256 of each of its files.
+    """A recording in a fold file.
 
-    layout: a layout of `reskin add`, or `presses` for a Parquet file of simulated presses beside the fold file. board:
-    None for layout `presses`, because the Parquet file contains the boards' names. options: options of `reskin add` for
-    the layout.
+    - path: path of the recording in the folder of recordings.
+    - layout: format of the recording, which is a layout of `reskin add`, or `presses` for a Parquet file of simulated
+      presses beside the fold file.
+    - board: name of the board; None for layout `presses`, because the Parquet file contains the names of its boards.
+    - options: options of `reskin add` for this layout.
+    - files: SHA-256 of each file of the recording.
     """
 
     path: str
@@ -54,11 +58,14 @@ class Recording(Strict):
 
 
 class Draw(Strict):
-    """Presses of one tested board by role.
+    """A random division of the presses of one tested board by role.
 
-    train: boards whose presses are all labelled. unlabelled: presses of the tested board at unknown places. labels:
-    labelled presses of the tested board; a task with n labels has the first n of them. tests: presses whose places and
-    forces are predicted.
+    - board, draw: names of the tested board and of this division.
+    - train: training boards, whose presses are all labelled.
+    - unlabelled: presses of the tested board whose places and forces methods do not receive.
+    - labels: presses of the tested board that may be labelled; in a task with n labels, the first n of them are
+      labelled.
+    - tests: presses of the tested board whose places and forces are predicted.
     """
 
     board: Name
@@ -72,8 +79,13 @@ class Draw(Strict):
 class FoldFile(Strict):
     """Content of a fold file.
 
-    forces: whether forces are known and predicted. labels_n: numbers of labels; each draw has one task per number.
-    presses_n: number of presses of each board.
+    - version, dataset, source: version of the benchmark, and name and kind of the dataset.
+    - forces: whether forces are known, and therefore predicted.
+    - about: description of the dataset.
+    - seeds: seeds of the random draws.
+    - labels_n: numbers of labels; each draw has one task for each of these numbers.
+    - presses_n: number of presses of each board.
+    - recordings, draws: the recordings of the dataset, and the divisions of their presses by role.
     """
 
     format: Literal["reskin-benchmark-1"]
@@ -100,11 +112,16 @@ class FoldFile(Strict):
 
 @dataclass(frozen=True)
 class Presses:
-    """Presses, each as the mean over its readings, or single readings of presses.
+    """A table of presses, each as the mean over its readings, or a table of the single readings of presses.
 
-    press: number of the press on its board. recording: index of the recording that contains the press; a recording of
-    dataset lab contains the presses to one depth. place_mm: x and y as recorded. force_N: normal force; NaN if unknown.
-    db_uT: field during the press minus `noload_uT`, the field before this press.
+    - board: board of each row.
+    - press: number of the press on its board.
+    - recording: index of the recording that contains the press. In dataset lab, a recording contains all presses to one
+      depth.
+    - place_mm: x and y as recorded.
+    - force_N: normal force; NaN if unknown.
+    - noload_uT: field before the press.
+    - db_uT: field during the press, minus `noload_uT`.
     """
 
     board: np.ndarray
@@ -223,7 +240,10 @@ class Dataset:
         )
 
     def _train(self, boards: tuple[str, ...]) -> tuple[Presses, Presses]:
-        """Join the presses of training boards, and their readings; draws with the same boards share these arrays."""
+        """Return the presses of the training boards, and all readings of these presses.
+
+        Draws with the same training boards share these arrays, to save memory.
+        """
         if boards not in self._joined:
             none = [next(iter(self.presses.values()))[:0]]
             presses, readings = ([of_board[board] for board in boards] for of_board in (self.presses, self.readings))
@@ -363,7 +383,7 @@ def read_simulated(file: Path) -> Presses:
 
 
 def write_simulated(file: Path, presses: Presses) -> None:
-    """Write simulated presses in single precision, which holds the chips' steps exactly."""
+    """Write simulated presses in single precision, which is precise enough to store the steps of the chips exactly."""
     columns: dict[str, Any] = {"board": presses.board.tolist(), "press": presses.press.astype(np.int32)}
     columns |= {"x_mm": presses.place_mm[:, 0], "y_mm": presses.place_mm[:, 1], "F_N": presses.force_N}
     arrays = {name: pa.array(values) for name, values in columns.items()}

@@ -1,11 +1,12 @@
-"""Our own entries of the benchmark: predict, score, and write benchmark/entries.
+"""Our own methods for the benchmark: predict with them, score the predictions, and write the scores as entries.
 
     python -m pipeline.benchmark.methods PREDICTIONS [DATASET ...]
 
-The command writes the files of predictions to folder PREDICTIONS, by default for all datasets. The recordings must be
-in data/fetched (`reskin fetch lab`, `reskin fetch eflesh`). Each method receives only the arrays of
-`pipeline.benchmark.tasks`, as other people's methods do. Some choices in the universal model, such as the form of its
-physical model (law), were made after results on both boards of dataset lab were known (docs/learning.md).
+The command writes the files of predictions to folder PREDICTIONS, and the entries to benchmark/entries. By default, it
+does so for all datasets. The recordings must be in data/fetched, where `reskin fetch lab` and `reskin fetch eflesh` put
+them. Each method receives only the arrays of `pipeline.benchmark.tasks`, as other people's methods do. However, some
+choices in the universal model, such as the form of its physical model (the law), were made after results on both boards
+of dataset lab were known (docs/learning.md).
 """
 
 import sys
@@ -46,12 +47,13 @@ from reskin.universal.map import Estimate, new_map, tabulate
 from reskin.universal.model import PriorModel
 from reskin.universal.presses import RecordedPresses
 
-LAB = read_settings("lab", ROOT)  # has the frame of the lab's boards, and settings of networks and universal models
+LAB = read_settings("lab", ROOT)  # coordinates of the lab's boards, and settings of networks and universal models
 SEED = 2021
 DATASETS = ("lab", "eflesh", "simulated")
 SEEDS_N = 3  # number of networks for each set of training boards
-ROWS_MAX_N = 2000  # largest number of presses, drawn at random, for kernel ridge regression on other boards
-# By dataset, the scene and section with the settings of the network. For `simulated`, these are settings of scene lab.
+ROWS_MAX_N = 2000  # kernel ridge regression on other boards is fitted to at most this number of random presses
+# The scene, and its section, from which the settings of the network are taken, by dataset. Dataset `simulated` has no
+# scene, so the settings of scene lab are used.
 NETWORK_SETTINGS = {
     "lab": ("lab", "few_labels"),
     "simulated": ("lab", "few_labels"),
@@ -80,7 +82,7 @@ def rows_of(task: Task, predicted: Float[np.ndarray, "t c"]) -> pa.Table:
 
 
 def nearest_label(all_tasks: Tasks) -> Iterator[pa.Table]:
-    """Predict place and force of the label with the most similar field change."""
+    """Predict that each test has the place and the force of the label with the most similar field change."""
     from sklearn.neighbors import KNeighborsRegressor
 
     for task in all_tasks:
@@ -155,8 +157,9 @@ def by_training_boards(all_tasks: Tasks) -> dict[tuple[str, ...], list[Task]]:
 def network(all_tasks: Tasks) -> Iterator[pa.Table]:
     """Train the paper's network on the readings of the training boards, and fine-tune it on the labels.
 
-    If there are no training boards, the network is trained on the labels. `SEEDS_N` networks are trained for each set
-    of training boards. Successive draws use different networks, so that the mean over draws is also a mean over seeds.
+    If there are no training boards, the network is trained on the labels instead. For each set of training boards,
+    `SEEDS_N` networks with different seeds are trained. Successive draws use different networks, so that the mean over
+    draws is also a mean over seeds.
     """
     scene, section = NETWORK_SETTINGS[all_tasks[0].fold.split(".")[1]]
     settings = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml")[section]
@@ -242,7 +245,10 @@ def universal(all_tasks: Tasks) -> Iterator[pa.Table]:
 
 
 def universal_of_rig(all_tasks: Tasks) -> Iterator[pa.Table]:
-    """Make universal models with the training boards, and calibrate them as experiment random_presses does."""
+    """Make universal models from simulated skins and the training boards, and calibrate them to each tested board.
+
+    The calibration is the same as in experiment `random_presses`.
+    """
     section = LAB.section(Compare, "compare")
     frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
     powers = reskin.load_universal().powers
@@ -301,7 +307,12 @@ def rows_of_estimate(task: Task, found: Estimate) -> pa.Table:
 
 
 class Method(NamedTuple):
-    """A method, its datasets, and the description of its training data in entries."""
+    """A method of the benchmark.
+
+    - predict: function that yields the predictions for a list of tasks.
+    - datasets: names of the datasets for which the method predicts.
+    - trained_on: description of its training data, as written in its entries.
+    """
 
     predict: Callable[[Tasks], Iterator[pa.Table]]
     datasets: tuple[str, ...]

@@ -1,8 +1,8 @@
 """Files of predictions for the benchmark: write them, read them, and check them completely.
 
-A file (CSV or Parquet) has one row for each tested press of each fold, in any order; docs/benchmark.md lists its
-columns. A file may leave out a number of labels, that is, all folds with this number; it may not leave out only some of
-these folds.
+A file (CSV or Parquet) has one row for each tested press of each fold, in any order. docs/benchmark.md lists its
+columns. Each fold has a number of labelled presses. A file may leave out all folds with the same number of labels, but
+it may not leave out only some of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,18 +24,24 @@ DECIMALS = 4  # written decimals of predictions: 0.1 um and 0.1 mN
 FIRST_LINE_N = 2  # number of the line with the first row of a CSV file
 SHOWN_N = 5  # number of missing presses that an error lists
 HELP = "See docs/benchmark.md."
-# Limits beyond which predictions probably have another unit or another origin. Predictions of poor methods are within
-# these limits.
-OFF_MIDDLE = 0.4  # largest distance of the median place from the pressed area's middle / the area's width
-PLACE_MIN = 0.15  # largest coordinate, relative to the largest one of the pressed area
-FORCE_MIN, FORCE_MAX = 0.01, 10.0  # largest and median force, relative to the largest true force
+# Beyond these limits, predictions probably have a wrong unit or another origin. Even the predictions of poor methods
+# are within these limits.
+# Upper limit of the distance from the median place to the middle of the pressed area / the area's width
+OFF_MIDDLE = 0.4
+PLACE_MIN = 0.15  # lower limit of the largest predicted coordinate / the largest coordinate of the pressed area
+# Lower limit of the largest predicted force, and upper limit of the median predicted force, both divided by the largest
+# true force.
+FORCE_MIN, FORCE_MAX = 0.01, 10.0
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Checked predictions of one dataset, sorted by fold and press.
+    """Checked predictions of one dataset, with one row per tested press and fold, sorted by fold and press.
 
-    fold: names of the folds. intervals: limits (low, high) of 90 % intervals by name of the quantity, if given.
+    - folds: fold file of the dataset.
+    - fold, press: name of the fold and number of the press in each row.
+    - place_mm, force_N: predicted place and force; `force_N` is None if no forces were predicted.
+    - intervals: limits (low, high) of the 90 % intervals, by name of the quantity; empty if none were given.
     """
 
     folds: FoldFile

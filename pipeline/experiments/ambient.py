@@ -1,8 +1,9 @@
 """Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
-The experiment measures how much these disturbances degrade the scores on held-out boards, and how much of the loss two
-methods recover. The first method subtracts the reading of a separate reference chip. The second method subtracts the
-common part, which is the uniform field that best fits the readings of all chips of the board.
+The experiment measures how much these disturbances degrade the scores of networks on held-out boards. Two methods try
+to remove a disturbance from the readings. The first method subtracts the reading of a separate reference chip beside
+the skin. The second method subtracts the common part of the board's own chips, which is the uniform field that best
+fits the readings of all these chips.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,8 +36,8 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-# Distance of the reference chip from the board's middle, along x. At this distance, the chip is assumed not to sense
-# pokes.
+# Distance of the reference chip from the board's middle, along x. The chip is assumed to be too far away from the skin
+# to measure any change of field by a poke.
 REFERENCE_ASIDE_MM = 30.0
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
@@ -61,8 +62,8 @@ class Ambient(Strict):
 def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Score the networks of every held-out board in ambient fields.
 
-    For the last board, networks are also trained on inputs without the common part of all chips, which
-    `remove_common_part` subtracts.
+    If the common part of all chips is subtracted, networks must also be trained on such inputs (see
+    `remove_common_part`). To save time, such networks are trained only for the last board.
     """
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
@@ -104,8 +105,8 @@ def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Pat
 class Instrument:
     """A board (`board`) and a separate reference chip (`aside`), both with their manufacturing errors.
 
-    `turn` contains the rotations of the board's chips in the design, without manufacturing errors. The methods that
-    subtract a field use only the rotations in the design, because the errors of a real board are unknown.
+    `turn` contains the rotations of the board's chips as designed, without manufacturing errors. The methods that
+    subtract a field use only these rotations, because the manufacturing errors of a real board are unknown.
     """
 
     board: Board
@@ -117,10 +118,12 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One ambient field; `added_uT` is the change that the field causes in each input row.
+    """One ambient field, and its effect on the input rows.
 
-    `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the strength
-    of a uniform field, or the distance of the ball of iron and the rms fields that the ball causes.
+    - keys: the strength of a uniform field, or the distance of the ball of iron and the rms fields that the ball
+      causes.
+    - added_uT: the change that the ambient field causes in each input row.
+    - reference_uT: the estimate of this change from the reading of the reference chip.
     """
 
     keys: Mapping[str, float]
@@ -241,7 +244,7 @@ def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> 
 
 
 def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Return the change, without noise, of a board's readings if the fields `b_T` are added at the board's chips."""
+    """Return how a board's readings change, without noise, if the fields `b_T` are added at the chips of the board."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
@@ -249,10 +252,11 @@ def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarr
 def reference_uT(
     instrument: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "f ch"]:
-    """Return the estimated change of the board's readings, from a noisy reading of the reference chip.
+    """Estimate the change of the board's readings by an ambient field, from a noisy reading of the reference chip.
 
-    `aside_T` is the ambient field at the reference chip. The reading of the reference chip is rotated into the axes of
-    each chip of the board, according to the design.
+    The ambient field is assumed to be the same at all chips. The reading of the reference chip is therefore only
+    rotated into the axes of each chip of the board, as designed. `aside_T` is the true ambient field at the reference
+    chip.
     """
     read_uT = readings_uT(instrument.aside, aside_T[:, None]) + instrument.noise_uT * rng.standard_normal(
         (len(aside_T), 3)
@@ -335,8 +339,8 @@ DASHES = ("-", "--", "-.")  # line styles of the methods, so that overlapping li
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores of every method in every field.
 
-    There are rows for the mean over all held-out boards, and rows for the last board alone, because networks of all
-    methods were trained for that board only.
+    Some rows are means over all held-out boards. Other rows are for the last board alone, because this is the only
+    board for which the networks of all methods were trained.
     """
     last = numbers["last_board"]
     summaries = (("all held out", numbers), (str(last["board"]), last))

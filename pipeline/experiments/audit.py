@@ -1,8 +1,9 @@
 """Audit: check that no information about test rows leaked into training.
 
-The audit checks the folds, the scalers, the adaptation data and the settings, and whether captures are copies of other
-captures. A leak fails the stage. Leaks that the paper's own protocol implies, and collapsed networks, are reported in
-the results and do not fail the stage.
+The audit checks the division of rows into training and test rows (folds), the scaling of inputs, the data for
+adaptation and the choice of settings. It also checks whether a capture (a recorded file) is a copy of another capture.
+If a leak is found, the stage fails. Two findings are only reported in the results: leaks that the paper's own protocol
+implies, and collapsed networks, whose predictions are nearly constant.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,10 +32,13 @@ COPIES = "copies"
 
 
 class AuditSettings(Strict):
-    """Settings section `audit`: whether training settings were chosen by a study on other boards, or set for speed.
+    """Settings section `audit`.
 
-    similar_skins: pairs of different skins whose readings are so similar that one could be a copy of the other.
-    weak_skins: skins whose fields are too weak to be compared. Both are accepted, and listed in the report.
+    - settings: whether the training settings were chosen by a study on other boards, or set so that training is fast.
+    - similar_skins: pairs of different skins whose readings are so similar that one skin could be a copy of the other.
+      The audit accepts these pairs, and lists them in the report.
+    - weak_skins: skins whose fields are too weak to be compared with other skins. The audit accepts these skins, and
+      lists them in the report.
     """
 
     settings: Literal["chosen", "for speed"]
@@ -47,10 +51,15 @@ NOTHING_ACCEPTED = AuditSettings(settings="for speed")
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check: the rule, what was found, and whether the rule holds.
+    """The result of one check of the audit.
 
-    `what` names the rule; `where` names the fold or the network. If `known`, a violation is reported in the results and
-    does not fail the stage. `remedy` is used only in the error message.
+    - what: short name of the rule.
+    - where: name of the fold or the network that was checked.
+    - rule: the rule in words.
+    - found: what the check found.
+    - holds: whether the rule holds.
+    - known: if true, a violation of the rule is reported in the results, but does not fail the stage.
+    - remedy: what to do about a violation; used only in the error message.
     """
 
     what: str
@@ -118,7 +127,13 @@ PAPERS_SPLIT = "single_random"
 
 @dataclass(frozen=True)
 class Sides:
-    """Row numbers of a fold: training rows, unlabelled rows for adaptation (`pool`), and test rows."""
+    """A fold, which is a division of the scene's rows.
+
+    - experiment, name: the experiment to which the fold belongs, and the name of the fold.
+    - train: numbers of the training rows.
+    - pool: numbers of the unlabelled rows to which networks may be adapted.
+    - test: numbers of the test rows.
+    """
 
     experiment: str
     name: str
@@ -280,24 +295,28 @@ def _first_names(names: np.ndarray) -> str:
 
 # --- Copies ---
 
-# Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
-# 4.4-5.0 uT on z.
+# Standard deviation of the noise of one reading, on the x, y and z axes of a chip. In the lab's recordings, it is 3.0
+# to 3.3 uT on x and y, and 4.4 to 5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-# Smallest |dB| of the compared indentations, in units of a reading's noise. The direction of a weaker dB is dominated
-# by noise.
+# Only indentations with at least this |dB|, in units of a reading's noise, are compared. The direction of a weaker dB
+# is dominated by noise.
 STRONG_NOISES = 10.0
-# Largest distance between a copy and its original, in units of a reading's noise. Two readings of the same contact
-# differ by 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
+# An indentation looks copied if its distance from another indentation is at most this, in units of a reading's noise.
+# Two readings of the same contact differ by 1.4 units (22 uT over 15 channels). A copy that was disguised by adding 5
+# uT to each channel differs by 1.3 units from its original.
 COPY_DISTANCE_NOISES = 2.0
-# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. All indentations of a copied capture have the
-# same ratio. Between different skins, the ratio varies with the depth of the indentation.
+# A copy may be disguised by multiplying all its fields by a factor. The ratio |dB of the copy| / |dB of the original|
+# is then the same for all indentations, within this relative tolerance. Between different skins, the ratio varies with
+# the depth of the indentation.
 FACTOR_TOLERANCE = 0.1
-# A capture counts as a copy if at least this fraction of its indentations look copied. Measured fractions: 0 % between
-# four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least 55 % in a
-# copy with up to 8 uT added to single readings, and 42 % in a copy with 5 % random gain per channel.
+# A capture counts as a copy if at least this fraction of its indentations look copied. We measured these fractions:
+# - 0 % between four recorded skins,
+# - at most 11 % between independent simulated skins (60 skins, 4 random draws),
+# - at least 55 % in a copy in which up to 8 uT were added to single readings,
+# - 42 % in a copy in which each channel was multiplied by a random gain with a spread of 5 %.
 COPIED_SHARE_MAX = 0.3
-# Largest number of pairs of indentations to compare per fold, which takes at most a second. SAMPLE_MIN_N may require
-# more pairs.
+# Largest number of pairs of indentations that are compared for a fold. The comparison then takes at most a second. The
+# number is exceeded if SAMPLE_MIN_N requires more pairs.
 PAIRS_MAX_N = 100_000_000
 SAMPLE_MIN_N = 100  # smallest number of indentations sampled from a capture, if it has as many
 CHUNK_PAIRS_N = 4_000_000  # number of pairs that are compared at once, in 16 MB of memory
@@ -356,9 +375,10 @@ def all_likenesses(test: MeanFields, train: MeanFields, *, rng: np.random.Genera
 def nearest_rays(
     db_uT: Float32[np.ndarray, "n ch"], others_uT: Float32[np.ndarray, "m ch"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Find, for each row of `db_uT`, the index of the row of `others_uT` that is nearest in direction.
+    """Find, for each row of `db_uT`, the row of `others_uT` whose direction is nearest.
 
-    The second result is the distance in uT from the row of `db_uT` to the line through the origin in that direction.
+    Returns the index of this row of `others_uT`, and the distance in uT between the row of `db_uT` and the line through
+    the origin in the direction of this row. The distance does not change if `others_uT` is multiplied by a factor.
     """
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))
@@ -384,9 +404,10 @@ def _copied_shares(sample_uT: Float32[np.ndarray, "n ch"], train: MeanFields) ->
 
 # --- Networks ---
 
-# Largest relative difference between two scalers that are fitted to the same rows: 4 float32 roundings, or 5e-7. The
-# order of float64 sums may differ, which changes a float32 result by at most one rounding. For comparison, one
-# additional row among 100,000 rows moves a column's mean by about 1e-5 of the column's standard deviation.
+# Two scalers count as fitted to the same rows if their relative difference is at most 4 float32 roundings, or 5e-7. The
+# scalers of the same rows may differ because float64 sums were computed in another order, which changes a float32
+# result by at most one rounding. For comparison, one additional row among 100,000 rows changes a column's mean by about
+# 1e-5 of the column's standard deviation.
 SCALER_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
 
 Arrays = Mapping[str, np.ndarray]
@@ -420,7 +441,7 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
-    """Fit a scaler, or return the cached arrays of the same fit."""
+    """Return the arrays of a scaler that is fitted to these rows; equal fits are computed only once."""
     fit_key = (*key, len(db_uT))  # the row count distinguishes training rows from training and test rows
     if fit_key not in fits:
         fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
@@ -504,7 +525,8 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
 
 # --- Settings ---
 
-SAME_AS = {"train_single": "train_multi"}  # a variant that uses the recipe chosen for another variant
+# The variant on the left uses the recipe that was chosen for the one on the right
+SAME_AS = {"train_single": "train_multi"}
 
 
 class Choice(Strict, extra="allow"):
@@ -523,7 +545,7 @@ class Choice(Strict, extra="allow"):
 
 
 def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
-    """Compare the headline recipes of the trained networks with those that the study of settings chose."""
+    """Compare the headline recipes of the trained networks with the recipes that the study of settings chose."""
     recipes = {variant: without_budget(_headline(models / variant)) for variant in data.settings.models}
     held_out = np.unique(np.concatenate([fold.test for fold in data.folds]))
     return audit_choice(
@@ -550,10 +572,10 @@ def audit_choice(
     test_skins: Sequence[str],
     physics: str,
 ) -> list[Check]:
-    """Check that the settings were chosen on boards and skins that are not tested here.
+    """Check that the settings were chosen on boards and skins that this scene does not test.
 
-    Also reports headline recipes that differ from the chosen ones. Simulated skins of another seed are different skins
-    even if their names are equal; recorded skins are identified by name.
+    Headline recipes that differ from the chosen recipes are also reported. Recorded skins are the same if their names
+    are equal. Simulated skins are different if their seeds differ, even if their names are equal.
     """
     record = parse(Choice, dict(choice), "record of the study of settings")
     same_draw = record.source == source and (source == "recorded" or record.seed == seed)
@@ -571,7 +593,7 @@ def audit_choice(
 
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
-    """Report the differences between a recipe and the one that the study chose; a difference is not a leak."""
+    """Report how a recipe differs from the recipe that the study chose; a difference is not a leak."""
     rule = f"the recipe is the one that scene {record.scene} chose; differences are listed"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)

@@ -1,7 +1,7 @@
-"""Smallest error that the noise of the chips allows, compared with a network's scores (paper section 4).
+"""The smallest error that the noise of the chips allows, compared with the scores of a network (paper section 4).
 
-The experiment computes the Cramér-Rao bound for estimates of place and force from one input row. The skin is simulated,
-and its properties are assumed to be known.
+The experiment computes the Cramér-Rao bound for estimates of place and force from one input row, which is a lower limit
+of the variance of unbiased estimates. The skin is simulated, and its properties are assumed to be known.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,7 +1,11 @@
 """Compare recorded changes of field with simulated ones, poke by poke, on boards with known forces (not in the paper).
 
-Each board is simulated in three ways: with the nominal skin, with a physical model (law) that is fitted to the board,
-and with the law of another board. In the third way, only the parameters that may differ between boards are refitted.
+A poke is a press at one place to one depth. A law is a physical model of a skin, which gives the change of field from
+the place and the force of a poke. Each board is simulated in three ways:
+- with the nominal skin, without any fit,
+- with a law that is fitted to the pokes of this board,
+- with the law of another board, of which only those parameters are fitted again that may differ between boards.
+
 The experiment also examines:
 - the friction under the tip,
 - the memory, which is the fraction of a poke's change of field that remains in the next no-load reading,
@@ -37,15 +41,15 @@ from reskin.universal.layout import BoardLayout, as_layout, read_layout
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
 ARROWS_N = 4  # number of places per board in the figure of arrows
-WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field, from one poke to the next
+WALK_uT = 0.5  # the simulated no-load field is a random walk; this is its assumed step from one poke to the next
 NOLOAD_READINGS_N = 10
-CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
+CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces at which |dB| is simulated, from a light touch to a firm press
 LIGHT_N = 1e-3  # force of a light touch
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
-PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
-# Values of k / mu in N/mm, where k is the stiffness of the springs that hold the skin, and mu the friction coefficient
-# under the tip. This ratio limits how far a tip can slide the skin. The first value means no limit (full slide at any
-# force), and the last value a slippery tip.
+PLACE_STRIDE = 5  # to save time, |dB| is simulated only at every fifth place of a board, and the median is plotted
+# Values of k / mu in N/mm, where k is the stiffness of the springs that hold the skin, and mu is the friction
+# coefficient under the tip. This ratio limits how far a tip can slide the skin. The first value stands for no limit
+# (the skin slides fully at any force), and the last value stands for a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -53,11 +57,12 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class Compare(SectionWithRows):
-    """Settings section `compare`: orientation of the recorded board, its labels and skin, and simulated memory.
+    """Settings section `compare`.
 
-    The scene's file may have key `layout` instead of `tip_radius_mm` and of the keys from `design` to
-    `labels_middle_mm`. Its value is the layout of a board, as in `reskin/universal/layouts`, or the name of a layout in
-    that folder.
+    The section states how the recorded board, its labels (places of pokes) and its skin are oriented, and which memory
+    is simulated. A scene's file may describe the board by one key `layout` instead of `tip_radius_mm` and the keys from
+    `design` to `labels_middle_mm`. The value of `layout` is either the layout of a board, in the form of the files in
+    `reskin/universal/layouts`, or the name of one of these files.
     """
 
     layout: BoardLayout | None = None
@@ -67,7 +72,7 @@ class Compare(SectionWithRows):
     labels_middle_mm: tuple[float, float]  # label (x, y) of the place at the board's middle
     labels_mirrored: bool  # whether y of the labels points opposite to y of the board
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
-    # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
+    # Simulated fraction of a poke's change of field that remains in the next no-load reading. The value is assumed.
     memory: Annotated[float, Field(ge=0, lt=1)]
 
     @classmethod
@@ -93,7 +98,7 @@ class Compare(SectionWithRows):
 
     @property
     def stated_by(self) -> str:
-        """Name, in messages, of what states the orientations."""
+        """Words for the source of the stated orientations (the scene, or a layout), for use in messages."""
         return "the scene" if self.layout is None else f"layout {self.layout.name}"
 
 
@@ -167,7 +172,10 @@ def _outline(section: Compare) -> dict[str, Any]:
 
 
 def _without_law(aligned: AlignedPresses, recorded: RecordedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Return a board's numbers that need no fitted law, and thus no forces; `recorded` contains all its presses."""
+    """Return the numbers of a board that need no fitted law, and which therefore exist even if forces are unknown.
+
+    `aligned` contains the presses that are used for fits, and `recorded` contains all presses of the board.
+    """
     noise_uT = recorded.noise_uT
     noise = {"noise_uT": dict(zip("xyz", noise_uT.tolist(), strict=True))} if np.isfinite(noise_uT).all() else {}
     counts = {"pokes_n": len(recorded), "left_out_n": recorded.excluded_n}
@@ -199,7 +207,8 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
     """Return the agreement of a simulation with a board's recordings.
 
-    The numbers of a board contain the agreement of the fitted law, and the agreement of other simulations by name.
+    The agreement of the fitted law is at the top level of a board's numbers. The agreement of any other simulation is
+    under the name of the simulation.
     """
     agreement_numbers: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
     return agreement_numbers
@@ -208,7 +217,7 @@ def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, An
 def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Return the data for the figures: changes of field at a few places, and |dB| against force.
 
-    All places are from one group of pokes, which is the middle group in the board's list.
+    Only places of one group of pokes are returned. The middle group in the board's list of groups is used.
     """
     in_group = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
     order = in_group[np.argsort(np.hypot(*aligned.place_mm[in_group].T), kind="stable")]
@@ -227,9 +236,10 @@ def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]
 
 
 def pool_skins(captures: Sequence[Readings], *, with_force: bool = True) -> dict[str, RecordedPresses]:
-    """Pool the captures of each skin; `with_force`: see `pool`.
+    """Pool the captures (recorded files) of each skin.
 
-    Keys are names of boards, or `board/skin` for boards with several skins.
+    The keys of the result are names of boards, or `board/skin` for boards with several skins. For the meaning of
+    `with_force`, see `pool`.
     """
     skins: dict[str, list[Readings]] = {}
     for capture in captures:
@@ -245,7 +255,7 @@ def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
 
 
 def make_setup(section: Compare, design: SkinDesign) -> Setup:
-    """Return the setup for the simulation: the designed skin on the scene's board, pressed with the scene's tip."""
+    """Return the setup to simulate: the skin as designed, on the board and under the tip that the scene states."""
     if section.layout is not None:
         return section.layout.setup()
     chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
@@ -253,7 +263,7 @@ def make_setup(section: Compare, design: SkinDesign) -> Setup:
 
 
 def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
-    """Transform the labels (places) and the fields of pokes to the board's axes."""
+    """Transform the places of pokes from the labels' axes, and fields from the chips' axes, to the board's axes."""
     turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
     if len(turn) != chips_n:
         where = f"compare.{'design' if section.layout is None else 'layout'}"
@@ -268,7 +278,7 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
 
 
 def agreement(aligned: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
-    """Compare the direction and size of simulated and recorded changes of field, and their growth with force."""
+    """Compare simulated with recorded changes of field: their directions, their sizes, and their growth with force."""
     cosine, groups = cosines(simulated_uT, aligned.db_uT), aligned.recorded.groups
     grown = {"recorded": growth(aligned.recorded, aligned.db_uT), "simulated": growth(aligned.recorded, simulated_uT)}
     return {
@@ -279,10 +289,10 @@ def agreement(aligned: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
 
 
 def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
-    """Estimate the memory from the recordings, and from simulated no-load readings whose memory is `section.memory`.
+    """Estimate the memory from the recordings and, to test the estimator, from simulated no-load readings.
 
-    Memory is the fraction of a poke's change of field that remains in the next no-load reading. Returns an empty dict
-    if either estimate is impossible.
+    Memory is the fraction of a poke's change of field that remains in the next no-load reading. The simulated readings
+    have memory `section.memory`. Returns an empty dict if either estimate is impossible.
     """
     pokes = aligned.recorded  # in the chips' axes, because the memory is the same in any axes
     if not np.isfinite(pokes.noise_uT).all():
@@ -307,9 +317,10 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
 
 
 def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
-    """Refit the law for each friction in `GRIPS_N_MM` under the tip; return agreement, and |dB| of a light touch.
+    """Refit the law for each value of the friction under the tip in `GRIPS_N_MM`.
 
-    In the result, `grip_N` is the force at which the slide in the skin's middle reaches two thirds of its limit.
+    Returns one row per value, with the agreement of the refitted law with the recordings, and |dB| of a light touch.
+    `grip_N` is the force at which the slide in the skin's middle reaches two thirds of its limit.
     """
     rows = []
     for grip_N_mm in GRIPS_N_MM:
@@ -328,21 +339,21 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 
 # --- Frames: are labels, chips and skin oriented as the scene states? ---
 
-# An orientation that differs from the scene's is reported only if it raises the sum of cosines by this much. The sum is
-# over chips, and each cosine is between the recorded and the simulated field of a chip. The value is assumed. Wrong
-# axes lower the cosine of a chip by 0.5 or more, while a skin displaced by 0.5 mm changes every cosine by less than
-# 0.1.
+# For each chip, a cosine tells how well the directions of the recorded and the simulated fields agree. An orientation
+# that differs from the scene's is reported only if it raises the sum of the chips' cosines by this much. The value is
+# assumed. It lies between two effects: wrong axes lower the cosine of a chip by 0.5 or more, while a skin that is
+# displaced by 0.5 mm changes every cosine by less than 0.1.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin are oriented as {} states."
-ASSUMED_N = 1.0  # replaces unknown forces in simulations of which only the direction is compared
+ASSUMED_N = 1.0  # replaces unknown forces; only the directions of fields are compared, which hardly depend on the force
 
 
 @dataclass(frozen=True)
 class Turn:
-    """Orientation of axes (of a chip or the labels) relative to the scene's.
+    """Orientation of a chip's axes or of the labels' axes, relative to the axes that the scene states.
 
-    The axes of the scene first change their signs, and are then rotated by quarter turns about z.
+    The stated axes are first multiplied by `signs`, and then rotated by `quarters` quarter turns about z.
     """
 
     quarters: int
@@ -353,7 +364,10 @@ class Turn:
         return quarter_turn(self.quarters) @ np.diag(self.signs)
 
     def describe(self, stated_by: str = "the scene") -> str:
-        """Describe the difference from the orientation that the scene states; return an empty string if none."""
+        """Describe how this orientation differs from the one that the scene states.
+
+        Returns an empty string if there is no difference.
+        """
         mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
         turned = [f"turned by {90 * self.quarters} degrees more than {stated_by} says"] * bool(self.quarters)
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
@@ -376,10 +390,13 @@ def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
 class Frames:
     """The orientations of labels, skin and chips with which recordings and the nominal skin agree best.
 
-    `chips[i]` is the position of recorded chip i, in the scene's numbering; `turns[i]` is the orientation of this chip.
-    `cosines` are the cosines between recorded and simulated fields in the found orientations, and `as_written` those in
-    the orientations that the scene states. `worth` is the sum of `cosines` minus penalties for differences from the
-    scene.
+    - labels: orientation of the labels' axes.
+    - flipped: whether all magnetic poles of the skin are swapped.
+    - chips: element i is the number, in the scene's list of chips, of the position where recorded chip i was found.
+    - turns: element i is the orientation of recorded chip i.
+    - cosines: cosine between recorded and simulated fields of each chip, in the orientations found.
+    - as_written: the same cosines in the orientations that the scene states.
+    - worth: sum of `cosines`, minus a penalty for each difference from the scene.
     """
 
     labels: Turn
@@ -446,10 +463,10 @@ def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dic
 
 
 def describe_outside(place_mm: Float[np.ndarray, "n 2"], section: Compare) -> str | None:
-    """Describe the presses that are not on the skin, according to the scene; return None if all are on it.
+    """Describe the presses that are outside the skin, if its size and position are as the scene states.
 
-    `place_mm` are places relative to the board's centre. If presses seem to be outside the skin, their best
-    orientations mean nothing.
+    Returns None if all presses are on the skin. `place_mm` are places relative to the board's centre. If presses seem
+    to be outside the skin, their places are wrong, so the orientations that agree best with them mean nothing.
     """
     outside_n = int((np.abs(place_mm) > np.array(section.skin_mm) / 2).any(axis=1).sum())
     if not outside_n:
@@ -484,16 +501,26 @@ def find_frames(
 ) -> Frames:
     """Find the orientations of labels, skin and chips with which recordings and the nominal skin agree best.
 
-    `read_uT` are recorded changes of field in the chips' axes; `chips_turn` are the rotations of the chips according to
-    the scene. `nominal` simulates pokes at places in the board's axes. If a chip is found at another chip's position,
-    it is assumed to have the rotation that the scene states for that position.
+    Parameters
+    ----------
+    place_mm
+        Places of the pokes.
+    read_uT
+        Recorded changes of field in the chips' axes.
+    chips_turn
+        Rotations of the chips according to the scene.
+    nominal
+        Function that simulates pokes of the nominal skin at places in the board's axes.
+
+    If a chip is found at the position of another chip, its rotation is assumed to be the rotation that the scene states
+    for this position.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
     as_written, candidate_frames = np.empty(0), []
     for labels in TURNS[:8]:
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
-        # Entry [k, l, t] of `cosine` is the cosine, over all pokes, between two fields: that of recorded chip k after
-        # orientation t, and that simulated at chip l.
+        # Entry [k, l, t] of `cosine` is the cosine, over all pokes, between two fields. One is the field of recorded
+        # chip k, transformed by orientation t. The other is the field that is simulated at the position of chip l.
         rotated_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
         moments = np.einsum("nka,nlb->klab", read_uT, rotated_uT)
         sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
@@ -510,9 +537,10 @@ def _best_chips(
 ) -> Frames:
     """Find the best positions and orientations of the chips for given orientations of labels and skin.
 
-    `common` is the orientation that most chips share. If `common` differs from the scene's orientation, this counts as
-    one difference. Its penalty is 1.5 times as large as others, because a flipped skin can look like such a common
-    turn.
+    `common` is a candidate for the orientation that most chips share. Only chips whose orientation differs from
+    `common` get a penalty. If `common` itself differs from the scene's orientation, one further penalty is subtracted.
+    It is 1.5 times as large as the other penalties, because a flipped skin can look like a common turn of all chips,
+    and a flipped skin shall then be preferred.
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
@@ -531,10 +559,11 @@ POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Describe how places, labels, chips and skin of a capture differ from what the scene states.
+    """Describe how a capture contradicts what the scene states about labels, chips and skin.
 
-    If presses are outside the skin, they are described instead of orientations. Returns None if there is no difference,
-    or if the data are too few to decide. `blocks` are the readings of the capture.
+    If presses are outside the skin, these presses are described. Otherwise, orientations that differ from the scene are
+    described. Returns None if there is no difference, or if the data are too few to decide. `blocks` are the readings
+    of the capture.
     """
     if not any(_pressed_rows(block).any() for block in blocks):
         return None
@@ -617,7 +646,7 @@ BOARDS_MAX_N = 4  # largest number of boards in the figure of arrows
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate agreement with its bounds, the fitted parameters, and the orientation of labels, chips and skin."""
+    """Return tables of the agreement, of the fitted parameters, of the friction, and of the orientations."""
     by_board = numbers["by_board"]
     rows = [
         _board_row(board, name, _of_simulation(numbers_of_board, name), numbers_of_board.get("laws", {}).get(name, {}))
@@ -707,7 +736,7 @@ def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw recorded and simulated changes of field: as arrows at the chips for a few places, and against force."""
+    """Draw recorded and simulated changes of field, as arrows at the chips for a few places, and against the force."""
     boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
     if not boards:  # no board has known forces
         return {}
@@ -719,7 +748,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 
 def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
-    """Plot |dB| against force, from 0.3 mN, for recorded presses, and for simulated presses with several frictions."""
+    """Plot |dB| of recorded presses, and of presses simulated with several frictions, against forces from 0.3 mN."""
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]

@@ -1,8 +1,10 @@
-"""Two contacts at once, modelled as the sum of two pokes of a held-out skin (paper section 7, future work).
+"""Two contacts at once on a held-out skin (paper section 7, future work).
 
-The experiment tests what networks that were trained on single contacts predict for two contacts, and whether two
-contacts can be detected. It also tests how closely the field change of two contacts equals the sum of the field changes
-of the single contacts.
+The skins have no recordings of two simultaneous contacts, so the field change of two contacts is modelled as the sum of
+the field changes of two pokes (single presses). The experiment tests
+- which place and force networks predict for two contacts, if they were trained on single contacts,
+- whether two contacts can be detected,
+- by simulation, how much the true field change of two contacts differs from the sum.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -52,8 +54,10 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
 SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
 DRAWN_N = 60  # number of pairs in the figure, for each board and separation
-SAME_PLACE = 0.0  # pokes at the same place (0 mm) show the effect of signal strength and noise alone
-TOLERANCE_MM = 0.5  # assumed tolerance of a pair's separation, needed because places are on a grid
+# Separation in mm of pairs of pokes at the same place. Such pairs differ from a single poke only in the strength of the
+# signal and in noise, so they show the effect of these two alone.
+SAME_PLACE = 0.0
+TOLERANCE_MM = 0.5  # places are on a grid, so the separation of a pair may differ by this much (assumed)
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
 
 Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
@@ -85,8 +89,8 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # Two detectors use networks. These were trained on all other boards, including the contacts that set
-        # thresholds.
+        # Two detectors use networks. The networks were trained on all other boards, so their training data include the
+        # contacts that set the thresholds.
         "threshold_set_on": (
             f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
@@ -160,9 +164,10 @@ def evaluate_board(
 
 @dataclass(frozen=True)
 class Pairs:
-    """Row numbers of pairs of pokes; both pokes of a pair are of one skin.
+    """Pairs of pokes on the same skin, as row numbers.
 
-    The weaker poke has the smaller force, or the smaller |dB| if some forces are unknown.
+    In each pair, the weaker poke is the one with the smaller force or, if some forces are unknown, with the smaller
+    |dB|.
     """
 
     weaker: Int64[np.ndarray, " p"]
@@ -176,9 +181,10 @@ class Pairs:
 def draw_pairs(
     rows: Rows, candidates: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
-    """Draw pairs of rows: two places of a skin with this separation, and then one row at each place.
+    """Draw pairs of rows at two places of a skin whose distance is `separation_mm`.
 
-    `candidates` are the row numbers to draw from. With a separation of 0 mm, both rows are at the same place.
+    For each pair, two places are drawn first, and then one row at each place. `candidates` are the row numbers to draw
+    from. With a separation of 0 mm, both rows are at the same place.
     """
     by_skin = [
         _pairs_at_distance(rows, candidates[rows.skin[candidates] == skin], separation_mm)
@@ -199,17 +205,17 @@ def draw_pairs(
 def _pairs_at_distance(
     rows: Rows, skin_rows: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
-    """Return the row numbers at each place of a skin, and the pairs of places (by index) with this separation.
+    """Return the row numbers at each place of a skin, and the pairs of places whose distance is `separation_mm`.
 
-    `skin_rows` are the row numbers of the skin.
+    A pair consists of the indices of two places. `skin_rows` are the row numbers of the skin.
     """
     places_mm, place_i = np.unique(rows.target[skin_rows, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
     order = np.argsort(place_i.ravel(), kind="stable")
     rows_at = np.split(skin_rows[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
-    # A place is paired with itself only for a separation of 0 mm, although 0 mm is also within the tolerance of small
-    # separations.
+    # A place is paired with itself only if the separation is 0 mm. For other small separations, such a pair would also
+    # be within the tolerance, so it must be excluded.
     return rows_at, np.argwhere(np.triu(near, k=1) if separation_mm else np.eye(len(places_mm), dtype=bool))
 
 
@@ -266,11 +272,12 @@ def position_along_line(
 def detection_rates(
     aside: Scores, single: Scores, double: Mapping[float, Scores], false_alarm_fraction: float
 ) -> dict[str, Any]:
-    """Return, for each detector, the percentages of single and of double contacts that score above its threshold.
+    """Return the rates of detection and of false alarms of each detector, and the area under the ROC curve.
 
-    `aside` contains the scores of the single contacts that set the thresholds, and `single` the scores of other single
-    contacts. `double` maps each separation in mm to the scores of double contacts. The result also has areas under ROC
-    curves.
+    A detector reports two contacts if its score is above its threshold. `aside` contains the scores of the single
+    contacts that set the thresholds. `single` contains the scores of other single contacts, which give the rate of
+    false alarms. `double` maps each separation in mm to the scores of double contacts, which give the rates of
+    detection.
     """
     limits = thresholds(aside, false_alarm_fraction)
     separated = {
@@ -292,10 +299,12 @@ def residual(
     predicted: Float[np.ndarray, "f 3"],
     db_uT: Float[np.ndarray, "f ch"],
 ) -> Float[np.ndarray, " f"]:
-    """Return the difference between dB and the dB of a single contact as predicted, relative to |dB| plus noise.
+    """Return how badly the predicted single contact explains each reading.
 
-    The dB of that single contact is interpolated from `known` contacts (x_mm, y_mm, F_N; dB in uT). These are the
-    contacts that are nearest to the prediction in place and, if forces are known, in force.
+    A network predicts one contact (x_mm, y_mm, F_N) from a reading. The dB that such a contact would cause is
+    interpolated from `known` contacts, which are given as (x_mm, y_mm, F_N) and dB in uT. The contacts that are nearest
+    to the prediction in place and, if forces are known, in force are used. The result is the norm of the difference
+    between this dB and the reading, divided by the reading's |dB| plus noise.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 
@@ -308,16 +317,19 @@ def residual(
 
 
 def disagreement(predicted: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
-    """Return the disagreement of networks of several seeds on each contact's place.
+    """Return how much networks with different seeds disagree on the place of each contact.
 
-    The disagreement is the rms distance, in mm, of the predicted places from their mean.
+    The disagreement is the rms distance, in mm, between the predicted places and their mean.
     """
     place_mm = predicted[:, :, :2]
     return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
 
 
 def summarise_nested(boards: Sequence[Any]) -> Any:
-    """Summarise nested mappings of equal structure, one per board: replace each number by its statistic over boards."""
+    """Summarise the results of several boards, which are nested mappings of equal structure.
+
+    In the result, each number is replaced by its statistic over boards.
+    """
     first = boards[0]
     if isinstance(first, Mapping):
         return {key: summarise_nested([board[key] for board in boards if key in board]) for key in first}
@@ -334,9 +346,11 @@ HEIGHTS_N = 9  # number of heights in the table of displacements, which is inter
 def superposition(
     simulation: SimulationSettings, separations_mm: Sequence[float], *, seed: int
 ) -> list[dict[str, Any]]:
-    """Return, by depth and separation, the rms error of adding the field changes of two single contacts.
+    """Return the rms error that is made if the field changes of two single contacts are added.
 
-    The skin is the first one of the scene. The two depths are the largest commanded depth, and half of it.
+    The field change of two contacts is simulated, and compared with the sum of the field changes of the single
+    contacts. The skin is the first skin of the scene. The result has one row for each depth and separation; the two
+    depths are the largest commanded depth, and half of it.
     """
     board_name, skin_name = list_captures(simulation, MAIN)[0]
     board = draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board_name)

@@ -1,4 +1,8 @@
-"""Novelty detection: scores of how unlike known readings a reading is, thresholds, and areas under ROC curves."""
+"""Novelty detection: find readings that are unlike all known readings.
+
+This module computes scores of how unlike the known readings a reading is, thresholds of these scores, and areas under
+ROC curves.
+"""
 
 from collections.abc import Mapping
 

@@ -1,7 +1,9 @@
 """Drift: networks trained on a skin's first contacts and tested on later contacts (paper section 4, figure 5).
 
-A no-load policy states when a new no-load reading is taken; each policy has its own networks. The paper makes
-statements about the policies, and about the force bias after many contacts. These statements are tested over boards.
+The networks receive the change of the field since a no-load reading (a reading without contact). A no-load policy
+states when a new no-load reading is taken. Separate networks are trained for each policy. The paper makes statements
+about the policies, and about the force bias after many contacts. This experiment tests each statement statistically,
+over boards.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -58,8 +60,11 @@ POINTS_MAX_N = 2000  # largest number of points in the scatter plot
 DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 
 Count = Annotated[int, Field(ge=1)]
-# No-load policies, by when a new no-load reading is taken. `initial`: only at the start. `regular`: every `regular_n`
-# contacts. `each`: before each contact. `free`: whenever a reading is judged free of contact.
+# The no-load policies. A new no-load reading is taken
+# - `initial`: only at the start,
+# - `regular`: every `regular_n` contacts,
+# - `each`: before each contact,
+# - `free`: whenever a reading is judged to be free of contact.
 PolicyName = Literal["initial", "regular", "each", "free"]
 UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
 # Errors by metric. Rows are networks (one per skin and seed), columns are test windows.
@@ -74,9 +79,10 @@ class Drift(SectionWithTraining):
     test_n: Count
     every_n: Count
     policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
-    regular_n: Count | None = None  # indentations from one no-load reading to the next under policy `regular`
-    # Step sizes (standard deviation per contact and channel) of random walks, which are added to all readings after the
-    # training contacts. For simulated scenes only.
+    regular_n: Count | None = None  # number of indentations between two no-load readings under policy `regular`
+    # The trained networks are also tested on readings with additional drift. This drift is a random walk, which is
+    # added to all readings after the training contacts. These are the step sizes of the random walks (standard
+    # deviation per contact and channel). For simulated scenes only.
     wander_uT: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = ()
     training: Training
 
@@ -106,7 +112,8 @@ class WindowPredictions:
     seed_i: int
     window_i: int
     contacts_n: int  # number of contacts of the skin before the window
-    noload_off_uT: float  # rms difference of the policy's no-load field from the one before each contact
+    # rms difference between the no-load field that the policy subtracts and the no-load field just before each contact
+    noload_off_uT: float
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
@@ -153,9 +160,10 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
 
 
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
-    """Divide all captures into the same windows, and collect the input rows of each window under every no-load policy.
+    """Divide all captures into the same windows of contacts, and collect the input rows of each window.
 
-    A `Part` contains the rows of one window of one capture under one policy.
+    The rows depend on the no-load policy, so they are collected once per policy. Each `Part` contains the rows of one
+    window of one capture under one policy.
     """
     check_one_per_skin(captures)
     units = [rank(getattr(capture, UNIT_COLUMN[section.unit])) for capture in captures]
@@ -167,7 +175,7 @@ def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selecti
 
 
 def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
-    """Return, for each reading, the no-load field to subtract under a policy."""
+    """Return the no-load field that a policy subtracts from each reading."""
     fields = readings.noload_uT, readings.indentation
     if policy == "regular":
         assert section.regular_n is not None
@@ -180,7 +188,7 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.n
 
 
 def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[TrainingJob, list[Part]]]:
-    """Yield one training job per skin, policy, recipe and seed, together with its test windows."""
+    """Yield one training job per skin, policy, recipe and seed, together with the windows that test its network."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
@@ -191,7 +199,7 @@ def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tupl
 
 
 def split_predictions(job: TrainingJob, trained: TrainingResult, tests: Sequence[Part]) -> Iterator[WindowPredictions]:
-    """Split the predictions of one network into its test windows."""
+    """Yield the predictions of one network, separately for each of its test windows."""
     ends = np.cumsum([len(part.rows) for part in tests])[:-1]
     for part, predicted in zip(tests, np.split(trained.predicted, ends), strict=True):
         yield WindowPredictions(
@@ -203,10 +211,10 @@ def split_predictions(job: TrainingJob, trained: TrainingResult, tests: Sequence
 def summarise_headline(
     section: Drift, predictions: Sequence[WindowPredictions], parts: Sequence[Part], field: dict[str, float]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Summarise the networks of the headline recipe: return the numbers, and the points of figure 5b.
+    """Summarise the networks of the headline recipe (the recipe whose results are compared with the paper's).
 
-    The paper does not say which no-load policy figure 5b shows. We use `regular` if the scene has it, and the first
-    policy of the scene otherwise.
+    Returns the numbers for the tables, and the points of figure 5b. The paper does not say which no-load policy figure
+    5b shows. We use `regular` if the scene has this policy, and the first policy of the scene otherwise.
     """
     scores = score_windows(predictions)
     windows = {policy: window_means(scores, policy) for policy in section.policies}
@@ -258,7 +266,10 @@ def _metrics_in(scores: pd.DataFrame, *names: str) -> list[str]:
 
 
 def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
-    """Return one row per window, with means over skins and seeds; `spread` contains the standard deviations."""
+    """Return one row per window, which contains the means of the metrics over skins and seeds.
+
+    Key `spread` of a row contains the standard deviations.
+    """
     rows = []
     for _, window_scores in scores[scores["policy"] == policy].groupby("window_i"):
         values = {name: window_scores[name].to_numpy() for name in _metrics_in(window_scores, *METRICS, "bias_f_N")}
@@ -275,9 +286,9 @@ def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
 
 
 def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
-    """Return, by metric, the errors of each network (rows) in each window (columns).
+    """Return an array of errors for each metric, with one row per network and one column per window.
 
-    Row i is for the same skin and seed under every policy, so that the rows of two policies form pairs.
+    Row i belongs to the same skin and seed under every policy, so that row i of two policies can be compared as a pair.
     """
     policy_scores = scores[scores["policy"] == policy]
     return {
@@ -310,7 +321,10 @@ def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
 
 @dataclass(frozen=True)
 class ContactForces:
-    """True and predicted forces of one window, averaged over the readings of each indentation with a known force."""
+    """True and predicted forces of the indentations in one window, averaged over the readings of each indentation.
+
+    Indentations with unknown forces are left out.
+    """
 
     skin: Shaped[np.ndarray, " n"]
     true_N: Float[np.ndarray, " n"]
@@ -318,9 +332,11 @@ class ContactForces:
 
 
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
-    """Average true and predicted forces over the readings of each indentation, because readings are not independent.
+    """Average true and predicted forces over the readings of each indentation.
 
-    All `predictions` must be for the same window, and each for a different skin.
+    The average is taken because the readings of one indentation are not independent, so the standard error of the force
+    bias must be computed over indentations. All `predictions` must be for the same window, and each for a different
+    skin.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -337,9 +353,10 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
 
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
-    """Return the mean of predicted minus true force, the standard error of this mean over contacts, and a slope.
+    """Return the force bias, which is the mean of predicted minus true force, and related numbers.
 
-    The slope is the least-squares slope of predicted force against true force.
+    `bias_se_N` is the standard error of this mean over contacts. `slope` is the least-squares slope of the predicted
+    force against the true force.
     """
     error_N = contacts.predicted_N - contacts.true_N
     deviation_N = contacts.true_N - contacts.true_N.mean()
@@ -355,10 +372,10 @@ def force_bias(contacts: ContactForces) -> dict[str, Any]:
 def late_force(
     predictions: Sequence[WindowPredictions], policy: str, window_i: int
 ) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
-    """Return the force bias of one window under one policy, and the points of the first seed for the figure.
+    """Return the force bias of one window under one policy, and the points for figure 5b.
 
-    The bias is given as the mean over seeds, and for each network. Returns None if fewer than two contacts have a known
-    force.
+    The bias is returned as a mean over seeds, and also separately for each network. The points are the forces that the
+    networks of the first seed predict. Returns None if fewer than two contacts have a known force.
     """
     window = [network for network in predictions if (network.policy, network.window_i) == (policy, window_i)]
     seeds = sorted({network.seed_i for network in window})
@@ -383,9 +400,9 @@ def points(contacts: ContactForces) -> dict[str, list[float]]:
 
 
 def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
-    """Return the mean over skins of `force_left`, which compares window `window_i` with the training window.
+    """Return what percentage of the early force remains in window `window_i`, as the mean of `force_left` over skins.
 
-    Returns None if `force_left` is unknown for any skin.
+    The early force is the force in the training window. Returns None if `force_left` is unknown for any skin.
     """
     windows = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
     ratios_pct = [force_left(windows[skin, TRAIN], late) for (skin, i), late in windows.items() if i == window_i]
@@ -393,9 +410,10 @@ def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float |
 
 
 def force_left(early: Readings, late: Readings) -> float | None:
-    """Return late force / early force at equal places and depths, in percent; below 100 if the skin softened.
+    """Return the late force as a percentage of the early force, at equal places and depths.
 
-    Returns None if no place was pressed to the same depth both early and late with known forces.
+    The percentage is below 100 if the skin has softened. Returns None if no place was pressed to the same depth both
+    early and late with known forces.
     """
     sides = []
     for readings in (early, late):
@@ -417,10 +435,11 @@ def force_left(early: Readings, late: Readings) -> float | None:
 
 
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
-    """Return two rms values over channels: the change of field by a contact, and the noise of a no-load reading.
+    """Return the size of the field change by a contact, and the noise of a no-load reading.
 
-    Under every policy, the change is relative to the no-load reading just before the contact. The noise is estimated
-    from differences between successive no-load readings, because little drift occurs between them.
+    Both sizes are rms values over channels. The field change is always relative to the no-load reading just before the
+    contact, whatever the no-load policies of the scene. The noise is estimated from the differences between successive
+    no-load readings, because little drift occurs from one to the next.
     """
     changes_uT = [subtract(capture.b_uT, capture.noload_uT)[~np.isnan(capture.x_mm)] for capture in captures]
     steps_uT = [np.diff(capture.noload_uT[_first_rows(capture)].astype(float), axis=0) for capture in captures]
@@ -430,9 +449,9 @@ def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def pace(captures: Sequence[Readings]) -> dict[str, float]:
-    """Return the median time from one indentation to the next, and the duration of the longest capture, in s.
+    """Return the median time from one indentation to the next, and the duration of the longest capture, in seconds.
 
-    Returns an empty dict if no capture has times and more than one indentation.
+    Captures without times are ignored. Returns an empty dict if no other capture has more than one indentation.
     """
     timed = [capture for capture in captures if np.isfinite(capture.t_s).all()]
     steps_s = [step_s for capture in timed for step_s in np.diff(capture.t_s[_first_rows(capture)])]
@@ -477,10 +496,10 @@ def score_wandering(
     networks: Sequence[tuple[TrainingJob, list[Part], TrainingResult]],
     seed: int,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Test each network again on its last test window, after a random walk has been added to all readings.
+    """Test each network again on its last test window, after a random walk has been added to the readings.
 
-    For each policy, returns one row per step size of the walk. A row contains mean scores over skins and seeds;
-    `spread` contains the standard deviations.
+    For each policy, returns a list with one row per step size of the walk. A row contains the mean scores over skins
+    and seeds. Key `spread` of a row contains the standard deviations.
     """
     from reskin.models.network import Predictor  # imported here because it imports torch, which takes seconds
 
@@ -512,12 +531,13 @@ def score_wandering(
 
 
 def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
-    """Add a random walk to all readings, including no-load readings, after the first `after_n` contacts.
+    """Add a random walk to all readings (in contact and without contact) after the first `after_n` contacts.
 
     The steps of the walk have a standard deviation of `step_uT` per contact and channel.
     """
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
-    rng = rng_for(seed, "drift", "wander", readings.skin)  # all step sizes scale the same random walk
+    # The random stream does not depend on step_uT, so walks of different step sizes differ only by a factor.
+    rng = rng_for(seed, "drift", "wander", readings.skin)
     walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
     walk_uT = (walk_T / micro).astype(np.float32)
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
@@ -533,25 +553,34 @@ EACH_IS_WORSE = '"errors are also higher when no-load measurements are updated b
 OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
-INDENTATION_SES = 2.0  # half-width, in standard errors, of the 95 % interval over a window's indentations
+# The 95 % interval of the force bias over a window's indentations extends by this many standard errors to each side.
+INDENTATION_SES = 2.0
 ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # MSE_F is absent if forces are unknown
 PER_CONTACTS_N = 10_000
 
 
 class Comparison(NamedTuple):
-    """Differences of a quantity between paired networks, which are positive if the paper's statement is right."""
+    """A comparison of one quantity with the paper's statement about it.
+
+    The compared values are differences that are positive if the paper's statement is right.
+
+    - text: the compared values in words and numbers, for the table.
+    - over_boards: statistics of the differences over boards.
+    - over_trainings: 95 % interval over training runs, or None if there is only one network.
+    """
 
     text: str
     over_boards: Stat
-    over_trainings: list[float] | None  # 95 % interval over training runs; None if there is a single network
+    over_trainings: list[float] | None
 
 
 def compare_networks(
     quantity: str, unit: str, values: Mapping[str, Float[np.ndarray, " u"]], boards: Sequence[str]
 ) -> Comparison:
-    """Compare a quantity between the networks of two policies, in pairs of networks with the same skin and seed.
+    """Compare a quantity between the networks of two policies.
 
-    `values` maps each of the two policies to one value per network; `boards` contains the board of each pair.
+    The networks are compared in pairs that have the same skin and seed. `values` maps each of the two policies to one
+    value per network. `boards` contains the board of each pair.
     """
     (policy, first), (other_policy, second) = values.items()
     over_boards, over_trainings = mean_over_boards(first - second, boards)
@@ -570,7 +599,10 @@ def _show_ends(over_boards: Stat, over_trainings: list[float] | None) -> str:
 def mean_over_boards(
     values: Float[np.ndarray, " u"], boards: Sequence[str]
 ) -> tuple[dict[str, Any], list[float] | None]:
-    """Return statistics over boards of the mean value per board, and the 95 % interval of the mean over networks."""
+    """Average the values of each board's networks; return statistics of these averages over boards.
+
+    The second result is the 95 % interval of the mean over networks, which ignores that networks share boards.
+    """
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
 
@@ -580,9 +612,16 @@ def judge_findings(
 ) -> list[dict[str, Any]]:
     """Test each finding of the paper for which the scene has the required policies and quantities.
 
-    `networks` contains the errors of the networks by policy. Under every policy, row i is a network with the same skin
-    (on board `boards[i]`) and seed. `contacts_n` is the number of contacts before each window. `late` contains the
-    numbers that `late_force` returns.
+    Parameters
+    ----------
+    networks
+        Errors of the networks, by policy. Under every policy, row i is a network with the same skin and seed.
+    boards
+        Board of the networks in row i.
+    contacts_n
+        Number of contacts of a skin before each window.
+    late
+        Numbers that `late_force` returns, or None if it returned None.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
@@ -618,7 +657,7 @@ def judge_findings(
 
 
 def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
-    """Return the least-squares slope of each network's errors against contacts, per 10,000 contacts."""
+    """Return how fast the errors of each network grow: their least-squares slope per 10,000 contacts."""
     contacts = np.array(contacts_n, float) / PER_CONTACTS_N
     deviation = contacts - contacts.mean()
     return errors @ deviation / (deviation @ deviation)
@@ -627,8 +666,9 @@ def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float
 def late_bias(late: Mapping[str, Any]) -> Comparison:
     """Compare the force bias after many contacts with 0.
 
-    The interval over training runs is widened, where necessary, to extend by two standard errors over indentations to
-    each side of the bias. It is None if there is only one network.
+    The interval over training runs is made wider if the bias is more uncertain because of the finite number of
+    indentations: it extends by at least two standard errors over indentations to each side of the bias. The interval is
+    None if there is only one network.
     """
     over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
     reach_N = INDENTATION_SES * late["bias_se_N"]
@@ -639,7 +679,10 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
 
 
 def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Combine the verdicts of all comparisons into two verdicts on a finding: over boards, and over training runs."""
+    """Judge a finding from all comparisons that belong to it; return the row for the table of findings.
+
+    `verdict` combines the verdicts over boards, and `of_trainings` combines the verdicts over training runs.
+    """
     judged = combine_verdicts([verdict(comparison.over_boards) for comparison in comparisons])
     trainings = [comparison.over_trainings for comparison in comparisons]
     of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])
@@ -710,7 +753,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
-    """Describe two possible reasons for the scores: errors of the no-load reading, and softening of the skin."""
+    """Describe two possible reasons for the errors: an outdated no-load reading, and softening of the skin."""
     field, late = numbers["field"], numbers.get("late", {})
     offsets = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
@@ -741,7 +784,10 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
 
 
 def _error(numbers: Mapping[str, Any]) -> str:
-    """Return the name of the error shown beside accuracy: of the force or, if no force is known, of the place."""
+    """Return the name of the error that is shown beside the accuracy.
+
+    This is the error of the force or, if no force is known, the error of the place.
+    """
     [(_, rows), *_] = _policies(numbers).values()
     return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
 

@@ -1,7 +1,8 @@
 """Dynamic presses: readings at the full rate while the force keeps changing (paper section 7, future work).
 
-Place and force are estimated from each reading alone, and from the mean of the last five readings. The paper averages
-five readings of a press at rest.
+Place and force are estimated from each reading alone, and from the mean of the last five readings, because the paper
+averages five readings of a press at rest. While the force changes, such a mean has less noise but lags behind the
+force.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +30,7 @@ from reskin.models.trained import networks_held_out
 WINDOW_N = 5  # number of readings that the paper averages for a press at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, from which places are hard to estimate
 BINS_N = 5  # number of ranges of duration for which presses are scored separately
-LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidate lags of the predicted force
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # lags of the predicted force behind the true force that are tried
 METHODS = ("one", "mean5", "mean5_of_middle")
 
 Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]  # dB in uT -> x and y in mm, F in N

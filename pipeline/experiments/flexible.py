@@ -1,4 +1,4 @@
-"""Flexible boards: networks trained on rigid boards, adapted to flexible ones (paper section 5)."""
+"""Flexible boards: networks that were trained on rigid boards are adapted to flexible boards (paper section 5)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -54,7 +54,14 @@ class Gripper(Strict):
 
 @dataclass(frozen=True)
 class Finger:
-    """The skin on a gripper's finger: depth and field change for each force at its middle; the first force is 0."""
+    """The skin on a gripper's finger, described by its response to forces at its middle.
+
+    - board: name of the board.
+    - force_N: forces, the first of which is 0.
+    - depth_mm, change_uT: indentation and field change at each of these forces.
+    - noload_uT: field without contact.
+    - noise_uT: standard deviation of the noise of a reading.
+    """
 
     board: str
     force_N: Float64[np.ndarray, " p"]
@@ -71,7 +78,11 @@ class Finger:
     def squeezed_N(
         self, closed_mm: Float64[np.ndarray, " r"], stiffness_N_mm: Float64[np.ndarray, " r"]
     ) -> Float64[np.ndarray, " r"]:
-        """Return each run's force on skin and object, which are in series, after the gripper closed by `closed_mm`."""
+        """Return the force in each run after the gripper has closed by `closed_mm`.
+
+        Skin and object are compressed one behind the other, so the same force acts on both, and their indentations add
+        up to `closed_mm`.
+        """
         return np.array([
             np.interp(closed, self.depth_mm + self.force_N / stiffness, self.force_N)
             for closed, stiffness in zip(closed_mm, stiffness_N_mm, strict=True)
@@ -117,7 +128,11 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
 
 def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
-    """Yield every force estimator: its model's name, use of the press of known force, and function of readings."""
+    """Yield every force estimator, as a tuple of three elements.
+
+    The elements are the name of its model, how it uses the press of known force, and a function that estimates forces
+    from readings.
+    """
     unlabelled = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])

@@ -1,7 +1,8 @@
-"""Manual: networks adapted with hand pokes, whose places are unknown (paper section 5).
+"""Manual: networks are adapted with pokes by hand, whose places are unknown (paper section 5).
 
-The networks are tested on the robot's grid of the same skin. They are compared with networks adapted with the same
-number of robot pokes, and with networks fine-tuned for the same number of steps without pokes (the control).
+The networks are tested on pokes of the same skin by the robot, which are on a grid. They are compared with networks
+that were adapted with the same number of robot pokes, and with a control: networks that were trained further for the
+same number of steps, but without pokes of the skin.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

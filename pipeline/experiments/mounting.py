@@ -1,8 +1,8 @@
 """How reliably the universal model finds the orientation of a skin and of its labels.
 
-The shipped model is used as a user would use it, on changed data of recorded boards and simulated skins. Fields are
-changed as if the skin had been turned by a quarter before it was glued on, or as if two chips had been exchanged.
-Labels are changed as if their axes had been mirrored or turned.
+The shipped model is used as a user would use it, on data of recorded boards and simulated skins that are changed first.
+Fields are changed as if the skin had been turned by 90 degrees before it was glued on, or as if two chips had been
+exchanged. The places of labels are changed as if their axes had been mirrored or turned.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,7 +46,7 @@ WITH_CHECK, WITHOUT_CHECK = "orientation found", "orientation assumed"
 
 
 class Mounting(Strict):
-    """Section mounting: numbers of simulated skins, of labels and of draws per recorded board."""
+    """Settings section `mounting`: numbers of simulated skins, of labels, and of random draws for each board."""
 
     skins_n: Annotated[int, Field(ge=1, le=10_000)]
     labels_n: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
@@ -54,7 +54,13 @@ class Mounting(Strict):
 
 
 class Skin(NamedTuple):
-    """No-load field and presses of a skin, as inputs of the universal model: chip axes, label coordinates."""
+    """A skin, with data in the form that the universal model expects.
+
+    - name: name of the skin.
+    - rest_uT: no-load field, in the chips' axes.
+    - db_uT: field changes of presses, in the chips' axes.
+    - place_mm, force_N: places of the presses, in the coordinates of labels, and their forces.
+    """
 
     name: str
     rest_uT: Float[np.ndarray, " ch"]
@@ -124,7 +130,11 @@ def simulated_skins(setup: Setup, skins_n: int, seed: int, name: str) -> list[Sk
 
 
 def orientations(skins: Sequence[Skin], seed: int) -> dict[str, Any]:
-    """Count turned orientations and warnings from no-load fields, and skins whose 65 presses have a large misfit."""
+    """Count how often the model notices a changed mounting of the skin.
+
+    From the no-load field, the model may find a turned orientation or give a warning. From 65 presses, it may notice a
+    large misfit.
+    """
     turned, warned, log_odds, misfits = [], [], [], []
     for skin in skins:
         model = load_universal().zero(skin.rest_uT)
@@ -157,7 +167,7 @@ def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int,
             for labels_n in section.labels_n:
                 chosen = order[:labels_n]
                 for name, matrix in frames().items():
-                    # labels in wrong axes, which `matrix` would correct
+                    # The places of the labels are given in wrong axes. Applying `matrix` to them gives the true places.
                     place_mm = (skin.place_mm[chosen] - CENTRE_MM) @ matrix + CENTRE_MM
                     model.label(place_mm, skin.force_N[chosen], skin.rest_uT + skin.db_uT[chosen])
                     frame = model.label_frame
@@ -202,7 +212,7 @@ def score_places(
 
 
 def summarise_accuracy(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Average over draws, then over boards."""
+    """Average the scores over draws, and summarise these averages over boards."""
     frame = pd.DataFrame(rows)
     keys = ["change", "check", "labels_n"]
     summary = []

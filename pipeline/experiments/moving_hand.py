@@ -1,8 +1,9 @@
-"""Contacts and places of the universal model on a moving hand, with and without `external_uT`.
+"""Contacts and places of the universal model on a moving hand, with and without its option `external_uT`.
 
-When a robot moves a skin, the earth's field turns relative to the skin, and magnets and other skins come near. The
-experiment counts how often such a change of the field is mistaken for a contact, and how much it shifts the estimated
-place of a press. Column `source` of the tables states the kind of each result:
+When a robot moves a skin, the earth's field turns relative to the skin, and magnets and other skins come near. With
+`external_uT`, the universal model expects external fields of this size. The experiment counts how often a change of an
+external field is mistaken for a contact, and how much it shifts the estimated place of a press. Column `source` of the
+tables states the kind of each result:
 
 - *recorded*: changes of the field at the pads of a hand that moves without contact;
 - *superposed*: recorded presses of other boards, plus recorded changes of the hand. A superposition contains the noise
@@ -54,8 +55,8 @@ Size_uT = Annotated[float, Field(ge=0, le=10_000)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
-MOVING_COUNTS = 5  # joints whose positions have a smaller standard deviation, from noise, are at rest
-TOUCH_STEP = 20  # every twentieth reading of the boards is used as a touch; a press has 100 nearly equal readings
+MOVING_COUNTS = 5  # a joint is at rest if the standard deviation of its positions is smaller, because it is then noise
+TOUCH_STEP = 20  # a press has 100 nearly equal readings; only every twentieth reading of the boards is used as a touch
 NO_FIELD, TURNED, MAGNET = "none", "turned in the earth's field", "beside a moving magnet"
 OTHER, FIRST_HALF = "the other recording", "the first half"
 # Candidate distances of sources, and candidate sizes, of the fields that a pad experiences
@@ -67,10 +68,10 @@ Row = dict[str, Any]
 
 
 class Group(Strict):
-    """Recordings of pads in one situation.
+    """Recordings of pads (skins on a hand) in one situation.
 
-    A pad has two captures at the same position of `threshold` and `tested`. The first sets thresholds, and the second
-    is tested.
+    Each pad was recorded twice. Element i of `threshold` and element i of `tested` are the captures (recorded files) of
+    pad i. The first capture sets thresholds, and the second capture tests them.
     """
 
     name: str
@@ -79,20 +80,24 @@ class Group(Strict):
 
 
 class MovingHand(Strict):
-    """Section moving_hand: recordings of the hand, sizes of fields, and numbers of draws."""
+    """Settings section `moving_hand`: recordings of the hand, sizes of external fields, and numbers of random draws."""
 
     groups: Annotated[tuple[Group, ...], Field(min_length=1)]
-    pad_chips: tuple[int, int, int, int, int]  # chip of a pad for each chip of the board of `presses`
+    # The chips of a pad are numbered differently from the chips of the boards in `presses`. Element i is the number of
+    # the pad's chip that is at the position of chip i of the boards.
+    pad_chips: tuple[int, int, int, int, int]
     external_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # values of the option, for contacts
-    compensated_uT: tuple[Size_uT, ...]  # values of the option with compensation learnt from joint positions
+    # Values of the option, if field changes that are predicted from joint positions are subtracted first.
+    compensated_uT: tuple[Size_uT, ...]
     boosting_iterations_n: Count
-    touch_scales: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]  # factors of touches
+    # Field changes of recorded presses are multiplied by each of these factors, to get weaker or stronger touches.
+    touch_scales: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
     detected_fraction: Fraction
     places_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # values of the option, for places
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     draws_n: Count  # number of draws of presses and labels, for each board
     readings_n: Count  # number of tested readings in each draw
-    skins_n: Annotated[int, Field(ge=2, le=10_000)]  # simulated
+    skins_n: Annotated[int, Field(ge=2, le=10_000)]  # number of simulated skins
     changes_n: Count  # number of changes of the external field, for each simulated skin
     turned_uT: Size_uT  # size of the field in which a simulated skin is turned
     magnet_uT: Size_uT  # rms of a component of the magnet's field at its smallest distance
@@ -113,7 +118,12 @@ class MovingHand(Strict):
 
 @dataclass(frozen=True)
 class Pad:
-    """A recording of one pad: field changes and joint positions in each row, and the noise of a channel."""
+    """A recording of one pad.
+
+    - db_uT: field changes, with one row per reading.
+    - joint_counts: positions of the hand's joints at each reading.
+    - noise_uT: standard deviation of the noise of a channel.
+    """
 
     db_uT: Changes
     joint_counts: Float[np.ndarray, "f j"]
@@ -174,7 +184,10 @@ def moving_hand(settings: Settings, section: MovingHand, raw: Path, indentations
 
 
 def read_pad(readings: Readings, raw: Path, section: MovingHand, policy: FaultPolicy) -> Pad:
-    """Return the changes of a pad, with its chips in the order of the board of `presses`, and its joint positions."""
+    """Return the field changes, the joint positions and the noise of a pad.
+
+    The pad's chips are put into the order of the boards in `presses`.
+    """
     motion = leaphand.read_motion(raw, read_header(raw), policy)
     db_uT = readings.b_uT.astype(float) - readings.noload_uT
     ordered_uT = db_uT.reshape(len(db_uT), -1, 3)[:, section.pad_chips].reshape(db_uT.shape)
@@ -207,7 +220,10 @@ def read_boards(settings: Settings, section: Compare, captures: Sequence[Reading
 
 
 def describe_pad(capture: str, pad_name: str, pad: Pad) -> Row:
-    """Return noise and field changes of one recording, and the most likely distance and size of the changes' source."""
+    """Describe one recording by its noise, its field changes, and the most likely source of these changes.
+
+    The source is described by its distance from the pad and by the size of its field.
+    """
     length_uT = np.linalg.norm(pad.db_uT, axis=1)
     distance_mm, size_uT = find_source(to_board(pad.db_uT), pad.noise_uT)
     return {
@@ -218,7 +234,10 @@ def describe_pad(capture: str, pad_name: str, pad: Pad) -> Row:
 
 
 def find_source(db_uT: Changes, noise_uT: float) -> tuple[float, float]:
-    """Return the candidate distance and size of a source with the largest likelihood; changes are in board axes."""
+    """Return the distance and the size of a source that make the field changes most likely, among the candidates.
+
+    `db_uT` are field changes in the board's axes.
+    """
     second_uT2 = db_uT.T @ db_uT / len(db_uT)
     likelihoods = {}
     for distance_mm in DISTANCES_MM:
@@ -250,10 +269,10 @@ def contact_rows(group: str, pairs: Sequence[Pair], touches_uT: Changes, section
 
 
 def compensate(learner: str, trained_on: str, pair: Pair, boosting_iterations_n: int) -> Pair:
-    """Subtract the field changes that a regression predicts from the joint positions; only moving joints are inputs.
+    """Subtract the field changes that a regression predicts from the positions of the moving joints.
 
-    The regression is trained on the pad's other recording, or on the first half of the tested recording. The threshold
-    is then set on the first half of the tested recording, and tested on the second half.
+    The regression is trained either on the pad's other recording, or on the first half of the tested recording. In both
+    cases, thresholds are set on the first half of the tested recording, and tested on the second half.
     """
     from sklearn.ensemble import HistGradientBoostingRegressor
     from sklearn.linear_model import RidgeCV
@@ -284,9 +303,10 @@ def count_contacts(
 ) -> Row:
     """Count contacts per 100 readings at the threshold of `reskin live`, and at thresholds for a stated detection rate.
 
-    Each touch is a recorded press, times a factor, plus a random change of a random pad. Each factor has its own
-    threshold, which is set with changes from the rows for thresholds, such that `detected_fraction` of the touches
-    exceed it. Detected touches are then counted with changes from the tested rows.
+    A touch is simulated: the field change of a recorded press is multiplied by a factor, and a random field change of a
+    random pad is added. Each factor has its own threshold, which `detected_fraction` of the touches exceed. Thresholds
+    are set with field changes from the recordings for thresholds. Detected touches are then counted with field changes
+    from the tested recordings.
     """
     model = load_universal(external_uT=external_uT)
     matrices = [[model.suppressor(pad.noise_uT) for pad in pair] for pair in pairs]
@@ -315,10 +335,11 @@ def count_contacts(
 
 
 def live_threshold(noise_uT: float, suppressor: Float[np.ndarray, "15 15"] | None) -> float:
-    """Return the strength above which `reskin live` reports a contact, for the noise of one channel.
+    """Return the strength of a field change above which `reskin live` reports a contact.
 
-    `reskin live` adds `CONTACT_SDS` times the noise to the median strength of many no-load readings. This function
-    replaces the median by the root mean square strength of noise alone, which is about as large.
+    `noise_uT` is the noise of one channel. `reskin live` adds `CONTACT_SDS` times this noise to the median strength of
+    many no-load readings. Here, no such readings are needed: the median is replaced by the root mean square strength
+    that noise alone would have, which is about as large.
     """
     channels_n = 3 * len(CHIPS_MM) if suppressor is None else float((suppressor**2).sum())
     return noise_uT * (np.sqrt(channels_n) + CONTACT_SDS)
@@ -328,7 +349,7 @@ def live_threshold(noise_uT: float, suppressor: Float[np.ndarray, "15 15"] | Non
 
 
 def draw_fields(skin: Skin, section: MovingHand, seed: int) -> dict[str, Changes]:
-    """Draw changes of each external field since the no-load field, for a simulated skin."""
+    """Draw changes of each kind of external field, relative to the field when the no-load reading was taken."""
     rng = rng_for(seed, "moving hand", skin.name, "fields")
     n = section.changes_n
     return {
@@ -378,7 +399,7 @@ def simulated_contact_rows(
             rng = rng_for(seed, "moving hand", "noise", skin.name, field)
             n = len(of_skin[field])
             still_uT.append(of_skin[field] + sd_uT * rng.standard_normal((n, len(sd_uT))))
-            # the presses of a simulated skin contain noise
+            # No noise is added here, because the presses of a simulated skin already contain noise.
             pressed_uT.append(skin.db_uT[rng.integers(len(skin.db_uT), size=n)] + of_skin[field])
         for external_uT in section.external_uT:
             matrix = load_universal(external_uT=external_uT).suppressor(noise_uT)
@@ -404,10 +425,11 @@ def _above_pct(strengths_uT: Sequence[Float[np.ndarray, " f"]], limit_uT: float)
 
 
 def board_rows(board: BoardPresses, fields_uT: Mapping[str, Changes], section: MovingHand, seed: int) -> Iterator[Row]:
-    """Score superpositions of a board's presses and field changes of the hand; the model is calibrated at rest.
+    """Score the estimated places of a board's presses, to which field changes of the moving hand are added.
 
-    The calibration uses 65 unlabelled presses at random places. Labels are at places of one colour of a checkerboard,
-    and tests at places of the other colour.
+    The model is calibrated without such field changes, to 65 unlabelled presses at random places. The board's places
+    are divided like the squares of a checkerboard: labels are at the places of one colour, and tests at the places of
+    the other colour.
     """
     skin = skin_of_board(board)
     readings_uT = to_chips(board.readings.db_uT)
@@ -428,7 +450,10 @@ def board_rows(board: BoardPresses, fields_uT: Mapping[str, Changes], section: M
 
 
 def simulated_place_rows(skin: Skin, fields_uT: Mapping[str, Changes], section: MovingHand, seed: int) -> Iterator[Row]:
-    """Score presses on a simulated skin in external fields; the model is calibrated at rest, to other presses."""
+    """Score the estimated places of presses on a simulated skin, in external fields.
+
+    The model is calibrated to other presses of the skin, without external fields.
+    """
     rng = rng_for(seed, "moving hand", skin.name, "presses")
     order = rng.permutation(len(skin.db_uT))
     pool, tested = order[:PLACES_N], order[PLACES_N:]
@@ -604,12 +629,13 @@ def _place_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[Row]:
         for name, title in (("accuracy_pct", "within 1 mm, %"), ("mse_xy_mm2", "MSE_xy, mm²")):
             line[option + title] = show(row[name])
         line[option + "in 90 % interval, %"] = round(row["coverage_pct"]["mean"])
-    alone = RECORDED if source == SUPERPOSED else source  # without a change of field, nothing is superposed
+    # Without a change of the external field, nothing is added to the recorded presses, so the result is recorded.
+    alone = RECORDED if source == SUPERPOSED else source
     return [line | {"source": alone if field == NO_FIELD else source} for (field, _), line in lines.items()]
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw false contacts and the accuracy of places against the option, one panel for each kind of result."""
+    """Draw false contacts and the accuracy of places against `external_uT`, with one panel for each kind of result."""
     with drawing(13.0, 3.8) as figure:
         panels = figure.subplots(1, 4)
         plain = [row for row in numbers["contacts"] if row["method"] == "none"]

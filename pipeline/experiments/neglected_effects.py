@@ -1,4 +1,7 @@
-"""Effects that the simulation may neglect, and the errors of field and force that neglecting each of them causes."""
+"""Physical effects that the simulation may neglect.
+
+For each effect, the experiment computes how wrong the simulated field and force are if the effect is neglected.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -46,20 +49,24 @@ COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects that are com
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect, and the errors that neglecting it causes.
+    """One effect, and the errors that are made if the effect is neglected.
 
-    The errors of dB (`field_pct`) and force (`force_pct`) are rms in percent; `rest_uT` is the largest error of the
-    no-load field. Errors that do not apply are None.
+    - term: name of the effect.
+    - done: whether the main protocol neglects the effect ("left out") or computes it ("kept").
+    - field_pct: rms error of dB, in percent; None if it does not apply.
+    - rest_uT: largest error of the no-load field; None if it does not apply.
+    - force_pct: rms error of the force, in percent; None if it does not apply.
+    - how: how the errors were computed, in words.
+    - left_out_by, computed_by: names of the protocols that neglect the effect, and of the protocols that compute it.
+      Both are empty if protocols cannot choose whether the effect is computed.
     """
 
     term: str
-    done: str  # "left out" or "kept" by the main protocol
+    done: str
     field_pct: float | None
     rest_uT: float | None
     force_pct: float | None
     how: str
-    # Names of the protocols that neglect the effect, and of the protocols that compute it. Both are empty if a protocol
-    # cannot choose whether the effect is computed.
     left_out_by: tuple[str, ...] = ()
     computed_by: tuple[str, ...] = ()
 
@@ -231,10 +238,10 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 
 
 def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
-    """Return the displaced nodes under each indentation, for an indentation in small steps.
+    """Return the displaced nodes under each indentation, if the depth increases in small steps.
 
-    A single call to `follow` tracks the nodes of all indentations, because all indentations have the same contact
-    pressures.
+    All indentations have the same depth and thus the same contact pressures. Therefore, a single call to `follow`
+    tracks the nodes of all indentations.
     """
     r_m = np.concatenate([np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(subject.coarse.nodes_m[:, 2], len(PLACES_M))
@@ -244,7 +251,7 @@ def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[
 
 
 def _one_shot(subject: Subject, place_m: tuple[float, float], depth_m: float, press: layer.IndentedLayer) -> Moved:
-    """Return the displaced nodes under one indentation, for a single linear step to the full depth."""
+    """Return the displaced nodes under one indentation, if the full depth is reached in a single linear step."""
     r_m, z_m = np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T), subject.coarse.nodes_m[:, 2].copy()
     u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
     return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2
@@ -272,9 +279,10 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
 
 
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
-    """Evaluate, to first order, the effect of the powder's own field on the magnetisation of the powder.
+    """Evaluate how much the magnetic field of the powder itself changes the magnetisation of the powder.
 
-    The powder's field is computed as the field of uniformly magnetised boxes (magpylib).
+    The effect is computed to first order. The powder's field is computed with magpylib, as the field of uniformly
+    magnetised boxes.
     """
     rest = midpoints(subject.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, subject.skin.thickness_m, simulation.skin.polarity)

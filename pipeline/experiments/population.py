@@ -1,8 +1,9 @@
 """The universal model, built from simulated skins alone and tested on held-out skins of a simulated scene.
 
-The model is calibrated to each skin with the skin's no-load field, unlabelled presses and labelled presses. Estimated
-forces are also corrected with one known weight, which is put on the skin. Networks trained on different numbers of
-simulated skins show how the error depends on this number.
+The model consists of a map, which compares a reading with simulated fields, and of networks. It is calibrated to each
+tested skin with the skin's no-load field (field without contact), with unlabelled presses (at unknown places), and with
+labelled presses. In addition, the estimated forces are corrected with one known weight, which is put on the skin.
+Networks that were trained on different numbers of simulated skins show how the error depends on this number.
 """
 
 import hashlib
@@ -52,21 +53,27 @@ from reskin.universal.network import Weights, draw_weights
 from reskin.universal.population import PLACES_N, Forces, Population, draw_population
 
 EXPERIMENT = "lobo"  # experiment whose folds are used; their pools contain the unlabelled pokes
-POOL_MAX_N = 65  # one press at each place of the paper's grid, at any of the depths pressed there
+POOL_MAX_N = 65  # largest number of presses for calibration: one press at each place of the paper's grid, at any depth
 TESTED_MAX_N = 2000  # at most this number of test rows per skin, drawn at random
 CALIBRATION_SKINS_N = 16  # simulated skins that determine likelihood powers and weight shares (see `Calibration`)
-FRESH_N = 32  # further simulated skins for measuring the coverage of intervals
+FRESH_N = 32  # number of further simulated skins, which are used to measure the coverage of intervals
 BY = ("way", "pokes_n", "labels_n")
 WAYS = ("map", "universal", "network")  # the map alone, map and networks, the networks alone
-WEIGHT_N = 5.0  # known weight (500 g) on the skin's middle, the place most informative about forces at other places
-WEIGHT_SD = 0.02  # sd of the log of the assumed force: friction in the weight's guide, and error of its mass
+# Force of the known weight (500 g). It is put on the skin's middle, which is the place that is most informative about
+# forces at other places.
+WEIGHT_N = 5.0
+# Standard deviation of log(assumed force / true force) of the known weight. The two forces differ because of friction
+# in the weight's guide, and because of an error of its mass.
+WEIGHT_SD = 0.02
 LOG_FORCE_MIN_N = 0.2  # presses with less force hardly change the field; they are left out of errors of log F
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINING_MODULE = "reskin.universal.training"
 PART_N = 100  # number of skins in one cached array
-LOG_FORCE_STEP = 0.6  # largest step of log F between two tabulated forces
-FORCE_SHARES = (0.7, 1.5)  # factors that widen the design's range of forces, because skins differ from the design
+LOG_FORCE_STEP = 0.6  # largest difference of log F between two successive forces in the map's tables
+# The smallest and the largest force of the design are multiplied by these factors, because skins differ from the
+# design.
+FORCE_SHARES = (0.7, 1.5)
 
 
 class CalibrationSize(NamedTuple):
@@ -79,9 +86,11 @@ class CalibrationSize(NamedTuple):
 class PopulationSettings(Strict):
     """Settings section `population`.
 
-    skins_n: number of simulated training skins of each network; a network uses the first skins of a population that all
-    networks share. steps_n: steps of each training run. unlabelled_n, labels_n: numbers of unlabelled and of labelled
-    presses to which the model is calibrated.
+    - skins_n: one network is trained for each of these numbers of simulated skins. All networks share one population
+      of skins, of which each network uses the first skins.
+    - steps_n: number of steps of each training run.
+    - unlabelled_n: numbers of unlabelled presses to which the model is calibrated.
+    - labels_n: numbers of labelled presses to which the model is calibrated.
     """
 
     skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
@@ -90,16 +99,22 @@ class PopulationSettings(Strict):
     labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
 
     def sizes(self) -> list[CalibrationSize]:
-        """List all numbers of unlabelled presses without labels, then the largest number with each number of labels."""
+        """List the amounts of calibration data that are tested.
+
+        First, every number of unlabelled presses is listed without labels. Then, the largest number of unlabelled
+        presses is listed with every number of labels.
+        """
         most_n = max(self.unlabelled_n)
         return [CalibrationSize(n, 0) for n in self.unlabelled_n] + [CalibrationSize(most_n, n) for n in self.labels_n]
 
 
 @dataclass(frozen=True)
 class DesignedSkins:
-    """Distribution of simulated skins around the design of a scene's skins, and the forces at the scene's depths.
+    """A distribution of simulated skins that vary around the design of a scene's skins.
 
-    forces_N: smallest and largest force.
+    - prior: the distribution.
+    - forces_N: smallest and largest force of a press on these skins, at the depths of the scene.
+    - seed: seed of all random draws.
     """
 
     prior: SkinPrior
@@ -122,7 +137,7 @@ class DesignedSkins:
 
 
 def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
-    """Return the distribution of skins around a design; boards are exactly as designed."""
+    """Return the distribution of skins around a design; boards do not vary, but are exactly as designed."""
     if design.hold is None:
         what = "hold of section skin is null, but this experiment needs a skin that slides"
         raise ParamsError(f"nominal.yaml: {what}. Run it in a scene whose skin has hold.")
@@ -144,7 +159,10 @@ def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, 
 
 
 def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -> Population:
-    """Draw a population of `skins_n` training skins in parts; cache each part, and report when it is done."""
+    """Draw a population of `skins_n` training skins.
+
+    The skins are drawn in parts. Each part is cached, and `report` is called when the part is complete.
+    """
     parts = []
     for first in range(0, skins_n, PART_N):
         which = slice(first, min(first + PART_N, skins_n))
@@ -161,7 +179,8 @@ def train_network(designed: DesignedSkins, skins: Population, skins_n: int, step
     from reskin.universal.training import train  # imported late, because it imports PyTorch
 
     first = Population(*(getattr(skins, name)[:skins_n] for name in Population.__annotations__))
-    rng_name = (designed.seed, "population", "network")  # without skins_n: all networks have the same initial weights
+    # skins_n is not part of the name, so that all networks have the same initial weights.
+    rng_name = (designed.seed, "population", "network")
     empty = draw_weights(skins.rest_uT.shape[1], rng_for(*rng_name))
 
     def make() -> Float[np.ndarray, " w"]:
@@ -201,7 +220,11 @@ def _skins_array(designed: DesignedSkins, which: slice) -> np.ndarray:
 
 @dataclass(frozen=True)
 class KnownWeight:
-    """A press by a known weight on the skin's middle: its field change, and the force that is assumed for it."""
+    """A press by a known weight on the skin's middle.
+
+    - db_uT: field change of the press.
+    - force_N: force that is assumed for the press, which may differ slightly from the true force.
+    """
 
     db_uT: Float[np.ndarray, " ch"]
     force_N: float
@@ -209,20 +232,20 @@ class KnownWeight:
 
 @dataclass(frozen=True)
 class TestSkin:
-    """A skin to score the model on, in the frame and axes of its board."""
+    """A skin on which the model is scored, with places and fields in the coordinates of its board."""
 
     board: str
     rest_uT: Float[np.ndarray, " ch"]
-    pool: LabelledPresses  # presses for calibration, which may use only the first ones
+    pool: LabelledPresses  # presses for calibration; a calibration with n presses uses the first n of them
     weight: KnownWeight
     test_uT: Float[np.ndarray, "n ch"]
     true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
 
 
 def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str, np.ndarray]) -> list[TestSkin]:
-    """Return the skins of a held-out board, each with a pool for calibration and test rows.
+    """Return the skins of a held-out board, each with presses for calibration (pool) and with test rows.
 
-    The pool has one press per place from the first passes; test rows are from later passes.
+    The pool has one press at each place, from the first passes over the skin. Test rows are from later passes.
     """
     rows, skins = data.rows, []
     for skin in np.unique(rows.skin[fold.test]):
@@ -253,9 +276,9 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
 
 
 def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> KnownWeight:
-    """Return the press that serves as the press of the known weight.
+    """Choose a recorded press that is used as if the known weight had caused it.
 
-    This is the press whose force is nearest to `WEIGHT_N`, among the presses nearest to the skin's middle.
+    Among the presses nearest to the skin's middle, this is the press whose force is nearest to `WEIGHT_N`.
     """
     rows = data.rows
     off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
@@ -272,7 +295,10 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
 
 
 def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> KnownWeight:
-    """Return a press as if a known weight had caused it; its assumed force is drawn around the true force."""
+    """Return a press as if a known weight had caused it.
+
+    `force_N` is the true force of the press. The force that is assumed for the weight is drawn around it.
+    """
     return KnownWeight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 
@@ -305,10 +331,12 @@ def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSki
 def estimate(
     model: PriorModel, skin: TestSkin, size: CalibrationSize, powers: Sequence[Mapping[str, float]]
 ) -> list[dict[str, Estimate]]:
-    """Calibrate a model to a skin; estimate its test presses and, last, the press by the known weight.
+    """Calibrate a model to a skin, and estimate the test presses of the skin.
 
-    `powers` contains mappings from way (map, universal, network) to likelihood power. For each of them, a mapping from
-    way to estimate is returned.
+    The press by the known weight is estimated as well; it is the last element of each estimate. A way is one of map,
+    universal and network. Each element of `powers` contains the likelihood power for each way. (A likelihood power is
+    an exponent of the likelihood, which sets how wide the stated uncertainty is.) For each element of `powers`, the
+    result contains the estimate of each way.
     """
     labels = skin.pool[: size.labels_n]
     labels = replace(labels, force_N=np.maximum(labels.force_N, model.skin.tables.force_N[0]))
@@ -325,10 +353,11 @@ def estimate(
 
 @dataclass(frozen=True)
 class Calibration:
-    """For each way (map, universal, network): the likelihood power, and the correction of forces by a known weight.
+    """Settings of each way (map, universal, network) that are chosen on simulated skins.
 
-    weight_share: the error log(true / estimated F) of the known weight, times this fraction, is added to log F of all
-    presses.
+    - power: likelihood power, an exponent of the likelihood that sets how wide the stated uncertainty is.
+    - weight_share: how much of the force error of the known weight is corrected at all other presses. The error
+      log(true / estimated F) of the known weight is multiplied by this fraction, and added to log F of all presses.
     """
 
     power: Mapping[str, float]
@@ -338,8 +367,8 @@ class Calibration:
 def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: CalibrationSize) -> Calibration:
     """Choose likelihood powers and weight shares on simulated skins that are not scored."""
     covered = {way: np.zeros((len(BOARD_POWERS), len(skins))) for way in WAYS}
-    # Errors of log F by power and skin. Index 0 is the error for the known weight, and index 1 the mean error over test
-    # presses.
+    # Errors of log F, by likelihood power (axis 0) and by skin (axis 2). On axis 1, index 0 is the error for the known
+    # weight, and index 1 is the mean error over the test presses.
     log_force_errors = {way: np.zeros((len(BOARD_POWERS), 2, len(skins))) for way in WAYS}
     candidates = [dict.fromkeys(WAYS, power) for power in BOARD_POWERS]
     for j, skin in enumerate(skins):
@@ -353,7 +382,11 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 
 
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
-    """Return the factor of the weight's error in log F that best fits the test presses' mean error, over skins."""
+    """Return how much of the force error of the known weight is, on average, also found at other presses.
+
+    This is the factor by which the weight's errors of log F (`weight_off`, one per skin) must be multiplied to fit the
+    mean errors of the test presses (`others_off`) best, by least squares.
+    """
     return float(weight_off @ others_off / (weight_off @ weight_off))
 
 
@@ -362,8 +395,9 @@ def score_skin(
 ) -> list[dict[str, Any]]:
     """Score each way (map, universal, network) on a skin.
 
-    The error of forces is also computed after a correction by the known weight. As a diagnosis, it is also computed
-    after a correction by the factor that fits the true forces best.
+    The error of the forces is computed three times: for the estimated forces, after a correction by the known weight,
+    and after multiplication by the factor that fits the true forces best. The last is only a diagnosis, because this
+    factor is unknown in practice.
     """
     rows = []
     (by_way,) = estimate(model, skin, size, [calibration.power])
@@ -383,7 +417,7 @@ def score_skin(
 
 
 def _off_log_N(estimated: Estimate, skin: TestSkin) -> tuple[float, float]:
-    """Return the error log(true / estimated F) for the known weight, and the mean error over test presses."""
+    """Return the error log(true / estimated F) of the known weight, and the mean of this error over test presses."""
     felt = skin.true[:, 2] > LOG_FORCE_MIN_N
     weight = np.log(skin.weight.force_N / estimated.force_N[-1])
     return float(weight), float(np.log(skin.true[felt, 2] / estimated.force_N[:-1][felt]).mean())
@@ -399,7 +433,8 @@ def score_all(
 ) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
     """Score the model with each amount of calibration data, on the scene's skins and on fresh simulated skins.
 
-    With all unlabelled presses, networks trained on fewer skins are also scored. Returns rows by amount of calibration
+    The network that was trained on the largest number of skins is scored with each amount of calibration data. Networks
+    that were trained on fewer skins are scored only with all unlabelled presses. Returns rows by amount of calibration
     data, rows by number of training skins, and further numbers.
     """
     skins = draw(designed, max(section.skins_n), lambda line: say(f"{scene} population: {line}"))

@@ -1,9 +1,10 @@
 """The universal model on recorded boards, calibrated to presses at random places and tested at other places.
 
-Unlabelled presses of a held-out board are drawn at random over all places and forces; the model does not know their
-places. Labels are drawn at random from one part of the places; all tested presses are in the other part. To test
-calibration with one known weight, the only label is a press in the middle of the skin, as if a user had put the weight
-there.
+The unlabelled presses of a held-out board are drawn at random from all places and forces. The model receives their
+field changes, but not their places. The places of the board are divided into two parts. Labels, which are presses with
+known places and forces, are drawn at random from one part, and all tested presses are in the other part. The experiment
+also tests the calibration with one known weight. The only label is then a press in the middle of the skin, as if a user
+had put the weight there.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,15 +49,18 @@ from reskin.universal.model import (
     load_universal,
 )
 
-SPACING_MM = 2.0  # spacing of places; presses are assigned to the nearest place of a grid with this spacing
-MIDDLE_MM = 1.0  # presses with |x| and |y| below this are in the middle of the skin
+SPACING_MM = 2.0  # a press belongs to the nearest place of a grid with this spacing
+MIDDLE_MM = 1.0  # a press is in the middle of the skin if |x| and |y| are below this
+# The two ways to divide the places into a part for labels and a part for tests. The places are either coloured like the
+# squares of a checkerboard, and labels are at places of one colour, or labels are on one half of the skin. Each name
+# says where the tested presses are.
 CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
 WEIGHT = "weight"
 NEAREST = "nearest label"
 
 
 class RandomPresses(Strict):
-    """Section random_presses: numbers of unlabelled presses and of labels, and the number of draws."""
+    """Settings section `random_presses`: numbers of unlabelled presses, numbers of labels, and number of draws."""
 
     presses_n: Annotated[tuple[Annotated[int, Field(ge=1, le=65)], ...], Field(min_length=1)]
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
@@ -65,13 +69,19 @@ class RandomPresses(Strict):
 
 @dataclass(frozen=True)
 class BoardPresses:
-    """The presses of one recorded board in its frame, and all their readings."""
+    """The presses of one recorded board and all their readings, in the coordinates of the board.
+
+    - rest_uT: field without contact.
+    - presses: the presses, each as the mean over its readings.
+    - readings: the readings of all presses.
+    - press_i: index of the press to which each reading belongs.
+    """
 
     board: str
     rest_uT: Float[np.ndarray, " ch"]
-    presses: LabelledPresses  # means over the readings of each press
+    presses: LabelledPresses
     readings: LabelledPresses
-    press_i: Int64[np.ndarray, " f"]  # press of each reading
+    press_i: Int64[np.ndarray, " f"]
 
     @property
     def middle(self) -> Bool[np.ndarray, " m"]:
@@ -79,9 +89,10 @@ class BoardPresses:
         return (np.abs(self.presses.place_mm) < MIDDLE_MM).all(axis=1)
 
     def part(self, split: str, draw_i: int) -> Int64[np.ndarray, " m"]:
-        """For each press, return 1 in the part of the skin for labels, -1 in the other part, and 0 between the parts.
+        """Return the part of the skin to which each press belongs.
 
-        The parts alternate from draw to draw.
+        The value is 1 in the part for labels, -1 in the part for tests, and 0 for presses on the line between two
+        halves. From one draw to the next, the two parts are exchanged.
         """
         if split == CHECKERBOARD:
             colour = np.rint(self.presses.place_mm / SPACING_MM).astype(int).sum(axis=1) % 2
@@ -92,7 +103,13 @@ class BoardPresses:
 
 @dataclass(frozen=True)
 class Draw:
-    """Indices of unlabelled presses, labels in random order, the press of known weight, and the tested readings."""
+    """A random selection of a board's presses.
+
+    - unlabelled: indices of the unlabelled presses.
+    - labels: indices of the presses that may be labels, in random order.
+    - weight: index of the press that serves as the press of the known weight.
+    - tested: indices of the tested readings.
+    """
 
     unlabelled: Int64[np.ndarray, " n"]
     labels: Int64[np.ndarray, " m"]
@@ -181,7 +198,11 @@ def score_draw(
 
 
 def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list[tuple[LabelledPresses, str]]:
-    """Return sets of labels for calibration, with names: each number of labels and, after 0, the known weight."""
+    """Return the sets of labels to which the model is calibrated, each with its name.
+
+    There is one set for each number of labels. If one of these numbers is 0, the set with only the known weight follows
+    it.
+    """
     if max(labels_n, default=0) > len(draw.labels):
         what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
         raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
@@ -200,7 +221,10 @@ def raise_forces(labels: LabelledPresses) -> LabelledPresses:
 
 @dataclass(frozen=True)
 class CalibratedBoard:
-    """A variant calibrated to a board's no-load field and unlabelled presses, and the presses' median misfit."""
+    """A variant of the universal model, calibrated to a board's no-load field and unlabelled presses.
+
+    `misfit` is the median misfit of the unlabelled presses, which tells how well the variant explains this board.
+    """
 
     calibration: PressCalibration
     misfit: float
@@ -233,7 +257,10 @@ class CalibratedBoard:
     def _held_out(
         self, labels: LabelledPresses, powers: LikelihoodPowers, presses_n: int
     ) -> tuple[list[HeldOutLabels], float]:
-        """Evaluate the labels by cross-validation; return the result and the likelihood power that follows from it."""
+        """Evaluate the labels by cross-validation; return the result, and the likelihood power that follows from it.
+
+        The likelihood power is an exponent of the likelihood; a smaller power gives wider intervals.
+        """
         folds = list(self.calibration.held_out(labels))
         power = lower_by_misfit(powers.power_for(presses_n, len(labels), even=False), self.misfit)
         held_out = [([fold.evaluation.combined(power)], fold.labels.place_mm) for fold in folds]
@@ -263,8 +290,9 @@ def calibrate_board(model: PriorModel, data: CalibrationData) -> CalibratedBoard
 def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str, float]:
     """Score the reference method: place and force of the label with the most similar field change.
 
-    Similarity is the Euclidean distance between features: the direction of the field change, and the logarithm of its
-    magnitude. `r2_line_f` is the R² of a constant prediction, the mean force of the labels.
+    Two field changes are similar if their features have a small Euclidean distance. The features are the direction of
+    the field change, and the logarithm of its magnitude. `r2_line_f` is the R² of a constant prediction, which is the
+    mean force of the labels.
     """
     magnitude_uT = [np.linalg.norm(part.db_uT, axis=1, keepdims=True) for part in (labels, tested)]
     pairs = zip((labels, tested), magnitude_uT, strict=True)

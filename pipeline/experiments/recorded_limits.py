@@ -1,9 +1,11 @@
 """Three limits of the recorded boards: rigid registration, shear force, and the smallest detected force.
 
-- *Registration*: a few presses at known places determine a rotation and a shift that correct a model of another board,
-  as in the procedure published for skins that are mounted again. Other presses of the board test the result.
-- *Shear*: the part of the recorded sideways force that can be estimated from the field.
-- *Detection*: the smallest field change and force that can be distinguished from no-load readings.
+- *Registration*: a model that was trained on another board estimates places on this board. A few presses at known
+  places determine a rotation and a shift that correct these estimates, as in the procedure published for skins that are
+  mounted again. The corrected estimates are scored on other presses of the same board.
+- *Shear*: how much of the recorded sideways force can be estimated from the field.
+- *Detection*: the smallest field change, and the smallest force, that can be distinguished from no-load readings
+  (readings without contact).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -56,10 +58,14 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 class RecordedLimits(SectionWithRows):
     """Settings section `recorded_limits`.
 
-    known_n, presses_n, draws_n: numbers of presses at known places, of unlabelled presses, and of random draws of these
-    presses. methods: regressors that are trained on the other boards. folds_n: folds of the cross-validation over
-    places. false_alarm_fraction: fraction of no-load readings above the threshold. detected_fraction: fraction of
-    contact readings that must be above the threshold at the smallest detected force.
+    - known_n: number of presses at known places in each random draw.
+    - presses_n: number of unlabelled presses in each random draw.
+    - draws_n: number of random draws of these presses.
+    - methods: regressors that are trained on the other boards.
+    - folds_n: number of folds in the cross-validation over places.
+    - false_alarm_fraction: fraction of the no-load readings that may be above the threshold of detection.
+    - detected_fraction: a force counts as detected if at least this fraction of the readings in contact are above the
+      threshold.
     """
 
     known_n: Annotated[int, Field(ge=2)]
@@ -85,7 +91,7 @@ def recorded_limits(
     models: Path,
     results: Path,
 ) -> None:
-    """Compute the three limits of the recorded boards of a scene."""
+    """Compute the three limits of a scene's recorded boards (see the module's docstring), and write the results."""
     known = read_known_boards(settings, indentations, folds)
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
     policy = settings.shared_section(FaultPolicy, "faults")
@@ -112,15 +118,19 @@ def recorded_limits(
 
 
 def number_places(place_mm: Float[np.ndarray, "m 2"]) -> Int64[np.ndarray, " m"]:
-    """Number the places of presses from 0; presses at the same point of a grid with `SPACING_MM` are at one place."""
+    """Assign a number to the place of each press, starting at 0.
+
+    Places are rounded to a grid with spacing `SPACING_MM`. Presses at the same point of this grid get the same number.
+    """
     return np.unique(np.rint(place_mm / SPACING_MM), axis=0, return_inverse=True)[1].ravel()
 
 
 # --- Rigid registration with presses at known places ---
 
-# Number of random sets of places. The set with the largest minimum distance between its places is used.
+# Number of random sets of places that are drawn. Of these sets, the one whose two closest places are furthest apart is
+# used.
 CANDIDATES_N = 100
-# Uses of the presses at known places.
+# Names of the ways in which the presses at known places are used.
 UNCHANGED, SHIFT, RIGID, LABELS = "not used", "shift only", "rigid registration", "labels of the model"
 NETWORK = "network of the paper, other board"
 
@@ -138,17 +148,20 @@ class RigidMotion:
         return float(np.degrees(np.arctan2(self.rotation[1, 0], self.rotation[0, 0])))
 
     def apply(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Move places."""
+        """Return the places after the rotation and the shift."""
         return place_mm @ self.rotation.T + self.shift_mm
 
 
 def fit_shift(from_mm: Float[np.ndarray, "m 2"], to_mm: Float[np.ndarray, "m 2"]) -> RigidMotion:
-    """Fit a shift without rotation: the mean difference."""
+    """Fit a shift without rotation, which is the mean difference between `to_mm` and `from_mm`."""
     return RigidMotion(np.eye(2), (to_mm - from_mm).mean(axis=0))
 
 
 def fit_rigid(from_mm: Float[np.ndarray, "m 2"], to_mm: Float[np.ndarray, "m 2"]) -> RigidMotion:
-    """Fit the motion without reflection that minimises the squared distances from moved places to `to_mm` (Kabsch)."""
+    """Fit a rotation and a shift that move the places `from_mm` as close as possible to the places `to_mm`.
+
+    The sum of squared distances is minimised by Kabsch's algorithm. Reflections are excluded.
+    """
     from_middle_mm, to_middle_mm = from_mm.mean(axis=0), to_mm.mean(axis=0)
     left, _, right = np.linalg.svd((to_mm - to_middle_mm).T @ (from_mm - from_middle_mm))
     rotation = left @ np.diag([1.0, np.sign(np.linalg.det(left @ right))]) @ right
@@ -157,7 +170,12 @@ def fit_rigid(from_mm: Float[np.ndarray, "m 2"], to_mm: Float[np.ndarray, "m 2"]
 
 @dataclass(frozen=True)
 class Draw:
-    """Indices of the presses at known places, of the unlabelled presses, and of the tested readings."""
+    """A random division of a board's presses into three sets.
+
+    - known: indices of the presses at known places.
+    - unlabelled: indices of the presses that the model receives without places and forces.
+    - tested: indices of the readings on which the estimates are scored.
+    """
 
     known: Int64[np.ndarray, " k"]
     unlabelled: Int64[np.ndarray, " n"]
@@ -165,10 +183,10 @@ class Draw:
 
 
 def draw_presses(board: BoardPresses, section: RecordedLimits, seed: int, draw_i: int) -> Draw:
-    """Draw presses at known places that are far from each other, and unlabelled presses anywhere.
+    """Draw presses at known places that are far from each other, and unlabelled presses anywhere on the skin.
 
-    Tested readings belong to all presses that are neither unlabelled nor at one of the known places. Raises SchemaError
-    if the board has too few presses.
+    All other presses are tested, except those at one of the known places. Raises SchemaError if the board has too few
+    presses.
     """
     rng = rng_for(seed, "recorded limits", "known presses", board.board, draw_i)
     place_i = number_places(board.presses.place_mm)
@@ -186,10 +204,13 @@ def draw_presses(board: BoardPresses, section: RecordedLimits, seed: int, draw_i
 
 
 class Predictions(NamedTuple):
-    """Predictions by several models of one method: places in the board's frame, for all readings of a board."""
+    """Places that one method predicts for all readings of a board, in the board's coordinates.
+
+    A method may have several models (for example, networks with different seeds); `place_mm` has one array per model.
+    """
 
     method: str
-    place_mm: Sequence[Float[np.ndarray, "f 2"]]  # one array per model
+    place_mm: Sequence[Float[np.ndarray, "f 2"]]
 
 
 def predict_by_regressors(
@@ -224,7 +245,7 @@ def score_draw(
     seed: int,
     draw_i: int,
 ) -> list[dict[str, Any]]:
-    """Score all methods on one draw, with and without the presses at known places."""
+    """Score the estimated places of all methods for one draw, with and without use of the presses at known places."""
     draw = draw_presses(board, section, seed, draw_i)
     true_mm, known_mm = board.readings.place_mm[draw.tested], board.presses.place_mm[draw.known]
     where = {"board": board.board, "draw_i": draw_i}
@@ -244,7 +265,11 @@ def score_draw(
 def score_universal(
     model: PriorModel, board: BoardPresses, draw: Draw, unlabelled: Int64[np.ndarray, " n"]
 ) -> list[dict[str, Any]]:
-    """Score the universal model without known places, with motions fitted to known places, and with labels."""
+    """Score the universal model in four ways of using the presses at known places.
+
+    The presses are not used, or a shift or a rigid motion of the estimated places is fitted to them, or the model is
+    conditioned on them as labels.
+    """
     true_mm, tested_uT = board.readings.place_mm[draw.tested], board.readings.db_uT[draw.tested]
     known, presses_uT = raise_forces(board.presses[draw.known]), board.presses.db_uT[unlabelled]
     calibration = model.calibrate(CalibrationData(board.rest_uT, presses_uT, area_uT=presses_uT))
@@ -256,7 +281,11 @@ def score_universal(
 
 
 def estimate_places(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n 2"]:
-    """Estimate places by map and networks; the estimates do not depend on the likelihood power."""
+    """Estimate places with the universal model.
+
+    The model requires a likelihood power (an exponent that widens or narrows its distribution of places). We pass 1.0,
+    because the estimates themselves do not depend on this power.
+    """
     return model.estimate(db_uT, [1.0])[0].place_mm
 
 
@@ -266,10 +295,11 @@ def score_motions(
     estimated_mm: Float[np.ndarray, "k 2"],
     known_mm: Float[np.ndarray, "k 2"],
 ) -> list[dict[str, Any]]:
-    """Score places of tested readings, as they are and after motions fitted from estimated to known places of presses.
+    """Score the estimated places of the tested readings, before and after they are moved by a shift or a rigid motion.
 
-    `rigid_limit_mm2` is the smallest mean squared error that a rigid motion can reach, which is the error of the motion
-    fitted to the tested readings themselves.
+    The motions are fitted to the presses at known places: they move the estimated places `estimated_mm` of these
+    presses to the known places `known_mm`. The score `rigid_limit_mm2` is the smallest mean squared error that any
+    rigid motion can reach. It is computed by fitting a motion to the tested readings themselves.
     """
     best_mm = fit_rigid(place_mm, true_mm).apply(place_mm)
     limit = {"rigid_limit_mm2": float(((best_mm - true_mm) ** 2).mean())}
@@ -286,7 +316,7 @@ GROUP = ("method", "presses_n", "known")
 
 
 def summarise_draws(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Average scores over models and draws, then summarise them over boards.
+    """Average scores over models and draws, then compute statistics over boards.
 
     `sd_draws_pct` is the standard deviation of the accuracy over draws, averaged over boards.
     """
@@ -314,9 +344,13 @@ OTHER_BOARD, OTHER_PLACES = "other board", "other places of the same board"
 
 @dataclass(frozen=True)
 class ForcePresses:
-    """Means over the readings of each press: place as labelled, force on the skin (Fx, Fy, Fz), and field change.
+    """The presses of all boards, with one row per press; values are means over the readings of the press.
 
-    sd_N is the standard deviation of each force component within a press.
+    - board, capture: board and capture (recorded file) that contain the press.
+    - place_mm: place, as labelled in the recording.
+    - force_N: components Fx, Fy and Fz of the force on the skin.
+    - sd_N: standard deviation of each force component over the readings of the press.
+    - db_uT: field change.
     """
 
     board: np.ndarray
@@ -328,7 +362,11 @@ class ForcePresses:
 
 
 def force_presses(rows: Rows) -> ForcePresses:
-    """Average the readings of each press; `rows` have `SHEAR_TARGETS`. Raises SchemaError for an unknown force."""
+    """Average the readings of each press.
+
+    The targets of `rows` must be `SHEAR_TARGETS` (place and three force components). Raises SchemaError if a force is
+    unknown.
+    """
     if np.isnan(rows.target).any():
         raise SchemaError("recorded_limits: readings without Fx, Fy or Fz. Remove the experiment from the scene.")
     _, first, press_i = np.unique(rows.indentation, return_index=True, return_inverse=True)
@@ -339,7 +377,7 @@ def force_presses(rows: Rows) -> ForcePresses:
 
 
 def evaluate_shear(rows: Rows, section: RecordedLimits, seed: int) -> dict[str, Any]:
-    """Describe the recorded forces, and score regressors of the three force components."""
+    """Describe the recorded forces, and score regressors that estimate the three force components."""
     presses = force_presses(rows)
     lines = [describe_forces(presses, str(capture)) for capture in np.unique(presses.capture)]
     scored = []
@@ -359,13 +397,16 @@ def evaluate_shear(rows: Rows, section: RecordedLimits, seed: int) -> dict[str, 
 
 
 def shear_regressors(methods: Mapping[str, Classical]) -> list[tuple[str, Classical | None]]:
-    """List the pairs of inputs and regressor; regressor None predicts the mean of the training presses."""
+    """List the pairs of an input and a regressor that are compared.
+
+    A regressor of None stands for the mean force of the training presses, which needs no input.
+    """
     first = next(iter(methods.values()))
     return [(CONSTANT, None), *((FIELD, method) for method in methods.values()), (PLACE_AND_FORCE, first)]
 
 
 def describe_forces(presses: ForcePresses, capture: str) -> dict[str, Any]:
-    """Return mean, standard deviation and size of the forces of one recording."""
+    """Describe the forces of one recording: mean and standard deviation of each component, and sideways / normal."""
     own = presses.capture == capture
     force_N, sd_N = presses.force_N[own], presses.sd_N[own]
     ratio = np.hypot(force_N[:, 0], force_N[:, 1]) / force_N[:, 2]
@@ -410,7 +451,10 @@ def predict_forces(
 def score_forces(
     presses: ForcePresses, own: Int64[np.ndarray, " a"], predicted: Float[np.ndarray, "a 3"], inputs: str
 ) -> dict[str, float]:
-    """Return R² of each force, over all presses of a board and within its recordings."""
+    """Return R² of each force component of a board, in two versions.
+
+    `r2_*` compares all presses of the board. `r2_within_*` compares presses only with presses of the same recording.
+    """
     scores = {}
     _, capture_i = np.unique(presses.capture[own], return_inverse=True)
     for i, name in enumerate(FORCES):
@@ -424,10 +468,11 @@ def score_forces(
 def explained(
     true: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], group: Int64[np.ndarray, " n"]
 ) -> float:
-    """Return R²: 1 - mean squared error / variance.
+    """Return R², which is 1 - mean squared error / variance.
 
-    If there are several groups, the mean over each group is subtracted from true values and errors. If there is one
-    group, errors keep their mean, so that R² is negative if the prediction is worse than the mean of the true values.
+    If there are several groups, the mean over each group is first subtracted from the true values of the group and from
+    the errors of the group. If there is only one group, the mean error is not subtracted. R² is then negative if the
+    prediction is worse than the mean of the true values.
     """
     error = predicted - true
     if group.max() > 0:
@@ -452,13 +497,17 @@ def summarise_shear(scored: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]
 # --- Smallest detected force ---
 
 EACH, PREVIOUS, START = "before each press", "before the previous press", "at the start of the recording"
-BASELINES = (EACH, PREVIOUS, START)  # names of no-load readings that are subtracted
-BY_RATE, BY_LIVE = "set by false alarms", "as in reskin live"  # rules for the threshold
+BASELINES = (EACH, PREVIOUS, START)  # baselines (subtracted no-load readings), named by when they were taken
+BY_RATE, BY_LIVE = "set by false alarms", "as in reskin live"  # names of the rules that set the threshold
 
 
 @dataclass(frozen=True)
 class Recording:
-    """No-load readings and readings in contact of one capture; `press_i` and `noload_press_i` count its presses."""
+    """The no-load readings and the readings in contact of one capture.
+
+    `press_i` is the number of the press to which each reading in contact belongs. `noload_press_i` is the number of the
+    press before which each no-load reading was taken.
+    """
 
     board: str
     noload_press_i: Int64[np.ndarray, " a"]
@@ -470,7 +519,10 @@ class Recording:
 
 
 def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Recording:
-    """Combine the readings of a capture with its single no-load readings; `readings` have only the means of these."""
+    """Combine the readings of a capture with its individual no-load readings, which are read from the raw file.
+
+    `readings` contains only the mean of the no-load readings before each press.
+    """
     header = read_header(raw)
     if header.layout != "lab":
         what = f"capture {readings.capture}: layout {header.layout} has no single no-load readings"
@@ -486,8 +538,10 @@ def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Record
 class Changes(NamedTuple):
     """Field changes relative to one kind of baseline.
 
-    Thresholds are set on the no-load readings before presses with odd numbers (`setting`), and verified on the no-load
-    readings before presses with even numbers (`verifying`). `contact` and `force_N` belong to the readings in contact.
+    - setting: no-load readings before presses with odd numbers, which set the thresholds.
+    - verifying: no-load readings before presses with even numbers, which verify the thresholds.
+    - contact: readings in contact.
+    - force_N: force of each reading in contact.
     """
 
     setting: Float[np.ndarray, "a ch"]
@@ -499,9 +553,12 @@ class Changes(NamedTuple):
 def changes(recording: Recording, baseline: str) -> Changes:
     """Subtract a baseline from the readings of a recording.
 
-    If each press has its own baseline, the baseline of a no-load reading is the mean of the press's other no-load
-    readings, so that the reading is not part of its own baseline. No-load readings of presses with only one no-load
-    reading are then omitted. For other kinds of baseline, the first press is omitted.
+    With baseline `EACH`, every press has its own baseline: the mean of the no-load readings before the press. From a
+    no-load reading, the mean of only the other no-load readings before the same press is subtracted, so that the
+    reading is not compared with itself. This is impossible if a press has only one no-load reading, so this reading is
+    omitted.
+
+    With the other baselines, the first press is omitted, because no earlier press provides a baseline.
     """
     mean_uT = mean_by(recording.noload_press_i, recording.noload_uT)
     base_uT = {EACH: mean_uT, PREVIOUS: np.roll(mean_uT, 1, axis=0), START: np.broadcast_to(mean_uT[0], mean_uT.shape)}
@@ -521,23 +578,26 @@ def join_changes(parts: Sequence[Changes]) -> Changes:
 
 
 def live_threshold(noload_uT: Float[np.ndarray, "a ch"]) -> float:
-    """Return the threshold of |dB| by the rule of `reskin live`: median |dB| + `CONTACT_SDS` times the noise."""
+    """Return the threshold of |dB| that `reskin live` would set: median of |dB| plus `CONTACT_SDS` times the noise.
+
+    Both are computed from no-load readings; the noise is their root mean square over readings and channels.
+    """
     return float(np.median(magnitude(noload_uT)) + CONTACT_SDS * np.sqrt((noload_uT**2).mean()))
 
 
 def magnitude(db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, " f"]:
-    """Return |dB| over all channels."""
+    """Return |dB|, the Euclidean norm over all channels, of each reading."""
     return np.asarray(np.linalg.norm(db_uT, axis=1))
 
 
 def needed_changes_uT(
     direction: Float[np.ndarray, "m ch"], noise_uT: Float[np.ndarray, "r ch"], threshold_uT: float
 ) -> Float[np.ndarray, "m r"]:
-    """For each press and each noise, return the size of the field change that a reading needs to exceed the threshold.
+    """Return how large a field change must be for a reading to exceed the threshold, for each press and each noise.
 
-    A reading is u s + n, where u is the unit vector of a press's field change, s the size and n the recorded noise.
-    |u s + n| is above the threshold for all s above the larger root of a quadratic equation. If there is no positive
-    root, the returned size is 0.
+    A reading is modelled as s u + n, where u is the direction (unit vector) of a press's field change, s is the size of
+    the field change, and n is the noise, which is a recorded no-load reading. The norm |s u + n| exceeds the threshold
+    for all s above the larger root of a quadratic equation. This root is returned, or 0 if no root is positive.
     """
     along_uT = direction @ noise_uT.T
     beyond = along_uT**2 + threshold_uT**2 - (noise_uT**2).sum(axis=1)
@@ -547,9 +607,11 @@ def needed_changes_uT(
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """Power law |dB| = a F^b of force F, with one exponent b for a board and one factor a for each of its places.
+    """Power law |dB| = a F^b, which gives the size of the field change that a force F causes.
 
-    r2 is the explained fraction of the variance of log |dB| among the presses at a place.
+    - exponent: b, which is the same at all places of a board.
+    - factor_uT: a, with one value for each place of the board.
+    - r2: fraction of the variance of log |dB| among the presses at the same place that the power law explains.
     """
 
     exponent: float
@@ -559,7 +621,10 @@ class PowerLaw:
     def force_N(
         self, change_uT: Float[np.ndarray, "m r"], place_i: Int64[np.ndarray, " m"]
     ) -> Float[np.ndarray, "m r"]:
-        """Return the forces that cause field changes at numbered places; NaN if the exponent is not positive."""
+        """Return the forces that cause field changes of size `change_uT` at the places with numbers `place_i`.
+
+        The forces are NaN if the exponent is not positive, because the power law then has no inverse.
+        """
         if self.exponent <= 0:
             return np.full(change_uT.shape, np.nan)
         return np.asarray((change_uT / self.factor_uT[place_i, None]) ** (1 / self.exponent))
@@ -568,7 +633,7 @@ class PowerLaw:
 def fit_power_law(
     place_i: Int64[np.ndarray, " m"], force_N: Float[np.ndarray, " m"], change_uT: Float[np.ndarray, " m"]
 ) -> PowerLaw:
-    """Fit the power law to presses at numbered places by least squares of log |dB|."""
+    """Fit the power law to presses by least squares of log |dB|; `place_i` is the number of each press's place."""
     logs = np.log(np.column_stack([force_N, change_uT]))
     mean = mean_by(place_i, logs)
     log_N, log_uT = (logs - mean[place_i]).T
@@ -582,9 +647,9 @@ def fit_power_law(
 def evaluate_detection(
     recordings: Sequence[Recording], section: RecordedLimits
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compute thresholds, false alarms, detected presses and the smallest forces of each board.
+    """Compute thresholds, false alarms, detected readings and the smallest detected forces of each board.
 
-    Returns the numbers and the data of the figure.
+    Returns the numbers for the tables, and the data for the figure.
     """
     rows, by_force, laws, drawn = [], [], [], {}
     for board in sorted({recording.board for recording in recordings}):
@@ -613,7 +678,13 @@ def evaluate_detection(
 
 @dataclass(frozen=True)
 class ContactPresses:
-    """Presses of a board: number of the place, mean force, size and direction of the mean field change."""
+    """The presses of a board, each averaged over its readings.
+
+    - place_i: number of the place of each press.
+    - force_N: mean force of each press.
+    - change_uT: size of the mean field change of each press.
+    - direction: unit vector of the mean field change of each press.
+    """
 
     place_i: Int64[np.ndarray, " m"]
     force_N: Float[np.ndarray, " m"]
@@ -621,10 +692,11 @@ class ContactPresses:
     direction: Float[np.ndarray, "m ch"]
 
     def proportional_N(self, change_uT: Float[np.ndarray, "m r"], law: PowerLaw) -> Float[np.ndarray, "m r"]:
-        """Return forces under the assumption that |dB| is proportional to the force below the weakest press at a place.
+        """Return the forces that cause field changes of size `change_uT`, without using the power law for weak forces.
 
-        For larger field changes than that of the weakest press, which are in the recorded range, the power law is used
-        instead.
+        Below the weakest press that was recorded at a place, |dB| is assumed to be proportional to the force. Field
+        changes larger than the field change of this weakest press are in the recorded range, where the power law is
+        used.
         """
         order = np.lexsort((self.force_N, self.place_i))
         weakest = order[np.unique(self.place_i[order], return_index=True)[1]][self.place_i]
@@ -642,7 +714,11 @@ class ContactPresses:
 
 
 def contact_presses(recordings: Sequence[Recording]) -> ContactPresses:
-    """Average the readings of each press of a board, relative to the no-load reading before it."""
+    """Average the readings of each press of a board.
+
+    Field changes are relative to the no-load reading before the press. Presses whose mean force is not positive are
+    left out.
+    """
     means = []
     for recording in recordings:
         contact_uT = changes(recording, EACH).contact
@@ -657,9 +733,10 @@ def contact_presses(recordings: Sequence[Recording]) -> ContactPresses:
 def evaluate_threshold(
     parts: Changes, threshold_uT: float, presses: ContactPresses, law: PowerLaw, fraction: float
 ) -> dict[str, float]:
-    """Return false alarms and detected readings for a threshold, and the field change and force needed to exceed it.
+    """Evaluate one threshold: percentages of false alarms and of detected readings, and the least detected force.
 
-    All pairs of a recorded press and a no-load reading have equal weight. Results that do not exist are left out.
+    The field change and the forces that are needed to exceed the threshold are quantiles over all pairs of a recorded
+    press and a no-load reading, with equal weights. Results that do not exist (NaN) are left out.
     """
     needed_uT = needed_changes_uT(presses.direction, parts.verifying, threshold_uT)
     detected = np.asarray(magnitude(parts.contact) > threshold_uT)
@@ -677,8 +754,8 @@ def evaluate_threshold(
 def smallest_force_N(force_N: Float[np.ndarray, " f"], detected: Bool[np.ndarray, " f"], fraction: float) -> float:
     """Return the smallest recorded force at and above which at least `fraction` of the readings are detected.
 
-    The fraction at a force is computed from the readings between this force and twice this force. Returns NaN if there
-    is no such force.
+    For each recorded force, the fraction is computed from the readings between this force and twice this force. Returns
+    NaN if the fraction is too small even at the largest force.
     """
     order = np.argsort(force_N, kind="stable")
     force_N, before_n = force_N[order], np.concatenate([[0], np.cumsum(detected[order])])
@@ -691,7 +768,7 @@ def smallest_force_N(force_N: Float[np.ndarray, " f"], detected: Bool[np.ndarray
 
 
 def detected_by_force(by_baseline: Mapping[str, Changes], limits_uT: Mapping[str, float]) -> Iterator[dict[str, Any]]:
-    """Yield the percentage of detected readings in ranges of the force, each up to twice its lower end."""
+    """Yield the percentage of detected readings in each range of the force; each range ends at twice its lower end."""
     least_N = min(float(parts.force_N[parts.force_N > 0].min()) for parts in by_baseline.values())
     most_N = max(float(parts.force_N.max()) for parts in by_baseline.values())
     for power in range(int(np.floor(np.log2(least_N))), int(np.floor(np.log2(most_N))) + 1):
@@ -711,7 +788,7 @@ def detected_by_force(by_baseline: Mapping[str, Changes], limits_uT: Mapping[str
 
 
 def in_range(force_N: Float[np.ndarray, " f"], low_N: float, high_N: float) -> Bool[np.ndarray, " f"]:
-    """Mark forces from `low_N`, below `high_N`."""
+    """Return which forces are at least `low_N` and below `high_N`."""
     return np.asarray((force_N >= low_N) & (force_N < high_N))
 
 
@@ -769,7 +846,9 @@ LAW_MEANING = (
     "presses. R²: explained variance of log |dB| between the presses of a place."
 )
 IMPLIED = {"power_law_N": "force by power law, N", "proportional_N": "force in proportion, N"}
-ALARMS_MAX = 10  # forces are shown only if false alarms are at most this multiple of the intended ones
+# A table shows the smallest forces only if the fraction of false alarms is at most this multiple of the intended
+# fraction.
+ALARMS_MAX = 10
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -800,14 +879,17 @@ def tabulate_registration(numbers: Mapping[str, Any], source: str) -> pd.DataFra
 
 
 def show_force(force_N: float | None, least_N: float, mark: str) -> str:
-    """Write a force; `mark` is the format for forces that are not above the smallest recorded force."""
+    """Format a force for a table.
+
+    A force that is not above `least_N`, the smallest recorded force, is written in the format `mark`.
+    """
     if force_N is None:
         return "–"
     return mark.format(f"{force_N:.3g}") if force_N <= least_N else f"{force_N:.3g}"
 
 
 def force_line(line: Mapping[str, Any]) -> dict[str, Any]:
-    """Write the forces of one recording as cells of a table."""
+    """Return the cells of the table of forces for one recording."""
     cells = {"board": line["board"], "recording": line["recording"], "presses": line["presses_n"]}
     for name in FORCES:
         force = line[name]
@@ -816,7 +898,7 @@ def force_line(line: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def shear_line(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Write R² of one regressor as cells of a table."""
+    """Return the cells of the table of R² for one regressor."""
     cells = {"trained on": row["trained_on"], "input": row["inputs"], "regressor": row["method"]}
     columns = {f"r2_{name}": f"R² of {name}" for name in FORCES}
     columns |= {f"r2_within_{name}": f"R² of {name} within recordings" for name in (FX, FY)}
@@ -824,7 +906,7 @@ def shear_line(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate thresholds and smallest forces, detected readings by force, and the power laws."""
+    """Return three tables: thresholds with smallest forces, detected readings by range of force, and power laws."""
     detection, fraction = numbers["detection"], numbers["detected_fraction"]
     alarm_max_pct = 100 * ALARMS_MAX * numbers["false_alarm_fraction"]
     least_N = {law["board"]: law["reading_min_N"] for law in detection["laws"]}
@@ -870,7 +952,10 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Plot the field change of each press against its force, with the thresholds and both extrapolations."""
+    """Plot the field change of each press against the force, with the thresholds and two extrapolations.
+
+    Both extrapolate to weaker forces: one by the power law, the other by assuming proportionality to the force.
+    """
     with drawing(3.8 * len(drawn), 4.4) as figure:
         panels = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
         for axes, (board, of_board) in zip(panels, drawn.items(), strict=True):

@@ -2,11 +2,13 @@
 
 The methods use the folds and test rows of experiment `labels`:
 
-- Regressors and networks trained on known boards. The inputs are aligned with the new board by its unlabelled pokes, or
-  by a few labelled pokes.
-- The universal model, and the inversion of a fitted physical model. Both receive unlabelled pokes of the new skin, no
-  pokes, or pokes of another skin.
-- Alarms, which test whether the residual of a fitted model detects that readings come from a foreign board.
+- Regressors and networks that are trained on known boards. Fields of the new board differ from fields of known boards.
+  This difference is reduced with unlabelled pokes of the new board (presses at unknown places), or with a few labelled
+  pokes.
+- The universal model, and the inversion of a physical model that is fitted to unlabelled pokes. Both methods receive
+  unlabelled pokes of the new skin, or no pokes, or (as a control) pokes of another skin.
+- Alarms: the residual of a fitted physical model may show that readings come from a foreign board, which is a board to
+  which the model was not fitted.
 """
 
 import time
@@ -61,14 +63,22 @@ from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
 from reskin.universal.law import Setup
 from reskin.universal.model import PriorModel
 
-OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # which unlabelled pokes a method receives
-Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
+OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # the skin whose unlabelled pokes a method receives
+Key = tuple[str, str, int]  # name of a method, one of OWN, NONE and FOREIGN, and number of labels
 Point = dict[str, Any]  # scores of one method on one fold
-RNG = "rivals"  # name of the random streams, which is an earlier name of this experiment
+# Name of the random streams. It is an earlier name of this experiment, which is kept so that results do not change.
+RNG = "rivals"
 
 
 class ReferenceMethods(SectionWithRows):
-    """Settings section `reference_methods`: numbers of labels, models of known boards, and fraction of false alarms."""
+    """Settings section `reference_methods`.
+
+    - labels_n: numbers of labelled pokes with which methods are tested.
+    - methods: regressors that are trained on known boards.
+    - recipe: recipe of the network that is trained on known boards.
+    - adversarial_weight: weight of the adversarial term in the loss of this network.
+    - false_alarm_fraction: fraction of the readings of the right board for which an alarm may be raised.
+    """
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
     methods: dict[Name, Classical]
@@ -125,7 +135,7 @@ def reference_methods(
 
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
-    """Return the fold of the next board in the same random draw, which provides the pokes of another skin."""
+    """Return the fold of another board in the same random draw, whose pokes serve as the pokes of another skin."""
     same_draw = [candidate for candidate in folds if candidate.draw_i == fold.draw_i]
     names = [candidate.name for candidate in same_draw]
     return same_draw[(names.index(fold.name) + 1) % len(same_draw)]
@@ -144,7 +154,7 @@ def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float
 def point(
     data: SceneData, fold: Fold, predicted: Float[np.ndarray, "b 3"], *, method: str, pokes: str, labels_n: int = 0
 ) -> Point:
-    """Score predictions (x and y in the labels' axes, and the force F) for the test rows of a fold."""
+    """Score predictions for the test rows of a fold; the columns are x and y in the labels' axes, and the force F."""
     keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": fold.board, "seed_i": fold.draw_i}
     return keys | {"scores": score_test(data, fold.test, predicted.astype(np.float32))}
 
@@ -152,7 +162,8 @@ def point(
 def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict[str, Any]]:
     """Summarise the scores of every method over boards.
 
-    Methods that have a control in `controls` also get the difference from this control, paired by board.
+    If `controls` names a control of a method, the summary of the method also contains the difference between the method
+    and its control, paired by board.
     """
     table = tidy([], {"rivals": points})
     table["labels_n"] = table["labels_n"].astype(int)
@@ -170,7 +181,7 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
 
 # --- Models of known boards with aligned inputs ---
 
-EVERY_N = 10  # only every tenth reading of a labelled poke is a training row, as its readings differ only by noise
+EVERY_N = 10  # a labelled poke's readings differ only by noise, so only every tenth of them becomes a training row
 SAME_MM = 0.5  # pokes closer to each other than this are at one place
 ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
@@ -178,10 +189,13 @@ ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long 
 
 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
-    """Score a regressor that was fitted to known boards on a new board, in several variants.
+    """Score a regressor on a new board, in several variants of using the pokes of this board.
 
-    The variants are the regressor as it is, alignment of the inputs with the new board by unlabelled pokes, direct
-    standardisation of the inputs by labelled pokes, and labelled pokes as additional training rows.
+    The variants are:
+    - the regressor, fitted to known boards, without any use of pokes,
+    - alignment of the inputs with the new board by means of unlabelled pokes,
+    - direct standardisation, which maps the inputs to those of known boards by means of labelled pokes,
+    - labelled pokes as additional training rows of the regressor.
     """
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
     known, new, test = (view(rows.db_uT[side]) for side in (fold.train, fold.pool, fold.test))
@@ -206,11 +220,12 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
 
 
 def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) -> Float[np.ndarray, "b ch"]:
-    """Map the test fields of a new board to fields that known boards would read (direct standardisation).
+    """Map the test fields of a new board to the fields that known boards would read (direct standardisation).
 
-    The linear map is fitted by ridge regression to pairs of fields: the field of a labelled poke of the new board, and
-    the field of known boards at the same place and force. All pairs have the same weight, whatever the strength of the
-    poke. The ridge penalty is chosen on the same pairs.
+    The map is linear, and is fitted by ridge regression to pairs of fields. A pair consists of the field of a labelled
+    poke on the new board, and the mean field of known boards at the same place and force. Both fields are divided by
+    the size of the first, so that weak and strong pokes have the same weight. The ridge penalty is chosen on the same
+    pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     paired = np.isfinite(old_uT).all(axis=1)
@@ -229,8 +244,9 @@ def pairs_uT(
 ) -> Float[np.ndarray, "m ch"]:
     """Return the mean field of the known boards at the place and force of each poke of a new board.
 
-    A row is NaN if no known board was poked at this place. Between the forces F that were recorded on a board at the
-    place, channels are interpolated linearly in log F. Beyond these forces, channels are constant.
+    Pokes of known boards have other forces F than the poke of the new board. The field of a known board at the force
+    of the new board's poke is therefore interpolated linearly in log F, channel by channel. Beyond the recorded forces,
+    it is constant. A row is NaN if no known board was poked at this place.
     """
     old_uT = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
@@ -300,7 +316,7 @@ def train_until_converged(
 
 
 def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]) -> dict[Key, Key]:
-    """Return the control of each method with aligned inputs: the same method without alignment."""
+    """Return the control of each method with aligned inputs, which is the same method without alignment."""
     controls: dict[Key, Key] = {(ADVERSARIAL, OWN, 0): (CONTROL, NONE, 0)}
     for method in methods.values():
         name = f"{method.title} ({method.inputs})"
@@ -313,7 +329,8 @@ def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]
 
 INVERSION = "physics inversion"
 CENTRED = f"{INVERSION}, centred"
-UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, and both combined
+# The two estimators of the universal model, a map of simulated fields and a network, and the combination of both.
+UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")
 ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 
@@ -401,7 +418,10 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the controls of methods without pokes, or with another skin's pokes: the methods with the skin's pokes."""
+    """Return the control of each method that receives no pokes or the pokes of another skin.
+
+    The control is the same method with pokes of the tested skin itself.
+    """
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
@@ -413,7 +433,8 @@ OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, which are simulated by changing the readings of a board as a wrong plug, driver or skin would.
+# Foreign boards. They are simulated: the readings of a board are changed as a wrong plug, driver or skin would change
+# them.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -425,7 +446,12 @@ ByBoard = Mapping[str, Float[np.ndarray, "_"]]  # one value per reading, by boar
 
 @dataclass(frozen=True)
 class Board:
-    """Field at rest, unlabelled pokes and test readings of a board, in its chips' axes."""
+    """Readings of a board, in the axes of its chips.
+
+    - rest_uT: field without contact.
+    - pool_uT: field changes of unlabelled pokes.
+    - tested_uT: field changes of the test readings.
+    """
 
     rest_uT: Float[np.ndarray, "1 ch"]
     pool_uT: Float[np.ndarray, "m ch"]
@@ -438,11 +464,12 @@ class Board:
 
 
 def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Evaluate the residual of the inversion, both as an alarm for foreign boards and as a flag for wrong estimates.
+    """Evaluate the residual of the inversion as an alarm for foreign boards, and as a flag for wrong estimates.
 
-    A physical model is fitted to the unlabelled pokes of each board's first fold. The model is inverted for test
-    readings of this board, and of foreign boards. The limits are set such that `fraction` is the fraction of false
-    alarms.
+    A physical model is fitted to the unlabelled pokes of each board's first fold. It is then inverted for test readings
+    of this board and of foreign boards, which gives a residual for each reading. An alarm is raised if the residual is
+    above the limit of the board. This limit is set with all other boards, whose own models are fitted to them: a
+    fraction `fraction` of their residuals is above the limit.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
@@ -486,16 +513,16 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
-    """Return, for each board, the limit that a fraction `fraction` of the readings of all other boards exceeds."""
+    """Return a limit for each board, which a fraction `fraction` of the readings of all other boards exceeds."""
     other_values = {board: [values for other, values in value.items() if other != board] for board in value}
     return {board: float(np.quantile(np.concatenate(values), 1 - fraction)) for board, values in other_values.items()}
 
 
 def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Summarise percentage of alarms, area under the ROC curve, and median residual over boards.
+    """Summarise over boards the percentage of alarms, the area under the ROC curve, and the median residual.
 
-    `residuals` are the residuals of the evaluated readings. `own_residuals` are the residuals of each board's own
-    readings, which are the negatives of the ROC curve.
+    `residuals` are the residuals of the evaluated readings, which are the positives of the ROC curve. `own_residuals`
+    are the residuals of each board's own readings, which are the negatives.
     """
     by_board = {
         "alarm_pct": [100 * float((values > limits[board]).mean()) for board, values in residuals.items()],
@@ -527,7 +554,10 @@ def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]]
 def flag_by_universal(
     known: KnownBoards, nominal: Variant, folds: Sequence[Fold], fraction: float
 ) -> list[dict[str, Any]]:
-    """Score two flags of the universal model: its standard deviation of the place, and the misfit of its map."""
+    """Score two quantities of the universal model as flags for wrong estimates.
+
+    The quantities are the standard deviation that the model states for the place, and the misfit of its map.
+    """
     sd_mm, misfit, off_mm = {}, {}, {}
     for board, fold in first_folds(folds).items():
         rows, test = known.data.rows, fold.test[::TESTED_EVERY_N]
@@ -543,7 +573,8 @@ def flag_by_universal(
 # --- Tables ---
 
 DASH = "–"
-# What each method can and cannot correct in principle; the other columns of the table show whether it helps.
+# What each method can and cannot correct in principle. Whether a method helps in practice is in the table's other
+# columns.
 WHY = {
     "channels matched": "corrects the gain of each channel; a shifted or rotated skin mixes channels, and standard "
     "deviations also differ if forces differ",

@@ -1,4 +1,11 @@
-"""Errors and run times of quadrature rules for the magnetised skin, and of integrators for the skin's relaxation."""
+"""Errors and run times of two numerical methods of the simulator.
+
+- *Quadratures*: the field of a magnetised skin is an integral over its volume. A quadrature rule replaces the integral
+  by a sum over nodes, which are points with weights in the skin.
+- *Integrators*: the force on the skin relaxes while a press is held. Its differential equation is integrated over time.
+
+The experiment compares the simulator's methods with other methods.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +48,10 @@ Changes = Float[np.ndarray, "n k 3"]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A prepared computation: `call` computes dB of all indentations of a trial, with `nodes_n` nodes."""
+    """A computation that is ready to be run and timed.
+
+    `call` computes dB (the change of the field) of all indentations of a trial, as a sum over `nodes_n` nodes.
+    """
 
     nodes_n: int
     call: Callable[[], Changes]
@@ -49,7 +59,11 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Trial:
-    """One skin on its board, and its commanded indentations, sorted by depth."""
+    """One simulated skin on its board, and the indentations of this skin, sorted by depth.
+
+    `depths_mm` are the depths to which the rig is told to press. `pokes_m` has a row (x, y, depth) for each
+    indentation.
+    """
 
     board: Board
     design: SkinDesign
@@ -62,21 +76,25 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Indentations(Strict):
-    """Places, relative to the skin's centre, and depths of indentations; each place is pressed to each depth."""
+    """Places and depths of indentations.
+
+    Each place is pressed to each depth. Places are relative to the skin's centre.
+    """
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # method name of the row that bounds the reference's own error from above
-CANDIDATES = "Gauss in z"  # method name of the rules that the simulator can use (`magnet.place_nodes`)
+# Name of the method in the row for the reference. The error in this row is an upper bound of the reference's own error.
+REFERENCE = "reference"
+CANDIDATES = "Gauss in z"  # name of the method whose rules the simulator can use (`magnet.place_nodes`)
 ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method with one setting, in one study."""
+    """A row of the results, for one method with one setting in one study."""
 
     study: str
     method: str
@@ -116,10 +134,13 @@ class TimedCall:
 
 @dataclass(frozen=True)
 class Choice:
-    """The cheapest acceptable quadrature rule, and the rule that the scene uses.
+    """The cheapest acceptable quadrature rule, compared with the rule that the scene uses.
 
-    The first three fields describe the cheapest acceptable rule, and are None if no rule is acceptable. `used_nodes_n`
-    and `used_error` are None if the rule in use was not tried. `differs` says whether the two rules differ.
+    - setting, nodes_n, error: name, number of nodes and error of the cheapest acceptable rule; None if no rule is
+      acceptable.
+    - used_setting: name of the rule that the scene uses.
+    - used_nodes_n, used_error: its number of nodes and its error; None if this rule was not tried.
+    - differs: whether the two rules differ.
     """
 
     setting: str | None
@@ -137,10 +158,10 @@ def rule_name(rule: Quadrature) -> str:
 
 
 def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
-    """Choose the rule with the fewest nodes among those whose error at the worst depth is below `error_max`.
+    """Choose the rule with the fewest nodes among the rules whose error at the worst depth is below `error_max`.
 
-    The run time is proportional to the number of nodes. Unlike the measured run time, the number of nodes does not vary
-    from one run of the experiment to the next.
+    The number of nodes replaces the run time as the cost of a rule. The run time is proportional to it but, unlike the
+    number of nodes, varies from one run of the experiment to the next.
     """
     candidates = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in candidates.values() if row.error is not None and row.error < error_max]
@@ -187,8 +208,8 @@ Layers = Annotated[int, Field(ge=1, le=100)]
 class Quadratures(Indentations):
     """Settings of the study of quadratures.
 
-    `skins_n` is the number of skins. `rules` maps each method to its rules, as pairs of cell size in mm and number of
-    layers.
+    - skins_n: number of skins on which the rules are compared.
+    - rules: the rules of each method. A rule is a pair of the cell size in mm and the number of layers.
     """
 
     skins_n: Annotated[int, Field(ge=1, le=100)]
@@ -201,11 +222,16 @@ class Quadratures(Indentations):
 
 @dataclass(frozen=True)
 class Reference:
-    """Gauss rules along x, y and z: the finer rule is the reference, and the coarser rule bounds the reference's error.
+    """The reference with which all quadrature rules are compared.
 
-    Magnetised boxes that move with the material would be an obvious reference, but rigid boxes overlap where the skin
-    is compressed. The field of such boxes converges to this reference with the square of the cell size. Its difference
-    from the reference is 5-9 % at 0.4 mm x 20 layers, and below 1 % when extrapolated to cells of size 0.
+    The reference is a fine Gauss rule along x, y and z (`finer`). The difference between a coarser Gauss rule
+    (`coarser`) and the reference is an upper bound of the reference's own error. Both rules have `per_cell_n` nodes per
+    cell along x, and as many along y.
+
+    Magnetised boxes that move with the material would be a more obvious reference, but rigid boxes overlap where the
+    skin is compressed. As the boxes become smaller, their field converges to the field of this reference; the
+    difference is proportional to the square of the cell size. It is 5-9 % at 0.4 mm x 20 layers, and below 1 % when it
+    is extrapolated to cells of size 0.
     """
 
     coarser: Quadrature
@@ -221,8 +247,8 @@ def study_quadratures(
 ) -> tuple[list[Precision], list[TimedCall]]:
     """Compare every rule of every method with the reference on all trials.
 
-    Returns one row per rule, and the calls to time, which compute dB of the first trial. For each depth, `parts` of a
-    row contains the largest error of any skin; `error` is the largest value in `parts`.
+    Returns one row per rule, and the calls that are to be timed, which compute dB of the first trial. In a row, `parts`
+    contains the largest error of any skin for each depth, and `error` is the largest value in `parts`.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -245,7 +271,10 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return rms error / rms dB for each depth, as the largest ratio of any skin, and for all depths and skins."""
+    """Return the relative error of dB (rms error / rms dB) for each depth, and for all depths together.
+
+    The value of a depth is the largest relative error of any skin. The value of all depths is over all skins together.
+    """
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -266,13 +295,16 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
-ATOL = 1e-3  # absolute / relative tolerance; states are a few percent of the elastic force, which is 1
+# Ratio of the absolute to the relative tolerance of the solvers. The peak elastic force is 1, and the states of which
+# the tolerance is compared are a few percent of it.
+ATOL = 1e-3
 DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
-DOWN_S, HELD_S = 0.3, 0.7  # times of lowering and of holding the tip, which is lifted for the rest of the period
+# The tip is lowered for DOWN_S, held for HELD_S, and lifted for the rest of the period.
+DOWN_S, HELD_S = 0.3, 0.7
 
-# Times in s, and the elastic forces at these times. Between two successive times, the elastic force is linear; this is
-# called a linear piece.
+# A history consists of times in s and the elastic forces at these times. Between two successive times, the elastic
+# force changes linearly; this part of a history is called a linear piece.
 History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]
 Forces = Float[np.ndarray, " u"]  # relaxed force / peak elastic force, at the end of each linear piece
 State = Float[np.ndarray, " p"]  # one state per relaxation time
@@ -286,9 +318,12 @@ class Failed(Exception):
 
 
 class Integrators(Strict):
-    """Settings of the study of integrators: stiffness ratios, tolerances of the solvers, and steps of explicit Euler.
+    """Settings of the study of integrators.
 
-    A stiffness ratio is the ratio of the slowest to the fastest relaxation time.
+    - ratios: stiffness ratios, each of which is the ratio of the slowest to the fastest relaxation time.
+    - tolerances: relative tolerances of SciPy's solvers.
+    - euler_steps_s: steps of the explicit Euler method.
+    - pokes_n: number of presses in the history that is integrated.
     """
 
     ratios: Annotated[tuple[Annotated[float, Field(gt=1, le=1e12)], ...], Field(min_length=1)]
@@ -306,10 +341,11 @@ class Counter:
         self.calls_n, self.calls_max_n = 0, calls_max_n
 
     def rates(self, prony: Prony, speed: float) -> Rates:
-        """Return the right-hand side q' = -q / tau + share e', for one linear piece of the elastic force e.
+        """Return the right-hand side of q' = -q / tau + share e' for one linear piece of the elastic force e.
 
-        q are the states; tau and share are the relaxation times and shares of the Prony series. `speed` is e', the
-        constant rate of the elastic force.
+        The states q are the parts of the force that relax, with one state for each term of the Prony series `prony`.
+        tau is the relaxation time of a term, and share is its share of the elastic force. `speed` is e', the rate of
+        change of the elastic force, which is constant within a linear piece.
         """
         driven = prony.share * speed
 
@@ -347,7 +383,7 @@ def study_name(ratio: float) -> str:
 
 
 def repeated_presses(pokes_n: int) -> History:
-    """Return the history of identical presses: each increases the elastic force to 1, holds it, and releases it.
+    """Return a history of identical presses, each of which raises the elastic force to 1, holds it, and releases it.
 
     As the presses are identical, error and run time per press hardly depend on the number of presses.
     """
@@ -444,9 +480,10 @@ def prepare(trial: Trial, rest: Nodes) -> Prepared:
 
 
 def gauss_in_z(trial: Trial, rule: Quadrature) -> Prepared:
-    """Prepare the simulator's computation of dB with its own nodes.
+    """Prepare the simulator's computation of dB with the nodes that the simulator itself uses.
 
-    Cells end at the seams of the magnetising array; each cell has Gauss nodes over the thickness.
+    No cell extends across a seam of the array of magnets that magnetised the skin. Each cell has Gauss nodes over the
+    thickness.
     """
     return prepare(trial, place_nodes(trial.skin.thickness_m, rule))
 
@@ -462,11 +499,11 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Prepare only the sum over nodes, with the compiled kernel and precomputed displacements.
+    """Prepare only the sum over nodes, with the compiled kernel; the displacements of the nodes are computed before.
 
-    The run time can be compared with the run times of the magpylib methods, except for one difference. For every
-    indentation, the kernel computes the field of each node both at rest and displaced, which avoids the subtraction of
-    two large sums. With magpylib, the field at rest is computed only once.
+    The run time can be compared with the run times of the magpylib methods, which also sum over displaced nodes. One
+    difference remains. For every indentation, the kernel computes the field of each node both at rest and displaced, so
+    that it need not subtract two large sums. With magpylib, the field at rest is computed only once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
@@ -577,8 +614,9 @@ def _slide(
 
 @dataclass(frozen=True)
 class _DeformationSplines:
-    """Splines over (r, z) of the changes of r, z and rotation angle.
+    """Displacement of the material under an axially symmetric indentation, as splines.
 
+    At a distance r from the axis and a height z, three splines give the changes of r, of z and of the rotation angle.
     Beyond the range of the splines, r^2 grows by `grown_m2`, while z and the angle do not change.
     """
 
@@ -615,7 +653,7 @@ COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a random ski
 def draw_trial(
     board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Indentations
 ) -> Trial:
-    """Draw a random skin that is not rotated and does not vary over its area, and its indentations.
+    """Draw the trial of a random skin that is not rotated and whose properties do not vary over its area.
 
     The places of `pokes` are relative to the skin's centre. Raises `ParamsError` if a poke does not reach the skin.
     """
@@ -630,9 +668,10 @@ def draw_trial(
 
 
 def with_nodes(trial: Trial, rest: Nodes) -> Skin:
-    """Return the trial's skin with its nodes replaced by `rest`, magnetised by the design's array.
+    """Return the trial's skin with its nodes replaced by the nodes `rest`.
 
-    The positions in `rest` are relative to the skin's centre and base.
+    The new nodes are magnetised by the array of magnets in the design. The positions in `rest` are relative to the
+    skin's centre and base.
     """
     b_T = magnet.array_field(rest.nodes_m, trial.skin.thickness_m, trial.design.polarity)
     j_T = magnet.magnetise(b_T, saturation_T=trial.design.saturation_T, half_field_T=trial.design.half_field_T)

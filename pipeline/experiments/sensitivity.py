@@ -20,7 +20,9 @@ from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
-RESOLVED_SHARE = 0.95  # a difference is resolved if this fraction of reading pairs is correctly ordered
+# A weight difference is resolved if, in at least this fraction of pairs of readings, the reading under the larger
+# weight has the larger response.
+RESOLVED_SHARE = 0.95
 WATER_N_PER_ML = 9.81e-3  # weight of 1 mL (1 g) of water at 9.81 m/s^2
 
 

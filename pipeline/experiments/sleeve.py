@@ -31,14 +31,14 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-NEAR_MM = 4.0  # a place this close to a border between boards is near it (assumed: twice the skin's thickness)
+NEAR_MM = 4.0  # a place closer than this to a border between boards is near it (assumed: twice the skin's thickness)
 Stats = dict[str, dict[str, float]]  # for each metric: mean, n and, for several training runs, sd
 
 
 class Sleeve(SectionWithTraining):
     """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # held-out fraction of each capture's pokes, the last ones
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # this fraction of each capture's pokes, at its end, is held out
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 
@@ -137,9 +137,9 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
 def predict_by_neighbours(
     data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray
 ) -> dict[str, list[np.ndarray]]:
-    """Predict the test rows by k nearest neighbours, with two kinds of inputs: dB, and the shape of dB.
+    """Predict the test rows by k nearest neighbours.
 
-    The keys of the result are `knn-raw` and `knn-shape`.
+    The inputs are either dB (key `knn-raw` of the result) or the shape of dB (key `knn-shape`).
     """
     none = np.zeros(0, np.int64)
     tasks = [

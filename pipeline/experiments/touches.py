@@ -1,8 +1,8 @@
-"""Recorded touches at numbered places of a real pad, one or two at once (paper section 7, future work).
+"""Recordings of a real pad that is touched at one or two of its numbered places (paper section 7, future work).
 
-The experiment estimates the place and force of a touch. It tests whether the change of field by two touches is the sum
-of the changes by two single touches, and whether two touches can be detected. Each recording of single touches is split
-by time into training rows, rows that set thresholds, and test rows.
+The experiment estimates the place and the force of a single touch. It tests whether the change of field by two
+simultaneous touches is the sum of the changes by the two single touches, and whether two touches can be detected. Each
+recording of single touches is split by time into training rows, rows that set thresholds, and test rows.
 """
 
 import re
@@ -44,7 +44,7 @@ from reskin.schema import Readings
 from reskin.seeds import rng_for
 
 PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # key in the ingest counts of captures with numbered places
-ROWS_MIN_N = 20  # smallest number of touched rows in a usable recording
+ROWS_MIN_N = 20  # a recording is usable only if it has at least this number of rows with enough force
 LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model that predicts the force
 SUMS_N = 100  # number of random sums of two single touches, for each pair of places
 
@@ -53,7 +53,12 @@ Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # mean direction of dB by
 
 
 class Touches(Strict):
-    """Settings section `touches`: how a recording is split by time, and the intended fraction of false alarms."""
+    """Settings section `touches`.
+
+    - train_fraction: fraction of each recording, from its start, that is used for training.
+    - aside_fraction: fraction of each recording, after the training rows, that sets the thresholds.
+    - false_alarm_fraction: fraction of single touches that a detector may report as two touches.
+    """
 
     train_fraction: Fraction
     aside_fraction: Fraction
@@ -103,7 +108,10 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
 
 @dataclass(frozen=True)
 class Touched:
-    """The rows of one recording with enough force, in order of time; `places` are its one or two place numbers."""
+    """The rows of one recording in which the pad is touched with enough force, in order of time.
+
+    `places` contains the numbers of the one or two places that are touched in this recording.
+    """
 
     name: str
     places: tuple[int, ...]
@@ -149,9 +157,12 @@ def split_by_time(recording: Touched, section: Touches) -> Split:
 
 @dataclass(frozen=True)
 class Sorted:
-    """Usable recordings of one place and of two places, and the reason for each recording that is left out.
+    """The recordings of the scene, sorted by their number of places.
 
-    `problem` is the reason why the experiment cannot be computed, or None.
+    - single: usable recordings of one place.
+    - double: usable recordings of two places.
+    - left_out: the reason why a recording is not used, by the name of the recording.
+    - problem: the reason why the experiment cannot be computed at all, or None.
     """
 
     single: list[Touched]
@@ -206,14 +217,21 @@ def stack_touches(recordings: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f
 
 
 def unit_directions(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
-    """Return dB / (|dB| + noise): a vector of length nearly 1 for strong readings, and shorter for weak readings."""
+    """Return dB / (|dB| + noise) for each reading.
+
+    This vector has the direction of dB. Its length is nearly 1 for strong readings, and shorter for weak readings,
+    whose direction is less certain because of noise.
+    """
     return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
 def predict_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Predict place numbers, by a majority vote among the known rows whose directions of dB are nearest."""
+    """Predict the place number of each tested row.
+
+    The prediction is the most frequent place number among the known rows whose directions of dB are nearest.
+    """
     from sklearn.neighbors import KNeighborsClassifier  # imported here because importing scikit-learn takes a second
 
     voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit_directions(known_uT), places)
@@ -231,9 +249,10 @@ def directions(
 def relative_residual(
     known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Fit each row by a non-negative combination of the directions of these places; return residual / |dB|.
+    """Return which part of each row cannot be explained by touches at these places, as residual / |dB|.
 
-    The force at each place was not recorded, so the amplitudes with the smallest residual are used.
+    Each row is fitted by a sum of the places' directions of dB, each multiplied by an amplitude of 0 or more. The
+    forces at the single places were not recorded, so the amplitudes that give the smallest residual are used.
     """
     basis = np.stack([known[place] for place in places], axis=1)
     rows_uT = db_uT.astype(np.float64)
@@ -243,10 +262,10 @@ def relative_residual(
 def score_unlike_one(
     known_uT: Float32[np.ndarray, "a ch"], known: Directions, tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Scores:
-    """Score how unlike a single touch each tested row is.
+    """Score how different each tested row is from a single touch, with several detectors of two touches.
 
-    The detectors are the detectors of experiment `contacts` that use no network, and the smallest residual of a fit by
-    one place.
+    The detectors are those of experiment `contacts` that use no network, and a detector that fits each row by a touch
+    at one place. The score of the latter is the smallest residual among all places.
     """
     residuals = [relative_residual(known, (place,), tested_uT) for place in known]
     return {
@@ -280,10 +299,11 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
-    """Return squared force errors of ridge regression on dB of single touches, and the variance of the force.
+    """Return the mean squared force errors of a ridge regression that predicts the force of single touches from dB.
 
-    `by_time` contains the errors on later rows of the training recordings, `place_left_out` those on recordings of
-    other places.
+    - by_time: errors on later rows of the training recordings.
+    - place_left_out: errors on recordings of a place that is not in the training recordings.
+    - variance: variance of the force, which would be the error of predicting the mean force.
     """
     by_time = [_force_error(blocks, block.test, rng) for block in blocks]
     left_out = [
@@ -305,9 +325,10 @@ def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generat
 
 
 def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Return the residuals of two touches after a fit by the directions of single touches.
+    """Return which part of the field change of two touches a sum of two single touches cannot explain.
 
-    For comparison, `single_touches_pct` is the residual of single touches after a fit by their own direction.
+    Each reading of two touches is fitted by the directions of single touches (see `relative_residual`). For comparison,
+    `single_touches_pct` is the residual of single touches after a fit by the direction of their own place.
     """
     known = directions(*stack_touches([block.train for block in blocks]))
     single_pct = [
@@ -322,9 +343,10 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Return the median residuals of two touches after fits by their two places, by single places and by other pairs.
+    """Compare fits of two touches by their two true places, by single places, and by all other pairs of places.
 
-    `rank` is the rank of the true pair among all pairs of places, where 1 is the pair with the smallest residual.
+    Returns the median residual of each fit. `rank` is the rank of the true pair among all pairs of places, where the
+    pair with rank 1 has the smallest residual.
     """
     residuals = {
         places: float(np.median(relative_residual(known, places, db_uT))) for places in combinations(sorted(known), 2)
@@ -383,9 +405,9 @@ def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32
 
 
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
-    """Return, for each detector, the percentage of single touches at an unknown place that are called two touches.
+    """Return how often each detector mistakes a single touch at an unknown place for two touches, in percent.
 
-    Each place in turn is left out of the known rows; the percentages are means over places.
+    Each place in turn is made unknown by leaving it out of the known rows. The percentages are means over places.
     """
     called = []
     for block in blocks:

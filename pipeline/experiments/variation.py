@@ -1,4 +1,4 @@
-"""Variation of the field of equal indentations over time and between skins (paper figure 4)."""
+"""How much the field of equal indentations varies over time and between skins (paper figure 4)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,7 +24,7 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # labels (commanded values in float32) that differ by less than this count as equal
+SAME_MM = 1e-3  # places and depths are commanded values in float32; they are equal if they differ by less than this
 LISTED_N = 8  # largest number of places or depths listed in an error message
 LINES_MAX_N = 40  # largest number of lines (visits of a place) in a panel of the figure
 DECIMALS = 1  # fields in uT are rounded to this many decimals for the figures
@@ -118,8 +118,9 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the visits within a skin's first `contacts_n` contacts with the first of these visits.
 
-    Returns two rms differences over channels between the last and the first visit: of the field as read, and of the
-    change of field. Also returns the lines to draw, which are the fields minus the field of the first visit.
+    The first result contains two rms differences over channels between the last and the first visit: the difference of
+    the field as read, and the difference of the change of field. The second result contains the lines to draw, which
+    are the fields of all visits minus the field of the first visit.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]

@@ -1,7 +1,7 @@
-"""Find which properties of simulated skins determine the scores of table 2 (not in the paper).
+"""Find which properties of simulated skins determine the scores of the paper's table 2 (not in the paper).
 
 The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from the
-scene's in one factor, such as a spread between skins or an error of the simulation.
+settings of the scene in one factor, such as how much skins vary, or how large an error of the simulation is.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -46,7 +46,7 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.rig import actual_positions, read_force
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-WAVES_N = 48  # number of random cosines whose sum is the smooth error
+WAVES_N = 48  # the smooth random error is a sum of this number of random cosines
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -65,7 +65,10 @@ class Residual(Strict):
 
 
 class Worlds(Strict):
-    """Settings section `worlds`: values of each factor; in each world, the other factors have the scene's values."""
+    """Settings section `worlds`: the values of each factor, one world per value.
+
+    In each world, all other factors have the values of the scene.
+    """
 
     residual: Residual
     skin_modulus: Sizes  # values of spreads.skin_modulus
@@ -75,9 +78,11 @@ class Worlds(Strict):
 
 @dataclass(frozen=True)
 class World:
-    """One world: the factor that differs from the scene, its value, and the settings of the simulation.
+    """One world.
 
-    `residual` is the rms size, relative to |dB|, of the error that is added to the simulation.
+    - factor, value: the factor that differs from the scene, and the value that it has in this world.
+    - simulation: settings of the simulation.
+    - residual: rms size, relative to |dB|, of the error that is added to the simulated changes of field.
     """
 
     factor: str
@@ -136,7 +141,8 @@ def with_residual(
 ) -> Float[np.ndarray, "n ch"]:
     """Return a skin's changes of field plus a smooth random error whose rms is `size` times |dB|.
 
-    One component of the error is the same for all skins, the other is drawn for this skin (`residual.own_share`).
+    The error is a sum of two components: one is the same for all skins, and the other is drawn for this skin.
+    `residual.own_share` is the fraction of the variance that belongs to the second component.
     """
     if size == 0:
         return change_uT
@@ -293,7 +299,8 @@ MEANING = (
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
     "error. {folds_n} boards are held out in turn; one network per row, fold and world, trained for {steps_n} steps."
 )
-DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # default values; the numbers have those of other factors
+# Values of two factors in the default world. The values of the other factors are in the experiment's numbers.
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

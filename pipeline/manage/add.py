@@ -1,7 +1,8 @@
-"""Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, and register it.
+"""Add a recording to a scene.
 
-The scene is also added to the plan. The whole recording is read and checked first. If adding fails or is stopped, all
-changes are undone.
+The recording is copied to data/raw/<scene>/<capture>/, read completely and checked. It is then tracked with DVC and
+listed in the registry (data/captures.yaml), and its scene is added to the plan. If anything fails or the command is
+stopped, all changes are undone.
 """
 
 import hashlib
@@ -31,7 +32,7 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # number of latest captures of the scene whose places are compared with a new capture's
+COMPARED_N = 3  # the places of a new capture are compared with those of this number of the scene's latest captures
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
@@ -81,10 +82,11 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 
 
 def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> CaptureNames:
-    """Return the names of a capture; names that are not given (empty) are taken from the file's name, `BOARD_SKIN.csv`.
+    """Return the names of board, skin and capture; names that are not given are taken from the name of the file.
 
-    The skin is then named `BOARD_SKIN`, so that skins of different boards have different names. Further parts of the
-    file's name, as in `BOARD_SKIN_MORE.csv`, distinguish the captures of a skin.
+    The file must then be named `BOARD_SKIN.csv`. The skin gets the name `BOARD_SKIN`, so that skins of different boards
+    have different names. Further parts of the file's name, as in `BOARD_SKIN_MORE.csv`, distinguish several captures of
+    a skin.
     """
     if given.board and given.skin:
         return given
@@ -103,7 +105,10 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
 
 @contextmanager
 def undoing(root: Path, scene: str, captures: Sequence[str]) -> Iterator[None]:
-    """Undo all changes if the `with` block fails; the block appends the captures that it has added to `captures`."""
+    """Undo all changes if the `with` block fails.
+
+    The block appends the name of each capture that it has added to `captures`, so that these captures can be removed.
+    """
     with io.restoring(root / REGISTRY, root / PLAN):
         try:
             yield
@@ -128,7 +133,7 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "Is it the same recording? Then nothing remains to be done. If not, choose another --name."
+        remedy = "If it is the same recording, it is in the scene already. Otherwise, choose another name with --name."
         raise ParamsError(f"the name {target.name} is taken in this scene. {remedy}")
     if target.exists():
         remedy = (
@@ -149,8 +154,9 @@ class Counts:
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[tuple[str, ...], Counts]:
     """Read a whole capture as stage ingest does; return its fingerprints and its counts.
 
-    The fingerprints are the SHA-256 of the readings and of the byte stream. Copies of a recording have a fingerprint in
-    common, even if they have other names or another layout. An unknown force (NaN) counts as a touch.
+    The fingerprints are the SHA-256 of the readings and, if the capture has one, of the recorded byte stream. Copies of
+    a recording have at least one fingerprint in common, even if they have other names or another layout. A reading with
+    an unknown force (NaN) counts as a touch.
     """
     _, blocks, counts = open_capture(folder, policy)
     rows_n, touched, readings, repeats = 0, False, hashlib.sha256(), RepeatCounter(header.chips_n)
@@ -171,15 +177,16 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
     if repeats.readings > REPEATED_MAX:
         say(
-            f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Was the board, "
-            "or the program that recorded it, faster than the chips? See reskin ports --rate. It was added anyway."
+            f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Probably the "
+            "board, or the program that recorded it, reads faster than the chips measure. To measure the rate of the "
+            "chips, run: reskin ports --rate. The recording was added anyway."
         )
     fingerprints = (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
     return fingerprints, Counts(len(passes), len(indentations), touched)
 
 
 def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
-    """Warn if the first capture of a skin has fewer passes or indentations than section split of the scene needs."""
+    """Warn if the first capture of a skin has too few passes or indentations for section `split` of the scene."""
     for what, have_n, key in (
         ("passes", counts.passes_n, "pool_passes_n"), ("indentations", counts.indentations_n, "labels_pool_n")
     ):  # fmt: skip
@@ -225,13 +232,17 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
     if most_common is not None:
         say(
             f"warning: capture {folder.name}: its places agree with those of the scene's other captures only "
-            f"{most_common}. Are columns swapped, or was the board rotated? It was added anyway."
+            f"{most_common}. Check whether columns are swapped, or whether the board was rotated. The recording was "
+            "added anyway."
         )
 
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """In errors, replace the paths of copies by the paths of the user's files, because the copies are deleted."""
+    """In error messages, replace the paths of copied files by the paths of the user's files.
+
+    If adding fails, the copies are deleted, so their paths would not help the user.
+    """
     try:
         yield
     except ReskinError as error:

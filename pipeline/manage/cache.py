@@ -79,7 +79,7 @@ def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:
         if name.endswith(FOLDER) and name in objects:
             try:
                 listed: list[dict[str, Any]] = io.read_json(objects[name])
-            except SchemaError:  # this list of files is damaged, and reported as a damaged object
+            except SchemaError:  # this object, which lists the files of a folder, is damaged, and is reported as such
                 continue
             for entry in listed:
                 uses[entry["md5"]].append(Use(command, path / entry["relpath"]))

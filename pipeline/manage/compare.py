@@ -19,17 +19,20 @@ from pipeline import plan
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # at most this many leading texts and counts name a row of a list
-LISTED_N = 10  # number of largest differences to list
-# Verdicts at the beginning of cells. Only results from before 2026-11 contain yes and no.
+# A row of a list gets a name, so that it can be compared with the row of the same name in the other run. The name
+# consists of at most this number of the row's first texts and counts.
+LABEL_N = 3
+LISTED_N = 10  # number of differences that are printed, beginning with the largest
+# The verdict at the beginning of a table's cell. Only results from before 2026-11 contain the verdicts yes and no.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|within interval|significant difference|"
     r"not judged \([^)]*\))(?![\w ])"
 )
 MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance that may explain a difference
 EXPECTED = (
-    "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
-    "processor with AVX2; a GPU or other versions may differ. If none of these explains a difference, please report it."
+    "Values are equal on every x86-64 processor with AVX2 if the code, the settings and the versions of packages "
+    "(constraints.txt) are those of the committed run. On a GPU, or with other versions, values may differ. If none of "
+    "these explains a difference, please report it."
 )
 MISSING: Any = object()  # placeholder for a value that one of the two runs lacks
 
@@ -65,7 +68,13 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Values that differ, names that only one of two runs has, and numbers of equal values by section."""
+    """The result of comparing the committed values with those of a fresh run.
+
+    - equal: number of equal values, by section of the results.
+    - differing: values that differ between the runs.
+    - missing: names of values that only the committed run has.
+    - new: names of values that only the fresh run has.
+    """
 
     equal: Counter[str]
     differing: list[Difference]
@@ -136,9 +145,11 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Label the rows of two lists by their leading values, so that an additional row does not shift the other rows.
+    """Give each row of two lists a label, by which the rows of the lists are paired.
 
-    If the labels differ but the lists are equally long, rows are paired by position.
+    The labels are made from the first values of a row, so that an additional row in one list does not change which
+    other rows are paired. If the labels of the lists differ but the lists are equally long, rows are paired by
+    position.
     """
     before, after = _labels(old), _labels(new)
     if set(before) != set(after) and len(before) == len(after):
@@ -147,7 +158,10 @@ def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any],
 
 
 def _labels(rows: Sequence[Any]) -> list[str]:
-    """Label rows by as few leading texts and counts as make the labels unique; number labels that are still equal."""
+    """Return a label for each row, which consists of the first texts and counts of the row.
+
+    As few texts and counts are used as make all labels different. Labels that are still equal are numbered.
+    """
     if not all(isinstance(row, Mapping) for row in rows):
         return [str(i) for i in range(len(rows))]
     leading: list[list[str]] = []
@@ -172,7 +186,13 @@ def _labels(rows: Sequence[Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Report:
-    """A report: its location, the compared values (numbers.json and the cells of tables), and its provenance."""
+    """A report of a scene.
+
+    - where: location of the report, for messages.
+    - numbers: content of numbers.json.
+    - tables: rows of each table, by name of the table.
+    - provenance: code, versions and machine that made the report.
+    """
 
     where: str
     numbers: dict[str, Any]
@@ -183,14 +203,14 @@ class Report:
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     """Compare `reports/<scene>` with the scene's report in a git revision or a folder; return the exit status.
 
-    If the scene cannot be compared, the function prints the error and returns the exit status of the error, so that the
-    caller can continue with other scenes.
+    An error, such as a missing report, is printed rather than raised, so that the caller can continue with other
+    scenes. The exit status is then that of the error.
     """
     try:
         folder = root / "reports" / scene
         if not (folder / "numbers.json").exists():
             plan.scene_file(root, scene)
-            remedy = f"Try: reskin scenes use {scene}, then dvc repro."
+            remedy = f"Run the scene first: reskin scenes use {scene}, then dvc repro."
             raise SchemaError(f"{folder / 'numbers.json'}: file not found. {remedy}")
         committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)
         return print_comparison(scene, committed, read_folder(folder, scene), echo)
@@ -205,7 +225,7 @@ def read_folder(path: Path, scene: str) -> Report:
     candidates = (start, start / scene, start / "reports" / scene)
     folder = next((candidate for candidate in candidates if (candidate / "numbers.json").is_file()), None)
     if folder is None:
-        remedy = "Use the path of reports/<scene> in another checkout."
+        remedy = "Give the path of folder reports/<scene> in another checkout."
         raise SchemaError(f"{path}: no {scene}/numbers.json there. {remedy}")
     files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
     return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
@@ -262,7 +282,10 @@ def compare_reports(committed: Report, fresh: Report) -> dict[str, Comparison]:
 
 
 def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -> int:
-    """Print how the reports of two runs differ, with a summary last; return 0 if all values are equal, else 1."""
+    """Print how the reports of two runs differ; the summary is printed last.
+
+    Returns the exit status, which is 0 if all values are equal, and 1 otherwise.
+    """
     parts = compare_reports(committed, fresh)
     values = f"{sum(part.compared_n for part in parts.values()):,} values"
     if all(part.reproduced for part in parts.values()):

@@ -1,6 +1,7 @@
-"""Fetch public recordings (`pipeline/fetch.yaml`) from a git repository or a folder, check them, and add them.
+"""Fetch public recordings from a git repository or a folder, check them, and add them to a scene.
 
-If the server of a git repository supports it, only the needed commit and files are transferred.
+`pipeline/fetch.yaml` lists the public recordings. If the server of a git repository supports it, only the needed commit
+and files are transferred.
 """
 
 import os
@@ -31,11 +32,11 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
-# The free disk space must suffice for this many copies of each file: as fetched, in data/raw, in DVC's cache, and one
-# in reserve.
+# The free disk space must suffice for this many copies of each file. Three copies are written: the fetched file, and
+# copies in data/raw and in DVC's cache. The fourth is a reserve.
 COPIES_N = 4
-USE_FROM = "--from takes a git mirror or a folder that contains the files."
-PART = "pad"  # option that selects one of several captures in the same files (layout leaphand)
+USE_FROM = "to take the files from elsewhere, name a git mirror or a folder with --from."
+PART = "pad"  # option of layout leaphand, whose files contain several captures; it selects one of them
 Say = Callable[[str], None]
 
 
@@ -50,9 +51,12 @@ Commit = Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")]
 
 
 class File(Strict):
-    """A file to fetch: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk.
+    """A file to fetch.
 
-    commit: the commit that contains the file, if this is not the commit of the source.
+    - path: path to which the file is written, below the folder of its source.
+    - at: path of the file in the repository.
+    - commit: the commit from which the file is taken, if this is not the commit of the source.
+    - bytes_n, sha256: size and hash of the written file.
     """
 
     path: RelativePath
@@ -73,7 +77,14 @@ class Recording(Strict):
 
 
 class Source(Strict):
-    """A public set of recordings. If `scene` is None, they are fetched but not added, and `note` gives the reason."""
+    """A public set of recordings.
+
+    - home: public address of the files.
+    - commit: commit of the git repository from which the files are taken; None for the newest commit.
+    - licence: licence of the files; None if they have no licence.
+    - scene: scene to which the recordings are added; None if they are only fetched.
+    - note: the reason why the recordings are not added, if `scene` is None.
+    """
 
     home: str
     commit: Commit | None
@@ -89,7 +100,7 @@ class Source(Strict):
 
     @property
     def commits(self) -> str:
-        """The pinned commits, in words."""
+        """The commits from which the files are taken, as words for a message."""
         pinned = sorted({commit for file in self.files if (commit := self.commit_of(file))})
         unpinned = "newest commit (none is pinned; checksums are checked)"
         return f"commit{'s' * (len(pinned) > 1)} {', '.join(pinned)}" if pinned else unpinned
@@ -100,7 +111,7 @@ class Source(Strict):
 
     @property
     def terms(self) -> str:
-        return self.licence or "none (use it here, do not pass it on)"
+        return self.licence or "none (you may not pass the files on)"
 
 
 def read_sources(root: Path) -> Mapping[str, Source]:
@@ -142,7 +153,7 @@ def fetch(
         say(f"{folder}: {source.size}, all checksums match")
     scene = scene or source.scene
     if scene is None or not source.recordings:
-        return say(source.note or "no layout reads it, so nothing is added")
+        return say(source.note or "the files are in no format that `reskin add` reads, so nothing is added to a scene")
     _add_all(root, scene, source, folder, say)
     _say_what_runs(root, scene, running, say)
 
@@ -152,7 +163,10 @@ def _is_unchanged(path: Path, file: File) -> bool:
 
 
 def download(source: Source, where: str, folder: Path) -> None:
-    """Read and check the files of a source, then replace a folder with them; on failure, the folder does not change."""
+    """Read and check the files of a source, then replace the content of `folder` with them.
+
+    If a file cannot be read or fails its check, the folder is not changed.
+    """
     try:
         with io.replacing(folder) as temporary:
             needed_B = COPIES_N * sum(file.bytes_n for file in source.files)
@@ -180,7 +194,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     """Read a file, convert an archive of pickled samples to CSV, and check the hash of the result."""
     path = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if path is None:
-        remedy = f"Is this the right source? {USE_FROM}"
+        remedy = f"Check whether this is the right source; {USE_FROM}"
         raise CaptureError(f"{origin.name}: no file {file.at} or {file.path}. {remedy}")
     content, name = origin.read(path), f"{origin.name} {path}"
     if path.endswith(".npz"):
@@ -188,14 +202,17 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
         rule, got = f"{file.sha256} ({file.bytes_n} bytes)", f"{digest} ({len(content)} bytes)"
-        problem = "The file is changed, truncated, or a different file with that name; nothing was kept."
+        problem = "The file was changed or truncated, or is another file with this name. Nothing was kept."
         remedy = f"{problem} Run the command again; {USE_FROM}"
         raise CaptureError(name, "sha256", rule, got, remedy)
     return content
 
 
 def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> None:
-    """Add the recordings of a source that the scene does not have yet; if one fails, earlier ones stay added."""
+    """Add the recordings of a source that the scene does not have yet.
+
+    If a recording cannot be added, the recordings that were added before it stay in the scene.
+    """
     added_n = 0
     try:
         for recording in source.recordings:
@@ -214,11 +231,10 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
 
 
 def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
-    """Return the name of the scene's capture with the same files as a prepared recording; None if there is none.
+    """Return the name of the capture that a prepared recording would duplicate; None if the scene has no such capture.
 
-    If the files contain several captures, the capture must also be the same part of the files.
-
-    A capture whose files are not on disk is compared by its name.
+    Captures are compared by the hashes of their files and, if the files contain several captures, by the part of the
+    files that they use. A capture whose files are not on disk is compared by its name.
     """
     header, files = prepared
     hashes = {
@@ -236,7 +252,10 @@ def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
 
 
 def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Say) -> None:
-    """Say whether the scene is in the plan, and what to run next; `before` has the scenes planned before the fetch."""
+    """Tell the user whether the scene is in the plan, and which command to run next.
+
+    `before` contains the scenes that were in the plan before the recordings were added.
+    """
     running = list(read_plan(root / PLAN).scenes)
     if scene not in running:
         return say(
@@ -250,14 +269,23 @@ def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Sa
 
 @dataclass(frozen=True)
 class Origin:
-    """A folder, or a git repository at a commit: its name in errors, its files, and how to read a file."""
+    """A place from which files are taken: a folder, or one commit of a git repository.
+
+    - name: name of the origin in error messages.
+    - paths: paths of its files.
+    - read: function that returns the content of the file with a given path.
+    """
 
     name: str
     paths: Sequence[str]
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path with the most trailing parts in common with `wanted`; None if no file has the same name."""
+        """Return the path of the file that best matches the path `wanted`.
+
+        The file must have the same name. Among several such files, the one with the most parent folders in common is
+        chosen. Returns None if no file has this name.
+        """
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)
@@ -269,7 +297,10 @@ class Origin:
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
-    """Open a folder, or a git repository at a commit (None means the newest); git creates the folder `scratch`."""
+    """Open a folder, or one commit of a git repository.
+
+    If `commit` is None, the newest commit is used. A repository is fetched to the folder `scratch`, which git creates.
+    """
     folder = Path(where)
     if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither an existing path nor a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")
@@ -297,12 +328,15 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
     try:
         _git("fetch", "--quiet", "--filter=blob:none", "--depth=1", "origin", commit, repository=repository)
     except subprocess.CalledProcessError:
-        try:  # a full clone, because git in a partial clone would search for a missing commit endlessly
+        try:  # clone the repository again and completely, because a partial clone would search for the commit endlessly
             repository = whole
             _git("clone", "--quiet", "--mirror", url, str(whole))
             _git("cat-file", "-e", f"{commit}^{{commit}}", repository=whole)
         except subprocess.CalledProcessError as error:
-            remedy = f"Was its history rewritten, or is it a clone made with --depth? {USE_FROM}"
+            remedy = (
+                "Perhaps the history of the repository was rewritten, or it is a clone that was made with --depth. "
+                f"Use a complete clone; {USE_FROM}"
+            )
             what = f"the repository does not have commit {commit}, at which the files are pinned ({_reason(error)})"
             raise CaptureError(f"{url}: {what}. {remedy}") from None
 
@@ -318,7 +352,10 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _git(*arguments: str, repository: Path | None = None) -> bytes:
-    """Run git such that it gives up on a dead connection, and never asks for a password."""
+    """Run git and return its output.
+
+    A dead connection causes an error after a minute, and git never asks for a password.
+    """
     command = ["git", "-c", "http.lowSpeedLimit=1000", "-c", "http.lowSpeedTime=60"]
     command += [] if repository is None else ["--git-dir", str(repository)]
     silent = {"GIT_TERMINAL_PROMPT": "0", "GIT_ASKPASS": "true", "GIT_SSH_COMMAND": "ssh -oBatchMode=yes"}

@@ -1,5 +1,6 @@
-"""Resolve conflicts in registry, plan, dvc.lock and reports when branches with different recordings are merged.
+"""Resolve the git conflicts that arise when branches with different recordings are merged.
 
+Conflicts are resolved in the files that commands write: registry (data/captures.yaml), plan, dvc.lock and reports.
 Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """
 
@@ -27,7 +28,7 @@ from reskin.errors import ParamsError
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
 REPORTS = "reports/"  # our version of reports is kept until the next `dvc repro` writes them again
-SIDES = ("1", "2", "3")  # git's stage numbers of base, ours and theirs
+SIDES = ("1", "2", "3")  # git's numbers for the three versions of a file in conflict: base, ours and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
@@ -50,7 +51,7 @@ def merge(root: Path) -> str:
             command = ["rm", "--quiet"] if name in deleted else ["checkout", "--ours"]
             _git(root, *command, "--", name)
     _git(root, "add", "--all", "--", *(name for name in unmerged if name not in deleted), PLAN)
-    changed = f" {len(changed_stages)} stages that both sides ran may run again." if changed_stages else ""
+    changed = f" {len(changed_stages)} stages, which both branches ran, may run again." if changed_stages else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
     return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
 
@@ -91,7 +92,11 @@ def merge_stages(
 
 
 def merge_scenes(base: Sequence[str], ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
-    """Return the scenes to run: our scenes, without those that their side removed, and with those that it added."""
+    """Return the scenes that run after the merge.
+
+    These are the scenes of our branch, without the scenes that the other branch removed, and with the scenes that it
+    added.
+    """
     added = [name for name in theirs if name not in ours and name not in base]
     return [name for name in ours if name in theirs or name not in base] + added
 

@@ -1,4 +1,4 @@
-"""Write the file of a new recorded scene that holds out each of several boards: `reskin new`."""
+"""Command `reskin new`: write the file of a new scene for two or more boards, each of which is held out in turn."""
 
 import re
 from collections.abc import Sequence
@@ -75,9 +75,10 @@ ABOUT_MODEL = """\
 # and add calibrated to the list of experiments.
 """
 ONE_BOARD = (
-    "one board cannot be held out and trained on. To train on its first passes and test on its last ones, use instead "
-    "of this command: reskin add RECORDING --layout table --board B --skin S --scene NAME --like ini. The universal "
-    "model needs no training: see docs/live.md, Calibrate the universal model"
+    "two or more boards are needed, because one board cannot be held out and trained on. To train on the first passes "
+    "over one board and test on its last passes, run instead: reskin add RECORDING --layout table --board B --skin S "
+    "--scene NAME --like ini. Or use the universal model, which needs no training: see docs/live.md, Calibrate the "
+    "universal model"
 )
 
 
@@ -86,14 +87,25 @@ def new(
 ) -> tuple[Path, list[str]]:
     """Write `pipeline/scenes/<scene>.yaml`; return its path, and sentences on what to do next.
 
-    boards: names of two or more boards. presses_n: indentations of each skin in one pass. passes_n: with two passes or
-    more, the scene also adapts networks. layout: the name of a layout of the project, or a YAML file whose text is
-    copied; with None, the text of the paper's layout is copied, to be edited. source: "simulated" for recordings of
-    emulated boards.
+    Parameters
+    ----------
+    root, scene
+        Folder of the checkout; name of the scene.
+    boards
+        Names of two or more boards.
+    presses_n, passes_n
+        Number of indentations of each skin in one pass over all places, and number of passes. With two passes or more,
+        the scene also adapts networks.
+    layout
+        Name of a layout of the project, or path of a YAML file whose text is copied into the scene's file. If None, the
+        text of the paper's layout is copied, and the user must edit it.
+    source
+        "simulated" for recordings of emulated boards.
 
     Raises
     ------
-    ParamsError : a name is invalid or taken, there are fewer than two boards, or the layout is invalid
+    ParamsError
+        A name is invalid or taken, there are fewer than two boards, or the layout is invalid.
     """
     for option, name in (("SCENE", scene), *(("--boards", board) for board in boards)):
         if not re.fullmatch(NAME, name):
@@ -156,12 +168,18 @@ def _layout_text(layout: str | None, scene: str) -> str:
 def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequence[str], source: Source) -> list[str]:
     steps = [f"wrote {file}"]
     if "adapt" not in experiments:
-        steps.append("left out: adapt, which needs recordings with --passes 2 or more")
+        steps.append("experiment adapt is left out, because it needs two or more passes over each skin (--passes 2)")
     if "calibrated" not in experiments:
-        steps.append("left out: calibrated, which needs a universal model for your layout (the file says how)")
+        steps.append(
+            "experiment calibrated is left out, because it needs a universal model for your layout; the scene's file "
+            "says how to make one"
+        )
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
     if source == "simulated":
         add = f"reskin add captures/BOARD_SKIN ... --layout capture --scene {scene}"
     if layout is None:
-        steps.append("next: describe your boards in this file, key layout of section compare: it has the paper's board")
+        steps.append(
+            "next: describe your boards in this file, under key layout of section compare, which now describes the "
+            "paper's board"
+        )
     return [*steps, f"then: {add}" if layout is None else f"next: {add}"]

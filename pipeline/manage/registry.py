@@ -1,4 +1,7 @@
-"""The registry of recorded captures, `data/captures.yaml`: names, layout and fingerprints, by scene."""
+"""The registry of recorded captures, `data/captures.yaml`.
+
+For each scene, it lists the names, the layout and the fingerprints of the captures (recorded files) of the scene.
+"""
 
 from pathlib import Path
 
@@ -20,12 +23,14 @@ class Entry(Strict):
     skin: str
     layout: str
     chips_n: int
-    fingerprints: tuple[str, ...]  # SHA-256 of the readings and of the stream; copies have at least one in common
+    # SHA-256 of the readings and of the recorded byte stream. Two copies of a recording have at least one of them in
+    # common.
+    fingerprints: tuple[str, ...]
     copy_of: str | None
 
 
 class Registry(Strict):
-    """Captures by scene, then by name."""
+    """Content of the registry: the captures of each scene, by name."""
 
     captures: dict[str, dict[str, Entry]]
 

@@ -24,9 +24,11 @@ from reskin.config import read_yaml
 STATE = Path(".reskin/run.json")  # the current run: process, start, planned stages and started stages
 LOCK = Path("dvc.lock")
 CODE, DIGESTS = "code", "data/code"  # the stage that writes digests of modules, and its output
-START_S = 1.5  # assumed time per stage for the start of Python and DVC's own work
+START_S = 1.5  # assumed time that each stage needs in addition, for the start of Python and for DVC's own work
 SIDE_BY_SIDE_N = 2  # default number of parallel training runs
-TRUSTED = 0.1  # fraction of work after which this run's speed has the same weight as the last report's
+# The estimate combines the speed of the run of the last report with the speed of the current run. After this fraction
+# of the work, both speeds have the same weight.
+TRUSTED = 0.1
 
 
 def progress() -> str | None:
@@ -59,7 +61,10 @@ def _continue_run(stage: str, process: int, command: str) -> dict[str, Any]:
 
 
 def _until_targets(stages: Sequence[str], command: str) -> list[str]:
-    """Return the stages that a command like `dvc repro report@mine` may run: the scene's stages up to the target."""
+    """Return the stages that a command may run, such as `dvc repro report@mine`.
+
+    These are the stages of the target's scene, up to the target.
+    """
     targets = {word.rpartition(":")[2] for word in command.split()} & set(stages)
     if not targets:
         return list(stages)

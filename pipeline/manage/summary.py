@@ -70,7 +70,7 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
 
 
 def _is_up_to_date(root: Path, scene: str) -> bool:
-    """Return whether DVC finds that the inputs and outputs of a scene's report are those that dvc.lock records."""
+    """Return whether the inputs and outputs of a scene's report are, according to DVC, those that dvc.lock records."""
     command = [sys.executable, "-m", "dvc", "status", "--json", f"report@{scene}"]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     return done.returncode == 0 and done.stdout.strip() == "{}"
@@ -82,7 +82,7 @@ def _differences(parts: Mapping[str, Comparison]) -> str:
     verdicts_n = sum(difference.verdicts is not None for difference in differing)
     largest = max((difference.relative or 0.0 for difference in differing), default=0.0)
     details = [f"by up to {100 * largest:.2g} %"] if largest else []
-    details += [f"{unpaired_n:,} are in one of the two only"] if unpaired_n else []
+    details += [f"{unpaired_n:,} are in only one of the two reports"] if unpaired_n else []
     details += [f"{verdicts_n} verdicts changed"]
     return f"{len(differing):,} ({'; '.join(details)})"
 

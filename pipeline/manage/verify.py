@@ -1,4 +1,7 @@
-"""`reskin verify-reports`: rerun scenes in a clone of the last commit, without any cache, and compare the reports."""
+"""Command `reskin verify-reports`: run scenes again in a clone of the last commit, and compare their reports.
+
+No cached results are used.
+"""
 
 import os
 import shutil
@@ -23,7 +26,10 @@ QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_T
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
-    """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
+    """Compare new reports of scenes with the reports in the last commit; return the exit status.
+
+    The new reports are those in folder `against` or, if this is None, the reports of a rerun.
+    """
     for name in names:
         plan.scene_file(root, name)
     # Committed reports are read first, so that errors in them are found before the rerun, which takes hours.

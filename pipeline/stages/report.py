@@ -60,7 +60,10 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write our table 2 and its figure as soon as the networks are trained; stage report writes both again."""
+    """Write our version of the paper's table 2 and its figure, as soon as the networks are trained.
+
+    The stage report writes both again, with the other results.
+    """
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -111,7 +114,17 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of stage report: results of training runs and experiments by name, and counts of captures."""
+    """Inputs of stage report, which are the results of other stages.
+
+    - cards: model cards (JSON descriptions) of all trained networks.
+    - points: points of the curves of sweeps, by experiment.
+    - analyses, studies: results of experiments, by name.
+    - described: descriptions of the captures' fields, noise and forces.
+    - final_model: numbers on the final model.
+    - before_touch: scores of places that are predicted before a contact.
+    - ingest_counts: counts of read and lost readings of each capture.
+    - dropped: numbers of rows that were left out, by reason.
+    """
 
     cards: list[dict[str, Any]]
     points: dict[str, Any]

@@ -83,9 +83,9 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Networks are trained in stacks (several networks in one computation), and the cache reuses only whole stacks.
-    # Folds with most training skins come first, so that the folds with all training skins form the same stacks as in
-    # stage train_multi.
+    # Several networks are trained in one computation, which is called a stack. The cache can reuse a result only if the
+    # whole stack is the same. The folds with most training skins come first, so that the folds with all training skins
+    # form the same stacks as in stage train_multi, and are not trained again.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
     # One seed per draw of skins is enough, because the random numbers of a network depend on the fold's name, which
     # contains the draw.

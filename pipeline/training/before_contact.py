@@ -1,9 +1,12 @@
-"""Predict places from inputs without the contact's signal, on the folds within one skin, and score the predictions.
+"""Predict places from inputs that do not contain the signal of the contact, on the folds within one skin.
 
-The method is k nearest neighbours (k = 2). The input is either the no-load field, or the number of the indentation in
-its pass. If such predictions are accurate, networks may have learnt places from the order of the scan rather than from
-contacts. The hover control uses models that were trained on contacts to predict the place of a hovering tip. The
-accuracy of the hover control is at chance level, unless the chips sense the tip itself.
+A rig presses the places of a skin in some order (a scan). A network could learn this order instead of the contacts. To
+find out, places are predicted by k nearest neighbours (k = 2) from one of two inputs: the no-load field before the
+indentation, or the number of the indentation in its pass over the skin. If these predictions are accurate, networks may
+have learnt places from the order of the scan.
+
+The hover control tests another possible cause. Models that were trained on contacts predict the place of a tip that
+hovers over the skin without touching it. Their accuracy is at chance level, unless the chips sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +37,10 @@ BY_TIME = "single_temporal"  # experiment that trains on some passes and tests o
 
 @dataclass(frozen=True)
 class Scan:
-    """For each row of the scene, the no-load field and the number of the row's indentation in its pass."""
+    """What is known about each row of the scene before the contact.
+
+    `noload_uT` is the no-load field, and `scan_i` is the number of the row's indentation in its pass over the skin.
+    """
 
     noload_uT: Float32[np.ndarray, "f ch"]
     scan_i: Int64[np.ndarray, " f"]
@@ -100,10 +106,11 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
 def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
 ) -> pa.Table:
-    """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
+    """Score places that are predicted without the signal of the contact, and the hover control.
 
-    networks: trained networks by fold, which the hover control uses in addition to nearest neighbours. The table has
-    one row for each fold and input, and one row for each fold and model of the hover control.
+    Places are predicted from the no-load field alone, and from the number of the indentation in its pass alone. The
+    hover control uses nearest neighbours and the trained networks of each fold (`networks`). The returned table has one
+    row for each fold and input, and one row for each fold and model of the hover control.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))

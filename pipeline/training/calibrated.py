@@ -1,4 +1,4 @@
-"""Experiment calibrated: a finished universal model, calibrated to each held-out board, scored on the test rows.
+"""Experiment `calibrated`: a finished universal model is calibrated to each held-out board and scored on its test rows.
 
 The model is the one that comes with the project, or one that `reskin model make` made for the layout of the scene's
 boards. No recording is used to train it.
@@ -26,10 +26,12 @@ from reskin.universal.model import FILE, Universal, load_universal
 
 
 class Calibrated(Strict):
-    """Section calibrated: the model, and numbers of labelled presses of the held-out board.
+    """Settings section `calibrated`.
 
-    model: path of the model's .safetensors file in the checkout; its card is beside it. even: whether the presses are
-    at the places of a grid around the board's centre, with equally many presses at each place.
+    - model: path of the model's .safetensors file in the checkout. The card of the model must be beside it.
+    - labels_n: numbers of labelled presses of the held-out board.
+    - even: whether the presses are at the places of a grid around the board's centre, with equally many presses at each
+      place.
     """
 
     model: str
@@ -39,7 +41,10 @@ class Calibrated(Strict):
 
 @dataclass(frozen=True)
 class Frame:
-    """Conversion of a scene's labels to the coordinates of the model, and back; both are the same operation."""
+    """Conversion of places between the labels of a scene and the coordinates of the model.
+
+    The conversion in one direction is the same operation as the conversion back.
+    """
 
     centre_mm: tuple[float, float]
     mirrored: bool  # whether y of the labels points opposite to y of the board

@@ -3,8 +3,10 @@
 The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
 budget, which is the number of training steps, is not chosen, because each scene sets it. Every candidate is tried with
 the same budgets, and its errors are averaged over the budgets, so that no candidate wins by training longer. Settings
-with a collapsed training run are not chosen. Settings of adaptation are chosen together with the triplet weight of the
-network that is adapted, because without adaptation the triplet term only increases the error.
+with a collapsed training run (a network whose predictions are nearly constant) are not chosen.
+
+The triplet term of the loss only increases the error of a network, unless this network is adapted later. The weight of
+the triplet term is therefore chosen together with the settings of the adaptation.
 
 The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
 fingerprint that the current code computes.
@@ -40,10 +42,11 @@ Cards = Sequence[Card]
 
 
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
-    """Choose settings for every stage; return `recipe_name`, `settings`, `by` (the criterion) and scored `candidates`.
+    """Choose the settings of every stage.
 
-    The choice for `adapt` also has the error of the control, the same network fine-tuned for equally long without
-    pokes.
+    Returns for each stage the name of the chosen recipe (`recipe_name`), its `settings`, the criterion (`by`), and all
+    `candidates` with their scores. The choice for `adapt` also contains the error of the control. The control is the
+    same network, trained further for as many steps as the adapted network, but without pokes of the new skin.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))

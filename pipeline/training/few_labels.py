@@ -1,4 +1,4 @@
-"""Experiment labels: methods on a held-out board, with different numbers of labelled indentations of that board.
+"""Experiment `labels`: methods that receive different numbers of labelled indentations of a held-out board.
 
 Networks are trained, adapted with unlabelled indentations, and fine-tuned on labelled ones. Classical methods are
 fitted to the training rows and the labelled indentations. This module lists the training jobs;
@@ -27,11 +27,15 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
 class FewLabels(SectionWithRows):
-    """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
+    """Settings section `few_labels`.
 
-    adapted: recipes whose networks are also adapted with unlabelled indentations. adapting: settings of these
-    adaptations. labelling: settings of fine-tuning on labelled indentations. rows_max_n: maximum number of training
-    rows of a classical method.
+    - labels_n: numbers of labelled indentations of the held-out board.
+    - recipes: recipes of the networks that are trained.
+    - adapted: recipes whose networks are also adapted with unlabelled indentations.
+    - adapting: settings of these adaptations.
+    - labelling: settings of the fine-tuning on labelled indentations.
+    - rows_max_n: largest number of training rows to which a classical method is fitted.
+    - methods: classical methods.
     """
 
     labels_n: Labels

@@ -1,4 +1,8 @@
-"""Training for one scene: read rows and folds, make and run training jobs, write models with JSON cards."""
+"""Training for one scene: read rows and folds, make and run training jobs, and write the trained models.
+
+A training job describes the training of one network. Each model is written with a model card, which is a JSON file that
+describes its training, inputs, outputs and scores.
+"""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -51,7 +55,13 @@ class SceneData:
 
 @dataclass(frozen=True)
 class AdaptationPokes:
-    """Unlabelled pokes in lines of places that adapt a network to a skin; `experiment` and `what` name the job."""
+    """Unlabelled pokes to which a network is adapted.
+
+    - experiment, what: used in the name of the training job.
+    - skin: skin on which the pokes were made.
+    - seed_i: index of the seed of the network.
+    - lines: the pokes, ordered along lines of places.
+    """
 
     experiment: str
     skin: str
@@ -107,7 +117,10 @@ class _HasTimes(Protocol):
 
 
 def preload_training() -> None:
-    """Start the workers' fork server, which imports the training module while the stage reads its data."""
+    """Start the server process from which workers are forked, so that it imports the training module early.
+
+    The import takes seconds. It runs while the stage reads its data.
+    """
     prepare_workers(TRAINING_MODULE)
 
 
@@ -129,7 +142,11 @@ def training_data(data: SceneData) -> TrainingData:
 def make_jobs(
     data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
 ) -> list[TrainingJob]:
-    """Make a job for every fold, recipe and seed; without `experiment`, a job belongs to the experiment of its fold."""
+    """Make a training job for every fold, recipe and seed.
+
+    `experiment` is the experiment to which the jobs belong; if it is None, each job belongs to the experiment of its
+    fold.
+    """
     return [
         TrainingJob(
             experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test
@@ -208,7 +225,10 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 
 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
-    """Train the jobs whose results are not cached; return all results, record costs, and warn of diverged runs."""
+    """Run all training jobs whose results are not cached, and return the results of all jobs.
+
+    The costs are recorded, and a warning is printed for training runs that diverged.
+    """
     start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
@@ -313,7 +333,11 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions over all test rows and per skin, as they are and after subtracting an offset per board."""
+    """Score predictions over all test rows, and separately for each skin.
+
+    The scores over all test rows are computed for the predictions as they are, and also after the mean error of the
+    positions on each board was subtracted.
+    """
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 

@@ -1,8 +1,10 @@
-"""Make universal models for boards: `reskin model make`, and the shipped one: `python -m pipeline.training.shipping`.
+"""Make a universal model for a board.
 
-The second command takes a few minutes, and writes reskin/universal/universal.safetensors and its card. The networks
-have the training settings and the seed of scene lab, which tests the shipped model under the name
-`universal, simulated alone`. Likelihood powers are calibrated on simulated skins.
+Command `reskin model make` makes a model for a user's own board. Command `python -m pipeline.training.shipping` makes
+the model that comes with the project. It takes a few minutes, and writes reskin/universal/universal.safetensors and the
+card of the model. The networks are trained with the settings and the seed of scene lab. The report of scene lab
+contains the scores of this model under the name `universal, simulated alone`. Likelihood powers (exponents that set how
+wide the stated intervals are) are chosen on simulated skins.
 """
 
 import time
@@ -34,8 +36,10 @@ from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
 
-PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
-PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not
+# Numbers of unlabelled presses for which likelihood powers are chosen. `reskin live` asks users for 12 presses.
+PRESSES_N = (0, 12, FULL_SET_N)
+# Pairs of a number of presses, and whether the presses are spread evenly over the skin.
+PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "source": "simulated",
@@ -70,7 +74,11 @@ MADE = {
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Choose likelihood powers for a misfit of 1, by number of presses and labels, from coverage on simulated skins."""
+    """Choose the likelihood powers of a model, for each number of presses and labels.
+
+    The powers are those for which the 90 % intervals have the right coverage on simulated skins. They are for a misfit
+    of 1; on a skin, the power is divided by the misfit of this skin.
+    """
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in CALIBRATION_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
@@ -108,7 +116,10 @@ def calibrate(
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` needs two."""
+    """Return the coverage of 90 % intervals for each likelihood power.
+
+    The result has two equal columns, because `best_powers` expects one column for the map and one for the combination.
+    """
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
     covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]

@@ -1,8 +1,9 @@
-"""The universal model on held-out boards: choose the powers of its likelihoods, calibrate it, and score it.
+"""The universal model on held-out boards: choose its likelihood powers, calibrate it, and score it.
 
-The model combines a map (a Gaussian model of the reading for each place and force) with networks. Places and forces are
-weighted by a power of their likelihood. In this module, the power affects only the standard deviations of estimates,
-and thus their intervals.
+The model combines a map with networks. The map is a Gaussian model of the reading for each place and force, and gives
+the likelihood of each place and force for a reading. Errors of the channels are not independent, so the likelihood
+itself would usually be too certain. It is therefore raised to a power, the likelihood power. In this module, the
+likelihood power affects only the standard deviations of estimates, and thus the width of their 90 % intervals.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -41,12 +42,19 @@ from reskin.universal.model import (
 from reskin.universal.population import PLACES_N, Population, draw_population
 
 EXPERIMENT = "labels"  # experiment whose folds are scored
-METHODS = ("universal map, ", "universal, ")  # first words of a method's name: for the map alone; for map and networks
-WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # last words of a method's name, by variant
-BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate powers for variant `rig`, chosen on the other boards
-NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidate powers of variant `nominal` for a misfit of 1
-ASSUMED_POWER = 0.5  # for places and forces of the map alone; 0.5 would be exact if channels had equal errors in pairs
-FORCE_MIN_N = float(FORCES_N[0])  # smallest force of the map; smaller forces of labelled presses are raised to it
+# Beginning of the name of a method in tables, for the map alone, and for the map together with the networks.
+METHODS = ("universal map, ", "universal, ")
+# End of the name of a method in tables, by variant of the model. Variant `rig` is made with the other boards of the
+# same rig, and variant `nominal` is made from simulated skins alone.
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
+BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidate likelihood powers of variant `rig`
+# Candidate likelihood powers of variant `nominal`, for a board on which the misfit of the map is 1.
+NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())
+# Likelihood power with which the map alone estimates places and forces. The value 0.5 would be exact if the channels
+# formed pairs with equal errors.
+ASSUMED_POWER = 0.5
+# Smallest force of the map; labelled presses with smaller forces are set to this force
+FORCE_MIN_N = float(FORCES_N[0])
 
 
 class Powers(NamedTuple):
@@ -65,10 +73,12 @@ class Estimates(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """The data, nominal model and likelihood powers that all folds share.
+    """What all folds share.
 
-    board_powers: likelihood powers of variant `rig`, by held-out board and number of labels. nominal_powers: likelihood
-    powers of variant `nominal` for a misfit of 1, by number of labels.
+    - known: the recorded boards of the scene.
+    - nominal: variant `nominal` of the model, made from simulated skins alone.
+    - board_powers: likelihood powers of variant `rig`, by held-out board and number of labels.
+    - nominal_powers: likelihood powers of variant `nominal` for a misfit of 1, by number of labels.
     """
 
     known: KnownBoards
@@ -100,7 +110,10 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Lower the nominal variant's powers, which are for a misfit of 1, according to the misfit of this pool."""
+        """Divide the likelihood powers of the nominal variant by the misfit of this pool's presses; limit them to 1.
+
+        `powers` are the likelihood powers for a misfit of 1.
+        """
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
@@ -132,15 +145,20 @@ def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: S
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Return `estimate` with the rms errors that its places have if the true place is distributed as in `other`.
+    """Return the places of `estimate` with standard deviations that are derived from another estimate.
 
-    The rms errors replace the standard deviations of `estimate`.
+    The true place is assumed to be distributed as `other` states. The standard deviations of `estimate` are replaced by
+    the rms errors that its places then have.
     """
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 
 def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequence[Powers]) -> list[Powers]:
-    """Lower powers according to the variance inflation from cross-validation over the pool's first labels."""
+    """Divide likelihood powers by the variance inflation of the labels, and limit them to 1.
+
+    The variance inflation is the factor by which the squared errors at held-out labels exceed the variances that the
+    model states. It is computed by cross-validation over the first `labels_n` labels of the pool.
+    """
     by_map: list[HeldOut] = []
     combined: list[HeldOut] = []
     for kept, held_out in folds_of_labels(min(labels_n, len(calibration.pool))):
@@ -157,7 +175,10 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
 
 
 def fit_force_line(calibration: PoolCalibration, labels_n: int) -> ForceLine:
-    """Fit the calibration line of forces by cross-validation; return the prior line for fewer than `FEW_N` labels."""
+    """Fit the calibration line, which corrects estimated forces, by cross-validation over the labels.
+
+    Returns the prior line, which is used without labels, if there are fewer than `FEW_N` labels.
+    """
     labels_n = min(labels_n, len(calibration.pool))
     if labels_n < FEW_N:
         return prior_line()
@@ -171,7 +192,10 @@ def fit_force_line(calibration: PoolCalibration, labels_n: int) -> ForceLine:
 def score_fold(
     benchmark: Benchmark, fold: Fold, rig: Mapping[str, Variant], labels_n: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Score both variants, each with and without networks, on the test rows of a fold, for every number of labels."""
+    """Score the universal model on the test rows of a fold, for every number of labels.
+
+    Both variants (`rig` and `nominal`) are scored, each as the map alone, and as the map with networks.
+    """
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
     if board not in known.presses:  # if a board has several skins, the keys of `presses` name both board and skin
@@ -240,16 +264,18 @@ def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = 24  # skins simulated with each of CALIBRATION_ERRORS, to choose the nominal variant's powers
+# Number of skins that are simulated with each of CALIBRATION_ERRORS, to choose the nominal variant's likelihood powers.
+CALIBRATION_SKINS_N = 24
 
 Coverages = Float[np.ndarray, "t 2"]  # rows: powers; columns: the map alone, the map with networks
 LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns field changes with errors of the law added
 
 
 def law_error(scale: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, which are `scale` times as large as in training.
+    """Return a function that adds random errors of the law to field changes.
 
-    The law is the physical model of a skin.
+    The law is the physical model of a skin, from which the map is computed. The errors are `scale` times as large as in
+    the training of the model.
     """
     least, most = ERROR_OF_NOMINAL
 
@@ -259,19 +285,22 @@ def law_error(scale: float = 1.0) -> LawError:
     return add
 
 
-# Sizes of errors that the map does not model and that presses hardly reveal. MEMORY_MAX: largest fraction of another
-# press's field change that remains in the no-load reading; 5 to 8 % were measured on the recordings of scenes lab and
-# eflesh. DIFFERENCE_MAX: largest scale of the relative difference between equal presses; assumed. The difference has
-# heavy tails; its median length over 15 channels is 1.4 times the scale.
+# Sizes of two errors that the map does not model, and that calibration presses hardly reveal.
+# - MEMORY_MAX: largest fraction of an earlier press's field change that remains in the no-load reading. In the
+#   recordings of scenes lab and eflesh, 5 to 8 % were measured.
+# - DIFFERENCE_MAX: largest scale of the random relative difference between equal presses. The value is assumed. The
+#   difference has heavy tails; its median length over 15 channels is 1.4 times the scale.
 MEMORY_MAX, DIFFERENCE_MAX = 0.15, 0.3
 HEAVY_TAILS = 3  # degrees of freedom of Student's t
 
 
 def unmodelled_error(scale: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, memory of another press, and differences between equal presses.
+    """Return a function that adds three kinds of errors to field changes.
 
-    The errors of the law are `scale` times as large as in training. For each skin, the size of the memory is drawn
-    uniformly from 0 to `MEMORY_MAX`, and the size of the differences from 0 to `DIFFERENCE_MAX`.
+    - Errors of the law, which are `scale` times as large as in training.
+    - Memory: a fraction of another press's field change remains. For each skin, this fraction is drawn uniformly from 0
+      to `MEMORY_MAX`.
+    - Differences between equal presses. For each skin, their size is drawn uniformly from 0 to `DIFFERENCE_MAX`.
     """
     add_law_error = law_error(scale)
 
@@ -287,13 +316,17 @@ def unmodelled_error(scale: float = 1.0) -> LawError:
     return add
 
 
-# Errors of the simulated skins on which powers are chosen, by name. The names are also the names of random streams.
+# Errors of the simulated skins on which likelihood powers are chosen, by name. The names also select the random
+# streams.
 AS_TRAINED = "further"
 CALIBRATION_ERRORS = {AS_TRAINED: unmodelled_error(), "further, missed twice": unmodelled_error(2.0)}
 
 
 def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[str, dict[int, Powers]]:
-    """Choose, for each held-out board and number of labels, the powers with the best coverage on the other boards."""
+    """Choose the likelihood powers of variant `rig`, for each held-out board and number of labels.
+
+    For each held-out board, the powers with the best coverage of intervals on the other boards are chosen.
+    """
     by_board = {board: _board_coverages(benchmark, board, labels_n) for board in benchmark.known.presses}
     return {
         board: {
@@ -307,10 +340,12 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
     """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
 
-    For a board, the chosen powers are divided by the board's misfit (Birge's ratio) and by the variance inflation of
-    its labels. The simulated skins have errors of the law that are as large as in training, and errors that the map
-    does not model (`unmodelled_error`). If there are labels, whose residuals reveal the size of the errors, skins whose
-    errors of the law are twice as large are added.
+    When the model is used on a board, the chosen powers are divided by the misfit of this board (Birge's ratio), and by
+    the variance inflation of its labels.
+
+    The simulated skins have errors of the law that are as large as in training, and errors that the map does not model
+    (see `unmodelled_error`). If there are labels, skins with twice as large errors of the law are also used, because
+    the residuals at the labels then reveal how large the errors are.
     """
     by_labels_n: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in CALIBRATION_ERRORS.items():

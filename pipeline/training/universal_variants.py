@@ -38,10 +38,13 @@ FORMAT = "reskin-universal-1"
 
 @dataclass(frozen=True)
 class Frame:
-    """Conversions from chip axes to board axes, and between label coordinates and the board's frame.
+    """Conversions between the coordinates of a recording and the coordinates of the board.
 
-    turn: for each chip, the rotation from the chip's axes to the board's axes. middle_mm: the board's centre in label
-    coordinates. mirrored: whether y of the labels points opposite to y of the board.
+    Fields are recorded in the axes of each chip, and places in the coordinates of the labels.
+
+    - turn: for each chip, the rotation from the chip's axes to the board's axes.
+    - middle_mm: centre of the board in label coordinates.
+    - mirrored: whether y of the labels points opposite to y of the board.
     """
 
     turn: Float[np.ndarray, "k 3 3"]
@@ -91,7 +94,11 @@ class Variants(NamedTuple):
 
 
 def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
-    """Fit a physical model (law) to each known board; then tabulate a map and train networks for each variant."""
+    """Make all variants of the universal model.
+
+    A physical model (law) is fitted to each known board. For each variant, a map is then tabulated from the laws, and
+    networks are trained.
+    """
     from reskin.universal.training import train_networks  # imported late, because it imports PyTorch
 
     with make_executor(imports="reskin.universal.training") as executor:
@@ -128,7 +135,10 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior made from the laws, the errors of the laws, and the readings of all boards except `board`."""
+    """Return the prior for held-out board `board`: it is made from all other boards.
+
+    The prior contains the mean law of the other boards, the errors of their laws, and their readings.
+    """
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
@@ -137,7 +147,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit a residual to the relative errors that each law has on the board to which the law was fitted."""
+    """Fit a model of the laws' errors, to the relative errors of each law on the board to which the law was fitted."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -149,7 +159,10 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select `READINGS_N` training readings of each press with a force; a press with fewer readings repeats them."""
+    """Select `READINGS_N` training readings of each press that has a force.
+
+    If a press has fewer readings, its readings are repeated.
+    """
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     rows_by_press = own[

@@ -1,4 +1,4 @@
-"""Stability: the behaviour of physics, chips, wire formats and learning in stiff, extreme and faulty cases."""
+"""Stability: how the simulated physics, the chips, the wire formats and learning behave in extreme and faulty cases."""
 
 from dataclasses import asdict
 from pathlib import Path

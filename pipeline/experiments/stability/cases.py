@@ -1,7 +1,7 @@
 """Class `Case`, whose instances are the rows of the stability experiment's table, and functions that create cases.
 
-The other modules of this package run cases with given inputs. The experiment passes the inputs of a scene; the tests
-pass random inputs.
+The other modules of this package define cases as functions of their inputs. The experiment calls these functions with
+the inputs of a scene, and the tests call them with random inputs.
 """
 
 import tracemalloc
@@ -13,7 +13,10 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """The result of one case: expected and observed behaviour and, if an error is measured, the error and its limit."""
+    """The result of one case: what should happen, what happened, and whether the two agree.
+
+    If the case measures an error, `error` and `limit` are this error and the largest accepted error.
+    """
 
     area: str
     case: str

@@ -1,7 +1,7 @@
-"""Class `Check`, whose instances are the rows of the verification experiment's table, and error measures.
+"""Class `Check`, whose instances are the rows of the verification experiment's table, and measures of error.
 
-The other modules of this package run checks with given inputs. The experiment passes the inputs of a scene; the tests
-pass random inputs.
+The other modules of this package define checks as functions of their inputs. The experiment calls these functions with
+the inputs of a scene, and the tests call them with random inputs.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,21 @@ from reskin.physics.board import Spreads
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check: a property (`law`) of `subject` is compared with the reference `against`.
+    """The result of one check, which compares a property of the simulator with a reference.
 
-    `reason` explains why the tolerance is this large.
+    - subject: the part of the simulator that is checked.
+    - law: the property of this part that is checked.
+    - against: the reference.
+    - error: the difference from the reference, in `unit` ("1" for a relative error).
+    - tolerance: the largest accepted error.
+    - reason: why the tolerance is this large.
     """
 
     subject: str
     law: str
     against: str
     error: float
-    unit: str  # "1" for a relative error
+    unit: str
     tolerance: float
     reason: str
 

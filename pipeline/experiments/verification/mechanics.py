@@ -1,6 +1,7 @@
-"""Checks of contact, force, friction, deformation and dB of indentations.
+"""Checks of the simulator's mechanics: contact, force, friction and deformation of indentations, and the resulting dB.
 
-The references are closed forms, published fits, rings of pressure, finite differences, finer steps, and symmetries.
+dB is the change of the field. The references are closed forms, published fits, an approximation of the contact by rings
+of uniform pressure, finite differences, computations in finer steps, and symmetries.
 """
 
 from collections.abc import Callable
@@ -30,8 +31,8 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # a layer this thick acts as a half-space under a tip of a few millimetres
-A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fitted 1.780)
+HALF_SPACE_M = 100.0  # under a tip of a few millimetres, a layer of this thickness behaves like a half-space
+A0 = 1.770  # integral of (1 - compliance) over k h; Dimitriadis et al. 2002 fitted 1.780
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
@@ -90,11 +91,11 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
 
 
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
-    """Return W(z), the profile of the vertical displacement in a layer on a sliding base, under a pressure wave.
+    """Return the function W(z), which is the vertical displacement in a layer on a sliding base under a pressure wave.
 
-    The pressure wave has amplitude 2 G k, where G is the shear modulus and k the wave number. The height z is in units
-    of 1 / k. W satisfies four boundary conditions: W'' + W = 0 on both faces, W = 0 on the base, and 3 W' - W''' = 2 on
-    the surface.
+    The pressure on the surface is a wave with wave number k and amplitude 2 G k, where G is the shear modulus. The
+    height z is in units of 1 / k. W satisfies four boundary conditions: W'' + W = 0 on both faces of the layer, W = 0
+    on the base, and 3 W' - W''' = 2 on the surface.
     """
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
@@ -163,10 +164,10 @@ def rings(depth_m: float, press: IndentedLayer) -> Check:
 
 
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
-    """Divide the simulator's contact area into rings; return the radii of the ring edges and the pressure on each ring.
+    """Divide the simulator's contact area into rings, and find the uniform pressure on each ring.
 
-    The pressures are in units of 2 G, where G is the shear modulus. They are found by collocation at the middle of each
-    ring.
+    The pressures are chosen such that the surface touches the tip at the middle of each ring (collocation). Returns the
+    radii of the ring edges, and the pressures in units of 2 G, where G is the shear modulus.
     """
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
@@ -331,10 +332,10 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that, far from the tip on a slipping base, r^2 of all material points grows by the same amount.
+    """Check how far the material moves outwards at a large distance from the tip, if the base slips.
 
-    Here, r is the distance from the tip's axis. The growth may depend neither on height nor on r, because the layer is
-    incompressible.
+    r is the distance of a material point from the tip's axis. As the layer is incompressible, r^2 must grow by the same
+    amount at all points, whatever their height and their distance.
     """
     h_m = press.thickness_m
     r_m, z_m = (grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
@@ -355,9 +356,10 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
     """Return the dipoles of a skin that has been indented and has slid on its base.
 
-    The depth increases in the steps `depths_m` (true depths). The motion of the dipoles is computed without tables.
-    Each moment is rotated by R, where F = R U is the polar decomposition of the deformation gradient at the dipole,
-    computed by singular value decomposition. No dipole may be on the tip's axis.
+    The depth increases in the steps `depths_m` (true depths). Unlike the simulator, this function computes the motion
+    of each dipole directly, without interpolation in tables. Each moment is rotated by R, the rotation in the polar
+    decomposition F = R U of the deformation gradient F at the dipole. The decomposition is computed by singular value
+    decomposition. No dipole may be on the tip's axis.
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
@@ -427,10 +429,10 @@ def quadrature(
     pokes_m: Float[np.ndarray, "n 3"],
     unseen_uT: float = UNSEEN_uT,
 ) -> list[Check]:
-    """Compare dB of a skin with dB of the same skin with narrower cells, and with more layers.
+    """Check that the quadrature rule of a skin is fine enough.
 
-    `fine` are the skins with narrower cells and with more layers; `rules` are the quadrature rules of all three skins.
-    Differences of a channel below `unseen_uT` are not visible in readings.
+    dB of the skin is compared with dB of the same skin with narrower cells, and with more layers (`fine`). `rules` are
+    the quadrature rules of the three skins. Differences below `unseen_uT` in a channel are not visible in readings.
     """
     found_T, cells_T, layers_T = (changes_of_field(board, variant, pokes_m)[1] for variant in (skin, *fine))
     size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)

@@ -372,8 +372,9 @@ def hereditary(
 ) -> Float[np.ndarray, " t"]:
     """Return the relaxed force at each time, from the hereditary integral of Lee & Radok with 50 digits.
 
-    The integral of relaxation(t - s) d elastic(s), over all earlier times s, is summed over the linear pieces of the
-    elastic force. Unlike `aging.relax`, this function does not propagate a state from one piece to the next.
+    The integral is that of relaxation(t - s) d elastic(s) over all earlier times s. Between two successive times, the
+    elastic force is linear, so the integral over this interval has a closed form, and these are summed. Unlike
+    `aging.relax`, this function does not compute the state at one time from the state at the time before.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (
