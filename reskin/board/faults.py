@@ -291,7 +291,7 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Return the step of the grid on which the values of all given axes lie; NaN if there is no such grid."""
+    """Return the step of the grid on which the values of all given axes lie; NaN if no grid is detected."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):

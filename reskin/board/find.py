@@ -41,7 +41,7 @@ class DetectedBoard(NamedTuple):
     rate_hz: float = np.nan
     lsb_uT: tuple[float, float] = (np.nan, np.nan)  # LSB along x and y, and LSB along z; each is the median over chips
     rate: RateMeasurement | None = None  # None if there is no board
-    frame_bytes_n: float = np.nan  # mean length of a frame
+    frame_bytes_n: float = np.nan  # mean length of a frame in bytes
 
     @property
     def gain_sel(self) -> int | None:
@@ -67,7 +67,7 @@ class DetectedBoard(NamedTuple):
         return "steps not known yet: do the readings change?"
 
     def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
-        """Describe the measured rate, its likely explanation, and the computed limits, in several lines."""
+        """Return a text of several lines with the measured rate, a possible explanation, and the computed limits."""
         if self.problem is not None or self.rate is None:
             return str(self)
         rate = self.rate

@@ -65,11 +65,12 @@ def check_name(port: str) -> None:
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
     """Return the bytes that are waiting or arrive within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
-    if isinstance(device, serial.Serial):  # wait for one byte, then read all bytes that are waiting
+    if isinstance(device, serial.Serial):  # first wait for one byte, and then read all other bytes that have arrived
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
         return first + device.read(waiting_n) if waiting_n > 0 else first
-    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket does not report how many bytes are waiting
+    # A socket does not report how many bytes have arrived, so wait until it can be read, and read once.
+    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)
     return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
 
 

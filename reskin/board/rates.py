@@ -80,7 +80,7 @@ class RateMeasurement:
 
     @property
     def new_hz(self) -> float:
-        """New readings of a chip per second."""
+        """Number of readings of a chip per second that do not repeat the previous reading."""
         return self.arrived_hz * (1 - self.repeated_readings)
 
 

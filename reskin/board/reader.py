@@ -64,7 +64,7 @@ class Reader:
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
-        """Remove and return all queued chunks; if there are none, wait for one for at most `wait_s`."""
+        """Remove all chunks from the queue and return them; if there are none, first wait for one, at most `wait_s`."""
         with self._arrived:
             self._arrived.wait_for(lambda: bool(self._chunks), wait_s)
             chunks = list(self._chunks)
@@ -74,7 +74,10 @@ class Reader:
         return chunks
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """Close the current recording, if any, and write all later chunks to `writer` (None: to no recording)."""
+        """Close the current recording, if there is one, and write all later chunks to `writer`.
+
+        If `writer` is None, later chunks are not written.
+        """
         with self._arrived:
             previous, self.writer, self.writer_problem = self.writer, writer, ""
         if previous is not None:

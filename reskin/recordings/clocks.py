@@ -81,7 +81,7 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 
 
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Return the time of each frame in s from the start of a stream with a constant frame rate.
+    """Return the time of each frame in s, counted from the start of the stream, if the frame rate is constant.
 
     `frame` is the position in the stream at which each frame ends, measured in frames. If all frames have the same
     length, this is the number of bytes up to the frame's end, divided by the length of a frame; damaged bytes then also
@@ -118,8 +118,8 @@ MARGIN_MIN = 1.5
 # At each offset, stream and dwells overlap in a part of the time. Offsets are ignored if this overlap is less than this
 # fraction of the largest overlap at any offset, because the few dwells in a small overlap can fit by chance.
 OVERLAP_MIN = 0.5
-# A peak of the match can have a flat top. Its position is therefore the middle between the two points where the match
-# has dropped to 5 % below the top.
+# As a function of the offset, the match has a peak, whose top can be flat. The position of the peak is therefore taken
+# as the middle between the two offsets at which the match is 5 % below the top.
 PEAK_DROP = 0.05
 # A frame is in contact if the distance of its field from the no-load field exceeds this multiple of the noise. The
 # noise is the median distance of frames without contact. With 15 channels, this threshold is 2.7 standard deviations

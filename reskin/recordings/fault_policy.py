@@ -34,7 +34,7 @@ FlagOrRefuse = Literal["flag", "refuse"]  # actions for faults for which no sing
 
 
 class FaultPolicy(Strict):
-    """The action taken for each fault; section `faults` of `params.yaml`."""
+    """The action that is taken for each kind of fault; section `faults` of `params.yaml` contains these actions."""
 
     failed_read: Action  # the I2C read of a chip failed
     zeros: Action  # a chip's reading consists of zeros
@@ -132,7 +132,7 @@ class CheckedRows(NamedTuple):
         }
 
     def part(self, rows: slice) -> "CheckedRows":
-        """Return a slice of the rows; `counts` still covers all rows."""
+        """Return the masks for a slice of the rows; `counts` stays the same, although it counts all rows."""
         return CheckedRows(self.keep[rows], self.failed[rows], self.stuck[rows], self.out_of_range[rows], self.counts)
 
 

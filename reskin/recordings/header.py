@@ -101,7 +101,7 @@ class Header(_Frozen):
     protocol: str
     contacts_before_n: Annotated[int, Field(ge=0)]
     options: dict[str, str]
-    files: dict[str, str]  # name -> sha256 of each file except this header
+    files: dict[str, str]  # names of all files except this header -> their SHA-256 hashes
     note: str
     rate: Rate | None = None
 

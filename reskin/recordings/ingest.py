@@ -140,7 +140,7 @@ class Joiner:
         return self._readings(pending)
 
     def account(self) -> dict[str, int]:
-        """Return the counts of frames and indentations so far: in total, used, and dropped by reason."""
+        """Return the counts of frames and indentations so far: all, those used, and those dropped for each reason."""
         counted = {name: self._count[name] for name in COUNTS}
         counted |= {OUT_OF_RANGE: self._count[OUT_OF_RANGE]} if self._count[OUT_OF_RANGE] else {}
         logged_n = int((~self._log.contact).sum())

@@ -52,11 +52,11 @@ class LabelContext:
 
 
 class LabelSource(NamedTuple):
-    """A source of labels."""
+    """A source of labels, which a recording runs in a thread of its own (see `LabelThread`)."""
 
     name: str  # name of the source, for the capture's header
     scan: str | None  # order of the places
-    # function that writes labels until they end or the recording stops, and returns a summary
+    # function that writes labels until there are no more labels or the recording stops, and then returns a summary
     run: Callable[[LabelContext], str]
 
 
@@ -318,7 +318,8 @@ def from_gauge(port: str, baud: int) -> LabelSource:
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
-# A place, a force, or both, separated by a space. The space is needed, because 12N could also mean place 1 with 2 N.
+# The person types a place, a force, or both. The space between them is needed: without it, 12N could mean a force of 12
+# N or place 1 with a force of 2 N.
 REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 

@@ -40,7 +40,7 @@ class CaptureInfo:
 
 
 class CaptureResult(NamedTuple):
-    """A finished recording and its labels."""
+    """The result of a finished recording: the summaries of its stream and of its labels."""
 
     stream: Recording
     labels: str  # a summary of the labels for the user

@@ -29,8 +29,9 @@ from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 # formats in which they can be decoded.
 HEAD_BYTES_N = 16384
 
-Report = Callable[[Mapping[str, int]], None]  # called many times a second with the counts of `FrameStream.account`
-Watch = Callable[[Frames], object]  # called with frames as they arrive
+# a function that is called many times a second during a recording, with the counts of `FrameStream.account`
+Report = Callable[[Mapping[str, int]], None]
+Watch = Callable[[Frames], object]  # a function that is called with the new frames whenever bytes have arrived
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
 
 
@@ -41,8 +42,8 @@ class PortSettings:
     baud: int
     wire: Wire
     chips_n: int
-    duration_s: float  # math.inf: no limit
-    bytes_max_n: int | None  # None: no limit
+    duration_s: float  # the recording ends after this time; math.inf means no limit
+    bytes_max_n: int | None  # the recording ends after this many bytes; None means no limit
     silence_s: float  # the recording ends if the port sends nothing for this long
     no_frame_s: float  # the recording ends if no frame has arrived this long after the first byte
 
@@ -95,7 +96,7 @@ class CaptureWriter:
         self.bytes_n = self.partial_line_bytes_n = 0
         self.decoder = FrameStream(wire, chips_n)
         self._chips_n = chips_n
-        self._meter: RateMeter | None = None  # None before the first bytes
+        self._meter: RateMeter | None = None  # None until the first bytes arrive
         self._in_partial_line = wire in TEXT_WIRES
         # The files are not buffered. Therefore, no written data is lost if the process is killed, and closing the files
         # cannot fail because of a full disk.
@@ -142,7 +143,7 @@ class CaptureWriter:
 
 
 class _Recorder:
-    """A recording in progress."""
+    """A recording in progress, which reads from a port and writes to a capture."""
 
     def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
         self._port, self._settings, self._writer, self._watch = port, settings, writer, watch

@@ -11,10 +11,11 @@ from reskin.errors import CaptureError
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.tables import FIRST_ROW
 
-# Full scale of an MLX90393 at its coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3): 2^15 steps (data sheet, table 17).
+# Largest field that an MLX90393 can send: 2^15 steps of its coarsest LSB, which is 9.680 uT along z with GAIN_SEL 0 and
+# RES 3 (data sheet, table 17).
 FULL_SCALE_uT = 32768 * 9.680
-# If the median field is below this number, it is not in uT, because the earth's field alone is 25 to 65 uT, and a chip
-# under a skin reads 200 to 9000 uT. In mT or T, the numbers are smaller.
+# If the median field is below this number, the fields are not in uT but in a larger unit, such as mT or G. In uT, even
+# the earth's field is 25 to 65, and a chip under a skin reads 200 to 9000.
 WEAKEST_uT = 20.0
 # Values in gauss are recognised by two conditions. The median field is below this number: the field of the strongest
 # known skin is 13000 uT, which is 130 G. And the steps between values are smaller than the steps of any chip in uT.

@@ -35,7 +35,7 @@ STATES = "states.csv"
 FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
-NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
+NEWTON_PER_GRAM = 9.80665e-3  # weight of one gram in standard gravity
 # Index of the column of the weight in states.csv, after time, x, y and z. There is no such column if the force was not
 # recorded.
 WEIGHT_COLUMN = 4
@@ -156,7 +156,7 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Raise unless the times in both files agree in every row, and increase."""
+    """Raise if the times in the two files differ too much in any row, or if the times do not increase."""
     disagreeing = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(disagreeing):
         where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"

@@ -203,7 +203,7 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
 def _noload_field(
     b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
 ) -> Float64[np.ndarray, "f ch"]:
-    """Return for each row the mean field over the corner rows of its pass."""
+    """Return the no-load field of each row: the mean field over the corner rows of the row's pass."""
     noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):

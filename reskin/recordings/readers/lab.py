@@ -77,7 +77,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the contact rows as readings; the no-load field of a press is the mean field of its `noload` rows."""
+    """Return the contact rows as readings.
+
+    The no-load field of a press is the mean field of its rows with phase `noload`.
+    """
     where = f"{header.capture}/{READINGS}"
     table, rows = _read_checked(folder, header, policy, where)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep

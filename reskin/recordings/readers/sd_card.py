@@ -21,7 +21,7 @@ from reskin.recordings.units import check_fields
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
-# assumed: no board logs at a lower rate, and no chip measures at a higher rate
+# Assumed limits of the frame rate: no board logs at a lower rate, and no chip measures at a higher rate.
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
 SHOWN_CHIPS_MAX = 5  # if there are more chips, the line of column names is too long for an error message
 # Assumed: if a smaller fraction of the frames is fault-free, the log is refused, because contacts would be missed.
