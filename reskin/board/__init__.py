@@ -1,1 +1,1 @@
-"""Boards: wire formats, ports and faulty readings."""
+"""Communication with boards: ports, the formats of the bytes that a board sends, frame rates, and faulty readings."""

@@ -1,8 +1,8 @@
 """Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. Two other
-modules decide what happens to faulty readings: `recordings.fault_policy` for recordings, and `live.health` for live
-boards.
+Each function detects one kind of fault. `FaultDetector` finds all kinds of faults in a stream of frames, which may be
+passed to it in several parts of any length. Two other modules decide what happens to faulty readings:
+`recordings.fault_policy` for recordings, and `live.health` for live boards.
 """
 
 from typing import NamedTuple
@@ -13,71 +13,88 @@ from jaxtyping import Bool, Float, Float64, Int
 from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from reskin.board.wire import Frames
 
-# Values that the ReSkin firmware sends for a chip whose I2C read failed, found in INI's public recording AFG_flex_50.
+# Values that the ReSkin firmware sends for a chip whose I2C read failed. They were found in AFG_flex_50, one of the
+# public recordings of layout `ini`.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
-FAILED_TOLERANCE = 0.01  # text formats round to two decimals
+FAILED_TOLERANCE = 0.01  # a reading counts as failed if it differs by less, because text formats round to two decimals
 
-# The LSB of a chip with its power-on settings, found in INI's public recordings AFG_test_new_board15 and piezo.
+# The LSB of a chip is the step between neighbouring values that the chip can send. These are the LSBs of a chip with
+# its power-on settings, found in AFG_test_new_board15 and piezo, two public recordings of layout `ini`.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
-LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
+# Two LSBs are treated as different if they differ by more than this fraction. The LSBs of different gains of the
+# MLX90393 differ by 20 % or more (data sheet, table 17).
+LSB_TOLERANCE = 0.1
 
-# The values of a channel are multiples of the chip's LSB, so they lie on a grid whose step is the LSB. Sort the
-# distinct values of a channel; the differences between neighbours are called gaps. A grid is detected if enough gaps
-# equal one step: at least the fraction STEP_SHARE_MIN of all gaps, and at least STEPS_MIN_N gaps. In the first 200
-# frames of 14 real recordings, 5 % or more of the gaps equal one step. If the values are not on a grid, only one or two
-# gaps are close to the smallest gap, by chance.
+# The values of a channel are multiples of the chip's LSB, so they lie on a grid whose step is the LSB. To find this
+# step, the distinct values of a channel are sorted. The difference between two neighbouring values is called a gap. A
+# grid is detected if enough gaps equal one step: at least the fraction STEP_SHARE_MIN of all gaps, and at least
+# STEPS_MIN_N gaps. In the first 200 frames of 14 real recordings, 5 % or more of the gaps equal one step. If the values
+# are not on a grid, only one or two gaps are close to the smallest gap, by chance.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
-# Maximum relative standard deviation of the gaps that count as one step (gaps below 1.5 times the smallest gap). This
-# deviation is 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
+# Gaps below 1.5 times the smallest gap are assumed to be one step each, so they must be nearly equal: their standard
+# deviation, divided by their mean, must not exceed this value. This ratio is 0.02 if the LSB is 0.242 uT and the values
+# are written with two decimals. It is 0.12 if the gaps are random.
 STEP_SPREAD_MAX = 0.06
-SURE_STEPS_MIN_N = 20  # this many equal gaps do not occur by chance, even if there are few values and no noise
+# A stricter choice than STEPS_MIN_N. This many equal gaps do not occur by chance, even if there are few distinct
+# values, as in data without noise.
+SURE_STEPS_MIN_N = 20
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
-SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
+# A gap below this value is a rounding error of float32 arithmetic, so the two values are treated as equal.
+SAME_VALUE_uT = 1e-3
 
 # Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
-# its next conversion is finished (after 1.84 ms), or if the chip's LSB is coarse. In 14 real recordings, at most 3
-# successive frames are equal.
+# its next conversion is finished (after 1.84 ms), or if the chip's LSB is larger than the noise. In 14 real recordings,
+# at most 3 successive frames are equal. A chip is therefore stuck if at least this many successive readings are equal.
 STUCK_FRAMES_MIN_N = 20
 # A chip with a constant reading counts as stuck only if another chip changes in at least this fraction of the same
-# frames. The fraction is below 1 because, in data without noise, readings change only while the skin is pressed or
-# released.
+# frames. The fraction is not 1, because simulated data may have no noise: the readings of working chips then change
+# only while the skin is pressed or released, and are constant in the other frames.
 OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock counts as a jump
-# assumed: repeated frames are a fault if more than 40 % of the frames in a window of 40 frames (0.1 s at 400 Hz) equal
-# the previous frame
+# Assumed: repeated frames are a fault if, in a window of 40 frames (0.1 s at 400 Hz), more than 40 % of the frames
+# equal the frame before them.
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
-MISSING_STEPS = 1.6  # frames are missing if a step of the board's clock exceeds the median step by this factor
+# Frames are missing between two frames if the time between them, on the board's clock, exceeds the median time between
+# frames by this factor.
+MISSING_STEPS = 1.6
+# The board is silent if no frame arrives for a time that exceeds both SILENCE_S and SILENCE_STEPS times the median time
+# between frames. The second condition ensures that a low frame rate does not count as silence.
 SILENCE_S = 1.0
-# A silence must also exceed the median time between frames by this factor, so that a low frame rate is not a silence.
 SILENCE_STEPS = 50.0
-GARBAGE_FRAMES_N = 10  # if there are more stray bytes than this many frames have, the baud rate is probably wrong
+# If the number of stray bytes before a frame exceeds the length of this many frames, the baud rate is probably wrong.
+GARBAGE_FRAMES_N = 10
 LONG_LINE = 1.5  # a line of text that is longer than the median length by this factor contains stray bytes
 
-# in real recordings, this is enough to find the LSB of every working chip; 200 frames may be too few
+# A stream's LSB is estimated from windows of this many frames. In real recordings, this number is enough to find the
+# LSB of every working chip; 200 frames may be too few.
 SCALE_FRAMES_N = 400
-GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
+GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of about this many rows
 
 
 def failed_reads(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
 ) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose I2C read failed; unknown temperatures are NaN."""
+    """Mark the readings that the firmware sends for a chip whose I2C read failed.
+
+    Such a reading has the field `FAILED_B_uT` and the temperature `FAILED_TEMPERATURE_degC`. If the temperature is
+    unknown (NaN), only the field is compared.
+    """
     same_b = np.abs(_by_chip(b_uT) - FAILED_B_uT) <= FAILED_TOLERANCE
     same_temperature = np.abs(temperature_degC - FAILED_TEMPERATURE_degC) <= FAILED_TOLERANCE
     return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose three field components are exactly 0, as in memory that was never written.
+    """Mark the readings of a chip whose three field components are exactly 0.
 
-    Some rows of the public eFlashTeam7 recordings have zeros on all chips. In the earth's field, a chip cannot read 0
-    on three axes at once.
+    In the earth's field, a chip cannot read 0 on three axes at once, so such a reading comes from memory to which no
+    reading was written. Some rows of the public eFlashTeam7 recordings (layout `eflash7`) have zeros on all chips.
     """
     return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
 
@@ -85,10 +102,12 @@ def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 def find_lsb(
     b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
 ) -> Float[np.ndarray, "k 2"]:
-    """Estimate the LSB of each chip in uT (first column: x and y, second: z) from its values; NaN if undetectable.
+    """Estimate the LSB of each chip in uT from its readings.
 
-    A few hundred frames are enough. The LSB is undetectable if the settings of the chip change within these frames, if
-    fewer than `steps_min_n` gaps between neighbouring values equal one step, or if this step is below `step_min_uT`.
+    The first column of the result is the LSB along x and y, and the second column is the LSB along z. A few hundred
+    frames are enough. An LSB is NaN if it cannot be detected. There are three possible reasons: the settings of the
+    chip change within these frames; fewer than `steps_min_n` gaps between neighbouring values equal one step; or this
+    step is below `step_min_uT`.
     """
     chips = np.moveaxis(_by_chip(b_uT), 1, 0)
     steps_uT = np.array(
@@ -98,10 +117,11 @@ def find_lsb(
 
 
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
-    """Mark the chips whose LSB is not the expected one (along x and y, and along z).
+    """Mark the chips that were probably reset, because their LSB is not the expected one.
 
-    Without an expected LSB, mark the chips whose LSB differs from the median LSB of all chips or equals that of a chip
-    after a reset. A chip whose LSB cannot be detected is not marked.
+    `expected_lsb_uT` is the LSB along x and y, and the LSB along z. If it is None, a chip is marked if its LSB differs
+    from the median LSB of all chips, or if its LSB is that of a chip with its power-on settings. A chip whose LSB
+    cannot be detected is not marked.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
 
@@ -109,7 +129,7 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
 def unusual_lsb(
     lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
 ) -> Bool[np.ndarray, " k"]:
-    """Mark the same chips as `reset_chips`, from the LSB that `find_lsb` returned."""
+    """Mark the same chips as `reset_chips`, but use an LSB that `find_lsb` has already estimated."""
     if expected_lsb_uT is not None:
         return _differs(lsb_uT, expected_lsb_uT)
     after_reset = ~_differs(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -118,26 +138,26 @@ def unusual_lsb(
 
 
 def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that stay the same for `STUCK_FRAMES_MIN_N` frames while other chips change."""
+    """Mark the readings of stuck chips in a whole recording; see `StuckChips`."""
     return StuckChips(b_uT.shape[1] // 3).feed(b_uT)
 
 
 class StuckChips:
-    """Find stuck chips in a recording that arrives in portions of any length.
+    """A detector of stuck chips in a recording, which may be passed in several parts of any length.
 
-    A reading is stuck if two conditions hold: at least `STUCK_FRAMES_MIN_N` successive readings of the chip, up to this
-    one, are equal, and other chips changed in at least the fraction `OTHERS_MOVE_MIN` of these frames. If no chip of
-    the board changes, no chip is stuck.
+    A reading is stuck if two conditions hold. First, at least `STUCK_FRAMES_MIN_N` successive readings of the chip are
+    equal, the last of which is this reading. Second, other chips changed in at least the fraction `OTHERS_MOVE_MIN` of
+    these frames. If no chip of the board changes, no chip is stuck.
     """
 
     def __init__(self, chips_n: int) -> None:
         self._last_uT = np.full((1, chips_n, 3), np.nan)
-        self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip last changed
-        # number of frames since each chip last changed in which another chip changed
+        self._quiet_n = np.zeros(chips_n, np.int64)  # number of frames since each chip last changed
+        # number of those frames since each chip last changed in which another chip changed
         self._moved_n = np.zeros(chips_n, np.int64)
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-        """Process the next readings; mark those that are stuck."""
+        """Process the next readings; return a mask of the stuck readings."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return np.zeros(chips.shape[:2], bool)
@@ -154,10 +174,10 @@ class StuckChips:
 
 
 class ConstantChannels:
-    """Find channels that never change in a recording, although other channels of the same chip change.
+    """A detector of channels that never change in a recording, although other channels of the same chip change.
 
-    The recording may arrive in portions of any length. A chip with three constant channels is not reported here,
-    because it is stuck (see `StuckChips`).
+    The recording may be passed in several parts of any length. A chip with three constant channels is not reported
+    here, because the whole chip is then stuck (see `StuckChips`).
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -166,7 +186,7 @@ class ConstantChannels:
         self._readings_n = 0
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Process the next readings; failed reads must have been removed."""
+        """Process the next readings, from which the caller must have removed the failed reads."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return
@@ -200,18 +220,21 @@ def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 
 
 def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the chips whose field changes from one frame to the next by more than 2^15 LSB, as when an int16 overflows.
+    """Mark the readings in which a chip's field differs from that of the previous frame by more than 2^15 LSB.
 
-    Chips with an unknown LSB are not marked.
+    Such a jump occurs if the firmware stores the field as an int16 and this number overflows. `step_uT` is the change
+    of the field from one frame to the next. Chips with an unknown LSB (NaN) are not marked.
     """
     wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
     return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
 
 
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that repeat the previous frame, if more than `REPEATED_SHARE` of the frames around them do so too.
+    """Mark frames that equal the frame before them, if many other frames around them do so too.
 
-    A few repeated frames are normal if the firmware reads the chips faster than they measure.
+    "Many" means more than the fraction `REPEATED_SHARE` of a window of `REPEATED_LOOK_N` frames. A few repeated frames
+    are normal, because the firmware may read the chips faster than they measure. `step_uT` is the change of the field
+    from one frame to the next.
     """
     same = np.asarray((step_uT == 0).all(axis=1))
     if len(same) < REPEATED_LOOK_N:
@@ -223,12 +246,19 @@ def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"
 
 
 def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark steps of the board's clock that are negative or longer than `CLOCK_STEP_MAX_S`."""
+    """Mark frames at which the board's clock went backwards, or forwards by more than `CLOCK_STEP_MAX_S`.
+
+    `device_step_s` is the time since the previous frame according to the board's clock.
+    """
     return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the missing frames before each frame by the board's clock; without a clock, all counts are 0."""
+    """Estimate the number of missing frames before each frame, from the times of the board's clock.
+
+    `device_step_s` is the time since the previous frame according to this clock. If the board sends no times (NaN), all
+    counts are 0.
+    """
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -237,7 +267,11 @@ def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " 
 
 
 def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames before which nothing arrived for a second or more, as when the board was unplugged or stalled."""
+    """Mark frames before which the board was silent for a second or more.
+
+    The board may have been unplugged, or its program may have stalled. `step_s` is the time since the previous frame.
+    See `SILENCE_S` for the two conditions.
+    """
     usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
     return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
 
@@ -245,8 +279,9 @@ def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
 def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
     """Count the stray bytes before each frame.
 
-    The length of text frames varies, so `frame_bytes_n` is None for them. Then only lines longer than `LONG_LINE` times
-    the median length count as having stray bytes.
+    `end_byte` is the position in the stream at which each frame ends, and `first_byte` is the position at which the
+    frame before the first one ended. `frame_bytes_n` is the length of a binary frame. It is None for text frames, whose
+    lengths vary. Stray bytes are then assumed only in lines that are longer than `LONG_LINE` times the median length.
     """
     length_n = np.diff(end_byte, prepend=first_byte)
     if frame_bytes_n is not None:
@@ -256,7 +291,7 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Return the step of the grid on which the values of all given axes lie; NaN if there is no such grid."""
+    """Return the step of the grid on which the values of all given axes lie; NaN if no grid is detected."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
@@ -281,7 +316,10 @@ def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
 
 
 class ReadingFaults(NamedTuple):
-    """Masks [frame chip] of the faults that can be detected from a single reading."""
+    """The faults of a set of frames that can be detected from a single reading.
+
+    Each field is a mask with one row per frame and one column per chip.
+    """
 
     failed_read: Bool[np.ndarray, "f k"]
     zeros: Bool[np.ndarray, "f k"]
@@ -308,9 +346,9 @@ def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float
 class ScaleWindow(NamedTuple):
     """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
-    `first_frame` is the number of the first of these frames, counted from 1. `t_s` contains the times of all of them.
-    `unusual` marks chips whose LSB is not the expected one or differs from the LSB of the other chips. `changed` marks
-    chips whose LSB differs from the first LSB that was found for the same chip.
+    `first_frame` is the number of the first of these frames. Numbers start at 1, and frames with failed reads have no
+    number. `t_s` contains the times of all frames of the window. `unusual` marks the chips that `unusual_lsb` marks.
+    `changed` marks the chips whose LSB differs from the first LSB that was found for the same chip.
     """
 
     first_frame: int
@@ -322,7 +360,10 @@ class ScaleWindow(NamedTuple):
 
 
 class Faults(NamedTuple):
-    """The faults in one portion of frames, as masks and counts per frame, or per frame and chip."""
+    """The faults in those frames that were passed to one call of `FaultDetector.feed`.
+
+    Most fields are masks or counts with one value per frame, or with one value per frame and chip.
+    """
 
     readings: ReadingFaults
     stuck: Bool[np.ndarray, "f k"]
@@ -330,24 +371,28 @@ class Faults(NamedTuple):
     repeated: Bool[np.ndarray, " f"]
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
-    missing_frames_n: Int[np.ndarray, " f"]  # number of frames missing before each frame, by the board's clock
-    torn_bytes_n: Int[np.ndarray, " f"]  # number of stray bytes before each frame, or 0 if they are counted as garbage
-    # number of stray bytes before each frame if there are very many (wrong baud rate?), or else 0
+    # number of frames that are missing before each frame, according to the board's clock
+    missing_frames_n: Int[np.ndarray, " f"]
+    # Number of stray bytes before each frame. If there are so many that the baud rate is probably wrong, they are
+    # counted in garbage_bytes_n; otherwise, they are counted in torn_bytes_n.
+    torn_bytes_n: Int[np.ndarray, " f"]
     garbage_bytes_n: Int[np.ndarray, " f"]
-    scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
+    scale: tuple[ScaleWindow, ...]  # the windows whose last frame is among these frames
 
 
 class FaultDetector:
-    """Find the faults in a stream of frames that arrives in portions of any length.
+    """A detector of all kinds of faults in a stream of frames, which may be passed in several parts of any length.
 
-    Both ingestion and the live view use this class. It stores at most `SCALE_FRAMES_N` frames.
+    The detector is used for recordings and for live boards. Between two calls of `feed`, it stores fewer than
+    `SCALE_FRAMES_N` frames.
 
     Parameters
     ----------
     chips_n : number of chips.
-    frame_bytes_n : length of a binary frame; None for text, where it varies.
-    expected_lsb_uT : LSB along x and y, and along z; None if unknown.
-    steps_min_n : minimum number of equal gaps between neighbouring values for an estimate of a chip's LSB.
+    frame_bytes_n : length of a binary frame in bytes; None for text frames, whose lengths vary.
+    expected_lsb_uT : LSB along x and y, and LSB along z; None if they are unknown.
+    steps_min_n : a chip's LSB is estimated only if at least this many gaps between neighbouring values are equal; see
+        `find_lsb`.
     """
 
     def __init__(
@@ -365,7 +410,8 @@ class FaultDetector:
         self._windowed_n = 0  # number of frames in complete windows so far
         self._lsb_uT = np.full((chips_n, 2), np.nan)  # LSB of each chip; NaN until known
         self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
-        self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame
+        # the last frame's time of arrival, its time on the board's clock, and its last byte's position in the stream
+        self._last: tuple[float, float, int] | None = None
 
     def feed(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Faults:
         """Process the next frames and their times in s; return their faults."""
@@ -379,8 +425,8 @@ class FaultDetector:
         stuck[read] = self._stuck.feed(b_uT[read])
         stuck[~sound] = False
         if sound.any():
-            # The first frame has no predecessor, so compare it with a different field, so that it does not count as
-            # repeated.
+            # The first frame of the stream has no frame before it. It is compared with a field that differs by 1 uT, so
+            # that it does not count as a repeated frame.
             last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]
@@ -416,10 +462,9 @@ class FaultDetector:
         Bool[np.ndarray, " f"], Bool[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, " f"],
         Int[np.ndarray, " f"],
     ]:  # fmt: skip
-        """Compare the times and the end byte of each frame with those of the previous frame.
+        """Find the faults between each frame and the frame before it, from their times and positions in the stream.
 
-        Returns the masks of clock jumps and silent gaps, and the numbers of missing frames, torn bytes and garbage
-        bytes.
+        Returns the fields `clock_jump`, `unplug`, `missing_frames_n`, `torn_bytes_n` and `garbage_bytes_n` of `Faults`.
         """
         if not len(frames):
             return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)

@@ -1,4 +1,8 @@
-"""Find boards among the serial ports, and detect each board's wire format, number of chips, rate and scale."""
+"""Find boards among the serial ports, and detect what each board sends.
+
+The properties that are detected are the wire format (the format of the bytes, see `wire`), the number of chips, the
+frame rate, and the LSB of the chips (the step between the field values that a chip can send).
+"""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -17,29 +21,31 @@ from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import CONVERSION_S, GAINS, steps_uT
 
 BAUD = 115200  # USB ports ignore the baud rate
-LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the LSB of its chips
+# In this time, even the slowest board sends about 200 frames. This is enough to find the LSB of its chips.
+LISTENING_S = 1.5
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
 BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
-LSB_TOLERANCE = 0.05  # relative tolerance; the LSBs of two gains differ by 20 % or more
-Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
+# relative tolerance with which a measured LSB is compared with that of a gain; LSBs of two gains differ by 20 % or more
+LSB_TOLERANCE = 0.05
+Chunk = tuple[bytes, float]  # bytes that were read at once, and their time of arrival in s
 
 
 class DetectedBoard(NamedTuple):
-    """A port and the board on it; if no board was detected, `problem` says why."""
+    """The result of listening to a port: the properties of the board on it, or the reason why no board was detected."""
 
     port: str
-    problem: str | None
+    problem: str | None  # why no board was detected; None if there is a board
     wire: Wire = "binary"
     chips_n: int = 0
     rate_hz: float = np.nan
-    lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and along z: medians over chips
+    lsb_uT: tuple[float, float] = (np.nan, np.nan)  # LSB along x and y, and LSB along z; each is the median over chips
     rate: RateMeasurement | None = None  # None if there is no board
-    frame_bytes_n: float = np.nan  # mean length of a frame
+    frame_bytes_n: float = np.nan  # mean length of a frame in bytes
 
     @property
     def gain_sel(self) -> int | None:
-        """GAIN_SEL of the chips, derived from their LSB; None if no gain has this LSB."""
+        """Setting GAIN_SEL of the chips, derived from their LSB; None if no value of GAIN_SEL gives this LSB."""
         for gain_sel in range(len(GAINS)):
             xy_uT, _, z_uT = steps_uT(gain_sel)
             if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
@@ -61,7 +67,7 @@ class DetectedBoard(NamedTuple):
         return "steps not known yet: do the readings change?"
 
     def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
-        """Describe the measured rate, its likely explanation, and the computed limits, in several lines."""
+        """Return a text of several lines with the measured rate, a possible explanation, and the computed limits."""
         if self.problem is not None or self.rate is None:
             return str(self)
         rate = self.rate
@@ -79,7 +85,10 @@ class DetectedBoard(NamedTuple):
 
 
 def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
-    """Listen to several ports at the same time: the given ports, or all ports of this machine."""
+    """Listen to several ports at the same time, and return what was detected on each.
+
+    `names` are the names of the ports. By default, these are all ports of this machine.
+    """
     names = port_names() if names is None else names
     with ThreadPoolExecutor(max(len(names), 1)) as pool:
         return list(pool.map(lambda name: detect_board(name, listening_s), names))
@@ -125,7 +134,7 @@ def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
 
 
 def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
-    """Detect a board from the bytes of its port: wire format, number of chips, rate and scale."""
+    """Detect a board from the chunks of bytes that its port sent."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
         return DetectedBoard(port, "no bytes arrived: is the board running?")
@@ -133,12 +142,14 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
     decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
-    # In text frames, the temperature of a chip is first in one format and last in the other. Temperatures vary less
-    # than fields, so choose the format in which the decoded temperatures vary least.
+    # The bytes of a text frame fit both text formats, which differ only in the order of the numbers: a chip's
+    # temperature is its first number in one format, and its last number in the other. Temperatures vary less than
+    # fields, so choose the format in which the decoded temperatures vary least.
     frames, account, wire, chips_n = min(
         decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64))
     )
-    with np.errstate(over="ignore"):  # a frame may contain any finite number
+    # Bytes that are not a board's may be decoded to very large numbers, whose differences overflow.
+    with np.errstate(over="ignore"):
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
     rate = rates.measure(frames, chunks)
     frame_bytes_n = account["frame_bytes_n"] / len(frames)
@@ -159,8 +170,9 @@ def find_replugged_port(
 ) -> str:
     """Ask the user to unplug a board and plug it in again; return the name of the port that then appears.
 
-    Waits up to `timeout_s` seconds for each of the two steps. The port's name may differ after replugging. The port is
-    not read, so any serial device is accepted. If several ports appear, the first by name is returned.
+    The function waits up to `timeout_s` seconds until the port disappears, and again until it appears. The name of the
+    port may be different afterwards. Nothing is read from the port, so any serial device is accepted, not only a board.
+    If several ports appear, the first one in alphabetical order is returned.
     """
     say("Unplug the board.")
     before = set(names())
@@ -171,7 +183,7 @@ def find_replugged_port(
 
 
 def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], timeout_s: float, what: str) -> set[str]:
-    """Call `find_ports` until it returns ports, and return them; raise `CaptureError` after `timeout_s`."""
+    """Call `find_ports` repeatedly until it returns ports; raise `CaptureError` if it returns none for `timeout_s`."""
     for _ in range(round(timeout_s / POLL_S)):
         if ports := find_ports():
             return ports
@@ -180,7 +192,7 @@ def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], ti
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
-    """Raise `ParamsError` if a port is named twice, or if there are no ports or more than `BOARDS_MAX_N`."""
+    """Raise `ParamsError` unless there are 1 to `BOARDS_MAX_N` ports, and all have different names."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
         raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Name each port once.")

@@ -1,6 +1,6 @@
-"""Open a board's port and read the bytes that are waiting in it.
+"""Open the port of a board, and read the bytes that have arrived there.
 
-The port is a serial port or `socket://host:port`.
+A port is either a serial port of this machine, or a network address written as `socket://host:port`.
 """
 
 import errno
@@ -14,7 +14,9 @@ from serial.tools import list_ports
 
 from reskin.errors import CaptureError
 
-READ_TIMEOUT_s = 0.1  # also the longest time until a stop request, a silence or the end of the recording is noticed
+# Longest time for which one read waits for bytes. A recording checks only between two reads whether it must end, so it
+# may end later by this time.
+READ_TIMEOUT_s = 0.1
 READ_BYTES_MAX_N = 65536
 SOCKET = "socket://"
 
@@ -24,8 +26,8 @@ Device = SerialBase  # an open port
 def open_port(port: str, baud: int) -> Device:
     """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
 
-    This function opens the ports of boards and of force gauges. Bytes that were waiting in the port are discarded. Read
-    from the port with `read_waiting`, because a socket is set to non-blocking mode.
+    This function opens the ports of boards and of force gauges. Bytes that arrived before the port was opened are
+    discarded. Use `read_waiting` to read from the port, because the read timeout of a socket is set to 0.
     """
     check_name(port)
     try:
@@ -63,11 +65,12 @@ def check_name(port: str) -> None:
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
     """Return the bytes that are waiting or arrive within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
-    if isinstance(device, serial.Serial):  # wait for one byte, then read all bytes that are waiting
+    if isinstance(device, serial.Serial):  # first wait for one byte, and then read all other bytes that have arrived
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
         return first + device.read(waiting_n) if waiting_n > 0 else first
-    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket does not report how many bytes are waiting
+    # A socket does not report how many bytes have arrived, so wait until it can be read, and read once.
+    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)
     return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
 
 

@@ -1,9 +1,9 @@
 """Measure a board's frame rate and its repeated readings, and explain what limits the rate.
 
-`RateMeter` measures the rate. `find_limits` computes the maximum rates that conversion time, I2C bus, baud rate and USB
-allow.
-`explain` compares the measured rate with these limits in one sentence. Agreement with a limit does not prove that this
-limit is the cause, so the sentence says "would explain".
+`RateMeter` measures the rate. `find_limits` computes the highest rates that are possible with the conversion time of
+the chips, the I2C bus, the baud rate and USB. `explain` compares the measured rate with these limits, and returns one
+sentence for the user. If the measured rate agrees with a limit, this does not prove that the limit is the cause.
+Therefore, the sentence says that the limit "would explain" the rate.
 """
 
 from collections.abc import Sequence
@@ -17,28 +17,34 @@ from reskin.board.faults import SILENCE_S, clock_jumps, find_reading_faults, mis
 from reskin.board.wire import Frames
 from reskin.physics.chip import CONVERSION_S, DIG_FILT_MAX, OSR_MAX, conversion_s
 
-# Repeated readings are reported if their share is above this value. In 30 public recordings of real boards, the share
-# is at most 0.024, because successive values of a chip with a coarse LSB are sometimes equal by chance.
+# A reading is repeated if it equals the chip's previous reading. Repeated readings are reported if they are more than
+# this fraction of all readings. In 30 public recordings of real boards, the fraction is at most 0.024: successive
+# readings are sometimes equal by chance, if the LSB of the chip is large.
 REPEATED_MAX = 0.05
-ALL_REPEATED = 0.99  # above this share, the board sends the same reading again and again
+# If more than this fraction of the readings is repeated, the board sends the same reading again and again.
+ALL_REPEATED = 0.99
 FRAMES_MIN_N = 20  # with fewer frames, the rate is unknown
-CLOCK_FRAMES_N = 400  # the usual step of the board's clock is determined from this many frames
-# A board sends the time of its clock as a float32 in s. After some hours, the resolution of a float32 is too coarse for
-# the time between two frames.
-CLOCK_STEP_RESOLUTION_MAX = 0.1  # largest ratio of this resolution to the time between two frames
+# The median time between frames on the board's clock is computed from more than this many frames at once.
+CLOCK_FRAMES_N = 400
+# A board sends the time of its clock as a float32 in s. The longer the board runs, the coarser is the resolution of
+# this number; after some hours, it is too coarse to measure the time between two frames. The clock is used only if the
+# resolution, divided by the median time between two frames, is at most this value.
+CLOCK_STEP_RESOLUTION_MAX = 0.1
 
-# Bits on the I2C bus for one chip: 9 per byte, including the acknowledge bit, and one for each start, repeated start
-# and stop. Each command takes 4 bytes: address, command, address again, and status. Command RM (read the measurement)
-# takes 8 more bytes, for T, X, Y and Z.
-START_BITS_N = 9 * 4 + 3  # command SM: start a single conversion
-READ_BITS_N = 9 * (4 + 8) + 3
-I2C_HZ = (100e3, 400e3, 1e6)  # Arduino's default, the rate in the ReSkin and AnySkin firmware, and the chip's maximum
-LIBRARY_WAIT_S = 10e-3  # Adafruit's library waits this long in `readData`, in addition to the conversion
+# Number of bits that are transferred on the I2C bus for one chip. Each byte takes 9 bits, including the acknowledge
+# bit. There are 3 more bits in each command: one for the start, one for the repeated start, and one for the stop. Each
+# command takes 4 bytes: the address, the command, the address again, and the status.
+START_BITS_N = 9 * 4 + 3  # command SM, which starts a single conversion
+READ_BITS_N = 9 * (4 + 8) + 3  # command RM, which reads the measurement: 8 more bytes for T, X, Y and Z
+# bit rates of the I2C bus: Arduino's default, the rate in the ReSkin and AnySkin firmware, and the chip's maximum
+I2C_HZ = (100e3, 400e3, 1e6)
+LIBRARY_WAIT_S = 10e-3  # Adafruit's library waits this long in `readData`, in addition to the conversion time
 UART_BITS_PER_BYTE_N = 10  # start bit, 8 data bits, stop bit
 USB_BYTES_PER_S = 19 * 64 * 1000  # full speed: at most 19 bulk packets of 64 bytes in 1 ms (USB 2.0, table 5-9)
 
 ERROR = 0.03  # assumed: relative error of a measured rate
-# assumed: a limit also explains rates down to this fraction of the limit, because the board's program takes time too
+# Assumed: a limit may also be the cause of a lower rate, because the board's program takes time too. The rate must be
+# at least this fraction of the limit.
 NEAR = 0.8
 
 Method = Literal["arrivals", "clock"]
@@ -46,16 +52,17 @@ Method = Literal["arrivals", "clock"]
 
 @dataclass(frozen=True)
 class RateMeasurement:
-    """The measured rate of a board.
+    """The measured frame rate of a board.
 
     Parameters
     ----------
-    frames_n : number of frames
+    frames_n : number of frames that arrived
     arrived_hz : frames per second that arrived; NaN if unknown
     sent_hz : frames per second that the board sent
-    method : how `sent_hz` was measured: by the board's clock, or by arrivals if there is no usable clock
-    repeated_frames : share of frames whose fields equal those of the previous frame
-    repeated_readings : share of a chip's readings that equal the chip's previous reading. This is the median over
+    method : how `sent_hz` was measured: from the times of the board's clock ("clock") or, if the board has no usable
+        clock, from the times of arrival ("arrivals")
+    repeated_frames : fraction of the frames in which the fields of all chips equal those of the previous frame
+    repeated_readings : fraction of a chip's readings that equal the chip's previous reading. This is the median over
         chips, so that a single stuck chip has no effect.
     """
 
@@ -73,14 +80,14 @@ class RateMeasurement:
 
     @property
     def new_hz(self) -> float:
-        """New readings of a chip per second."""
+        """Number of readings of a chip per second that do not repeat the previous reading."""
         return self.arrived_hz * (1 - self.repeated_readings)
 
 
 class RepeatCounter:
-    """Count repeated frames and readings in a stream that arrives in portions of any length.
+    """A counter of repeated frames and readings in a stream, which may be passed in several parts of any length.
 
-    Frames with a failed reading are left out, because all failed readings are equal.
+    The caller must remove frames with a failed reading, because all failed readings are equal.
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -102,12 +109,12 @@ class RepeatCounter:
 
     @property
     def frames(self) -> float:
-        """Share of frames that repeat the previous frame."""
+        """Fraction of the frames that repeat the previous frame."""
         return self._same_frames_n / self.frames_n if self.frames_n else 0.0
 
     @property
     def readings(self) -> float:
-        """Share of a chip's readings that repeat its previous reading: the lower median over chips."""
+        """Fraction of a chip's readings that repeat the chip's previous reading; the lower median over chips."""
         same_n = np.sort(self._same_readings_n)
         return float(same_n[(len(same_n) - 1) // 2] / self.frames_n) if self.frames_n else 0.0
 
@@ -118,10 +125,12 @@ class RepeatCounter:
 
 
 class RateMeter:
-    """Measure the rate of frames that arrive in portions of any length, with constant memory.
+    """A meter of the frame rate of a stream, which may be passed in several parts of any length.
 
-    `start_s` is the time of arrival of the first bytes. Frames that arrived at this time may have been waiting in the
-    port, so they are not counted for the rate. A silence of a second or more is not counted either.
+    The meter needs a constant amount of memory. `start_s` is the time of arrival of the first bytes. Frames that
+    arrived at this time are not counted for the rate, because they may have been waiting in the port for any time. A
+    silence of a second or more, such as while the board is unplugged, does not count as time in which frames could
+    arrive.
     """
 
     def __init__(self, chips_n: int, start_s: float) -> None:
@@ -129,9 +138,9 @@ class RateMeter:
         self._repeats = RepeatCounter(chips_n)
         self._frames_n = self._arrived_n = 0
         self._elapsed_s = 0.0
-        # times of the board's clock for frames that are not counted yet
+        # times on the board's clock of the frames that `_count_sent` has not counted yet
         self._clock_s: list[Float64[np.ndarray, " f"]] = []
-        self._clocked_n = 0  # number of times in `_clock_s`
+        self._clocked_n = 0  # number of times that were added to `_clock_s` since the last count
         self._sent_n = 0.0
         self._sent_s = 0.0
 
@@ -164,11 +173,12 @@ class RateMeter:
         )
 
     def _count_sent(self) -> None:
-        """Count the frames that the board sent according to its clock, including missing ones."""
+        """Count the frames that the board sent according to its clock, including those that did not arrive."""
         clock_s = np.concatenate(self._clock_s) if self._clock_s else np.zeros(0)
         self._clock_s, self._clocked_n = [clock_s[-1:]], 0
         step_s = np.diff(clock_s)
-        # If a frame has the same time as the previous frame, this frame was sent once but arrived twice.
+        # A frame with the same board time as the previous frame is a copy of it that arrived again, so it is not
+        # counted.
         step_s = step_s[~clock_jumps(step_s) & (step_s > 0)]
         if not len(step_s) or np.spacing(np.float32(clock_s[-1])) > CLOCK_STEP_RESOLUTION_MAX * np.median(step_s):
             return
@@ -177,7 +187,7 @@ class RateMeter:
 
 
 def measure(frames: Frames, chunks: Sequence[tuple[bytes, float]]) -> RateMeasurement:
-    """Measure the rate of frames that were decoded from chunks of bytes, each with its time of arrival in s."""
+    """Measure the rate of frames that were decoded from `chunks`, which are pairs of bytes and time of arrival in s."""
     arrived_s = np.array([t_s for _, t_s in chunks])
     chunk_i = np.searchsorted(np.cumsum([len(chunk) for chunk, _ in chunks]), frames.end_byte)
     meter = RateMeter(frames.temperature_degC.shape[1], arrived_s[0])
@@ -186,7 +196,7 @@ def measure(frames: Frames, chunks: Sequence[tuple[bytes, float]]) -> RateMeasur
 
 
 class Limit(NamedTuple):
-    """A computed upper limit of the frame rate, and its cause."""
+    """An upper limit of the frame rate that was computed from one possible cause."""
 
     hz: float
     cause: str
@@ -195,14 +205,14 @@ class Limit(NamedTuple):
 def find_limits(
     chips_n: int, frame_bytes_n: float, *, baud: int, conversion_time_s: float = CONVERSION_S
 ) -> list[Limit]:
-    """Compute upper limits of the frame rate, lowest first.
+    """Compute the upper limits of the frame rate from several causes, sorted from the lowest limit to the highest.
 
     Parameters
     ----------
-    chips_n : number of chips, all on one I2C bus
-    frame_bytes_n : mean length of a frame
-    baud : baud rate, which limits a board with a USB-to-serial chip
-    conversion_time_s : time of one conversion; the default is that of the paper's settings
+    chips_n : number of chips, all of which are on one I2C bus
+    frame_bytes_n : mean length of a frame in bytes
+    baud : baud rate. It limits the frame rate only if the board has a USB-to-serial chip.
+    conversion_time_s : time that a chip needs for one conversion; the default is the time with the paper's settings
     """
     chips = f"{chips_n} chips" if chips_n > 1 else "1 chip"
     in_turn = f"{chips} read one after the other" if chips_n > 1 else "1 chip started and read"
@@ -236,7 +246,7 @@ def find_limits(
 
 
 def explain(rate: RateMeasurement, limits: Sequence[Limit]) -> str:
-    """Explain in one sentence what limits a measured rate; `limits` are from `find_limits`."""
+    """Return a sentence on what may limit a measured rate; `limits` is the result of `find_limits`."""
     if not rate.known:
         return f"{rate.frames_n} frames are too few to measure a rate: listen longer"
     arrive = f"{_hz(rate.arrived_hz)} arrive"
@@ -267,7 +277,7 @@ def _hz(rate_hz: float) -> str:
 
 
 def _settings_with(time_s: float) -> str:
-    """Name the chip settings with which a conversion takes about `time_s`; "" if there are none."""
+    """Return the chip settings with which a conversion takes about `time_s`, as a text; "" if there are none."""
     found = [
         f"OSR {osr} with DIG_FILT {dig_filt}"
         for osr in range(OSR_MAX + 1)

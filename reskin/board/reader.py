@@ -9,14 +9,15 @@ from reskin.board.find import BAUD, Chunk
 from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError
 
-# Two minutes of data from five chips at 400 Hz. If the queue is longer, its oldest chunks are dropped.
+# The queue holds two minutes of data from five chips at 400 Hz. If it is longer, its oldest chunks are dropped.
 QUEUE_BYTES_MAX_N = 2**22
-RETRY_S = 0.5
-PLUGGED_IN = b""  # a chunk that marks the beginning of a new stream
+RETRY_S = 0.5  # time between two attempts to open the port of an unplugged board
+# An empty chunk in the queue. It means that the board was plugged in, so that a new stream begins.
+PLUGGED_IN = b""
 
 
 class ChunkWriter(Protocol):
-    """A recording that chunks are written to, such as a `CaptureWriter`."""
+    """An object that writes chunks of bytes to a recording, such as a `CaptureWriter`."""
 
     def write(self, chunk: bytes, unix_s: float) -> object: ...
 
@@ -24,9 +25,10 @@ class ChunkWriter(Protocol):
 
 
 class Reader:
-    """Read a port in a thread, and queue the chunks with their times of arrival.
+    """A reader of a port, which reads in a thread and queues the chunks of bytes with their times of arrival.
 
-    `missed_bytes_n` counts the bytes that were dropped because the queue was full.
+    `missed_bytes_n` counts the bytes that were dropped because the queue was full. If a port cannot be opened or read,
+    `problem` is the reason. If a recording cannot be written, `writer_problem` is the reason.
     """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
@@ -36,8 +38,8 @@ class Reader:
         self.taken_s = 0.0  # when `take` was last called, in unix seconds
         self.writer: ChunkWriter | None = None
         self.writer_problem = ""
-        # Unix time minus monotonic time. It is determined only once, because the system's clock may be adjusted during
-        # reading.
+        # Unix time minus monotonic time. This offset is determined only once, so that the times of arrival stay
+        # consistent if the system's clock is adjusted while the port is read.
         self._clock_s = time.time() - time.monotonic()
         self._chunks: deque[Chunk] = deque()
         self._arrived = threading.Condition()
@@ -62,7 +64,7 @@ class Reader:
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
-        """Remove and return all queued chunks; if there are none, wait for one for at most `wait_s`."""
+        """Remove all chunks from the queue and return them; if there are none, first wait for one, at most `wait_s`."""
         with self._arrived:
             self._arrived.wait_for(lambda: bool(self._chunks), wait_s)
             chunks = list(self._chunks)
@@ -72,7 +74,10 @@ class Reader:
         return chunks
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """Close the current recording, if any, and write all later chunks to `writer` (None: to no recording)."""
+        """Close the current recording, if there is one, and write all later chunks to `writer`.
+
+        If `writer` is None, later chunks are not written.
+        """
         with self._arrived:
             previous, self.writer, self.writer_problem = self.writer, writer, ""
         if previous is not None:
@@ -102,8 +107,8 @@ class Reader:
 
     def _queue_chunk(self, chunk: bytes) -> None:
         with self._arrived:
-            # The time is read while the lock is held. Therefore, a chunk that `take` has not returned has a time after
-            # `taken_s`.
+            # The time is read while the lock is held. Therefore, any chunk that `take` has not returned yet has a time
+            # after `taken_s`, when `take` was last called.
             now_s = self.unix_s()
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)
@@ -116,6 +121,6 @@ class Reader:
             if writer is not None:
                 try:
                     writer.write(chunk, now_s)
-                except OSError as error:  # for example a full disk: end the recording, but continue to read the port
+                except OSError as error:  # for example, the disk is full: end the recording, but continue to read
                     self.writer, self.writer_problem = None, f"cannot be written any more: {error.strerror}"
                     writer.close()

@@ -1,7 +1,8 @@
-"""Split a byte stream into frames, without I/O; every byte is part of a frame or is counted as lost.
+"""Split a stream of bytes into frames; every byte is part of a frame or is counted as lost.
 
-No format marks the start of a frame, and the bytes CR LF at its end may also occur in a float (34.513275 degC contains
-them). The result depends only on the bytes, and not on the portions in which they were read.
+None of the wire formats marks the start of a frame. The bytes CR LF mark its end, but they may also occur within a
+binary number; the float32 of 34.513275 degC contains them. The result depends only on the bytes, and not on how they
+were divided into calls of `FrameStream.feed`. This module does no input or output.
 """
 
 import re
@@ -18,36 +19,39 @@ from reskin.errors import CaptureError
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # the same limit as in the header of a capture
-# The counts that `FrameStream.account` returns.
+# Names of the counts that `FrameStream.account` returns.
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
-# An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. These limits are used only if the positions of CR
-# LF allow several ways to divide the bytes into frames. A frame with values outside the limits is not dropped, because
-# the values of a failed read are outside too (see `faults`).
+# Limits of plausible values. An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. The limits are used
+# only if the bytes can be divided into frames in several ways, because CR LF occurs at several possible positions. A
+# frame with values outside the limits is not dropped, because the values that the firmware sends for a failed read are
+# outside too (see `faults`).
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
-VALUE_MIN = 1e-3  # in uT or degC; a smaller value, except 0, is below the LSB of any chip
+VALUE_MIN = 1e-3  # in uT or degC; a value that is smaller but not 0 is implausible, because it is below the LSB
 
-SEARCH_FRAMES_N = 64  # number of frames whose bytes a search uses at once
+SEARCH_FRAMES_N = 64  # the search for the next frame looks at the bytes of this many frames at once
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """Result of scanning a buffer for frames."""
+    """The result of scanning a buffer of bytes for frames."""
 
     frames: Frames
     count: Counter[str]  # keys of `ACCOUNT`
-    settled_n: int  # number of bytes at the start of the buffer that need not be scanned again
-    at_boundary: bool  # whether a frame begins after the settled bytes
+    # number of settled bytes: those at the start of the buffer that need not be scanned again when more bytes arrive
+    settled_n: int
+    at_boundary: bool  # whether the next frame is known to begin directly after the settled bytes
 
 
 class FrameStream:
-    """Incremental decoder, which returns each frame as soon as it is certain, and stores the bytes that are undecided.
+    """An incremental decoder of a stream of bytes.
 
-    `_find_runs` defines which bytes are a binary frame. A text frame of k chips is a line of exactly 4 k numbers with
-    two decimals. The first byte of a stream is assumed to be the start of a frame. If the first line was cut inside its
-    first number, this number is therefore decoded wrongly.
+    Each frame is returned as soon as it is certain which bytes belong to it. Until then, these bytes are stored. See
+    `_find_runs` for the rules by which binary frames are found. A text frame of k chips is a line of exactly 4 k
+    numbers with two decimals. The first byte of a stream is assumed to be the start of a frame. Therefore, if a text
+    stream begins in the middle of a frame's first number, this number is decoded wrongly.
     """
 
     def __init__(self, wire: Wire, chips_n: int) -> None:
@@ -59,7 +63,7 @@ class FrameStream:
         self._count: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> Frames:
-        """Process the next bytes; return the frames that are now certain."""
+        """Process the next bytes; return the frames that have become certain."""
         assert not self._closed, "the stream is closed"
         return self._advance(data, final=False)
 
@@ -71,7 +75,7 @@ class FrameStream:
     def account(self) -> dict[str, int]:
         """Return the counts of bytes and frames so far.
 
-        Once the stream is closed, `frame_bytes_n` and all `skipped_*_bytes_n` add up to `bytes_n`.
+        After the stream was closed, `bytes_n` is the sum of `frame_bytes_n` and all `skipped_*_bytes_n`.
         """
         return {name: self._count[name] for name in ACCOUNT}
 
@@ -98,7 +102,10 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 
 
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
-    """Return the error for a stream without frames; it suggests formats that fit `data`, the stream's first bytes."""
+    """Return the error for a stream without frames.
+
+    The message suggests those formats in which `data`, the first bytes of the stream, can be decoded.
+    """
     hint = " or ".join(f"{fit} with {k} chips" for fit, k in matching_formats(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
@@ -109,9 +116,10 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
 
 
 def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats (wire format, number of chips) that decode most of the first 16 KiB of `data` into frames.
+    """List the formats in which most of the first 16 KiB of `data` can be decoded into frames.
 
-    If formats with different numbers of chips do so, only those with the smallest number of chips are listed.
+    A format is a pair of a wire format and a number of chips. If formats with different numbers of chips fit, only
+    those with the smallest number of chips are listed.
     """
     data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
@@ -127,7 +135,7 @@ def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
 def _scan_binary(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int
 ) -> _Scan:
-    """Find and decode binary frames; drop and count those with values that are not finite."""
+    """Find and decode binary frames; drop and count the frames with values that are not finite."""
     record = wires.record_type(wire, chips_n)
     runs, settled_n, at_boundary = _find_runs(octets, at_boundary, final, record)
     frames, finite = wires.decode_runs(octets, runs, wire, chips_n)
@@ -145,13 +153,18 @@ def _scan_binary(
 def _find_runs(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[list[Run], int, bool]:
-    """Find the runs of consecutive frames; return them, the number of settled bytes, and whether a frame follows these.
+    """Find the runs of consecutive frames in the bytes of a buffer.
+
+    Returns the runs, the number of settled bytes, and whether the next frame begins directly after the settled bytes
+    (see `_Scan`).
 
     A frame is accepted directly if it begins where the previous frame ended (or at the start of the stream) and ends
-    with CR LF. There is one exception: a frame that also has CR LF in its payload *and* has implausible values is not
-    accepted directly. In this case, and after stray bytes, `_search` looks for the next position with CR LF both before
-    the frame and at its end. If several positions fit, it chooses the one with the most plausible chips in the frame
-    there and in the frame after it. Among equally plausible positions, it chooses the first.
+    with CR LF. There is one exception: a frame that also contains CR LF among its values *and* has implausible values
+    is not accepted directly. In this case, and after stray bytes, `_search` looks for the next position at which a
+    frame may begin: there must be CR LF directly before this position, and at the end of the frame. If there are
+    several such positions, `_search` decides by the number of chips with plausible values. It counts these chips in the
+    frame at the position and in the frame after it, and chooses the position with the largest number. If several
+    positions have the same number, it chooses the first.
     """
     runs: list[Run] = []
     position = 0
@@ -176,7 +189,7 @@ def _find_runs(
 
 
 def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the successive frames, from the first byte on, that are accepted directly (see `_find_runs`)."""
+    """Return how many successive frames, from the first byte on, are accepted directly (see `_find_runs`)."""
     sure_n, frames_n = 0, len(octets) // record.itemsize
     while sure_n < frames_n:
         block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
@@ -189,7 +202,7 @@ def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void
 
 
 def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count like `_sure_frames_n`, in one block of whole frames."""
+    """Return the same number as `_sure_frames_n`, for a block that consists of whole frames."""
     rows = block.reshape(-1, record.itemsize)
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
@@ -206,10 +219,10 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
 def _search(
     window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[int, bool]:
-    """Return the number of bytes to skip, and whether a frame begins there; if not, more bytes are needed.
+    """Return the number of bytes to skip, and whether a frame begins after them; if not, more bytes are needed.
 
-    The two bytes before the first possible start of a frame are not skipped, because they may be the CR LF of a frame
-    when the window is searched again with more bytes.
+    If more bytes are needed, the window is searched again together with these bytes. Therefore, the two bytes before
+    the first possible start of a frame are not skipped: they may be the CR LF at the end of the frame before it.
     """
     length_n, window_n = record.itemsize, len(window)
     ended = np.zeros(window_n + 2 * length_n + 1, bool)  # whether a frame may have ended before each byte
@@ -228,8 +241,8 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # If a payload contains CR LF, the bytes after it may look like a frame. The real frame that follows is then more
-    # plausible.
+    # If the values of a frame contain CR LF, the bytes after this CR LF may look like the start of a frame. Such a
+    # false frame has fewer plausible chips than the real frame after it, so it is skipped.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 
@@ -240,7 +253,7 @@ def _terminators(octets: UInt8[np.ndarray, " bytes"]) -> Bool[np.ndarray, " pair
 
 
 def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the plausible chips of the frame at the first byte."""
+    """Count the chips with plausible values in the frame that begins at the first byte."""
     return int(np.count_nonzero(_plausible(octets[: record.itemsize].view(record)["txyz"])))
 
 
@@ -253,13 +266,13 @@ def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:
-    """Decode whole lines; skip a line that is longer than any frame without waiting for its end."""
+    """Decode whole lines; skip the bytes of a line that is longer than any frame, without waiting for its end."""
     line_end = np.flatnonzero(octets == LF) + 1
     settled_n = int(line_end[-1]) if len(line_end) else 0
     parts: list[Frames] = []
     count: Counter[str] = Counter()
-    # Unless a frame begins at the first byte, skip the first line, because the end of an overlong line may look like a
-    # frame.
+    # If the first byte is in the middle of a line that is longer than any frame, skip the rest of this line, because it
+    # may look like a frame.
     for first in range(0 if at_boundary else 1, len(line_end), BLOCK_LINES_N):
         base = int(line_end[first - 1]) if first else 0
         ends = line_end[first : first + BLOCK_LINES_N] - base
@@ -284,7 +297,7 @@ def _not_finite_lines(
     is_frame: Bool[np.ndarray, " lines"],
     chips_n: int,
 ) -> Bool[np.ndarray, " lines"]:
-    """Mark the lines that would be frames if the firmware had not written nan, inf or ovf for a number."""
+    """Mark the lines that would be frames if the firmware had not written nan, inf or ovf in place of a number."""
     line = re.compile(rb"(?:-?(?:\d{1,10}\.\d\d|nan|inf|ovf)\t?){%d}\t?\r?\n" % (wires.NUMBERS_PER_CHIP_N * chips_n))
     start = np.concatenate([[0], line_end[:-1]])
     marked = np.zeros(len(line_end), bool)

@@ -1,7 +1,8 @@
-"""Encode and decode whole frames: binary bursts and lines of text.
+"""Encode and decode whole frames in the wire formats of the ReSkin and AnySkin firmware.
 
-The formats are those of the ReSkin and AnySkin firmware; their frames have no header, checksum or counter. Module
-`stream` finds frames in a byte stream, and `faults` checks their values.
+A frame contains one reading of each chip of a board. In the binary formats, a frame is a fixed number of bytes; in the
+text formats, it is a line. Frames have no header, checksum or counter. Module `stream` finds the frames in a stream of
+bytes, and `faults` checks their values.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,17 +18,19 @@ TEXT_WIRES = ("text-xyzt", "text-txyz")
 NUMBERS_PER_CHIP_N = 4  # a temperature and three components of the field
 INTEGER_DIGITS_MAX_N = 10  # Arduino's print() writes "ovf" above 4294967040
 NUMBER_BYTES_MAX_N = len("-4294967040.00\t")
-BLOCK_FRAMES_N = 4096  # a block of this many frames and the values computed from it fit into the processor's cache
+# Frames are processed in blocks of this many frames, which fit into the processor's cache with the values computed from
+# them.
+BLOCK_FRAMES_N = 4096
 
-Run = tuple[int, int]  # first byte, number of consecutive frames
+Run = tuple[int, int]  # a run of consecutive frames: position of its first byte, and number of frames
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames, in the order of the stream.
+    """Decoded frames, in the order in which the board sent them.
 
-    `end_byte` is the number of bytes from the start of the stream to the end of each frame. `device_s` is the time on
-    the board's clock, or NaN in formats without a clock.
+    `end_byte` is the number of bytes from the start of the stream to the end of each frame. `device_s` is the time of
+    each frame on the board's clock; it is NaN in formats without a clock.
     """
 
     b_uT: Float32[np.ndarray, "f ch"]
@@ -44,7 +47,7 @@ class Frames:
 
 
 def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
-    """Join frames in order; without parts, return zero frames of `chips_n` chips."""
+    """Join frames in order; if there are no parts, return an object with zero frames of `chips_n` chips."""
     if not parts:
         return _allocate(0, chips_n)
     if len(parts) == 1:
@@ -55,7 +58,8 @@ def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
 def record_type(wire: Wire, chips_n: int) -> np.dtype[np.void]:
     """Return the data type of a binary frame: T, X, Y, Z of each chip as little-endian float32, then CR LF.
 
-    A frame of k chips has 16 k + 2 bytes, and 4 more with the board's clock.
+    A frame of k chips has 16 k + 2 bytes. In format `binary-clock`, the frame begins with 4 more bytes, which are the
+    time on the board's clock in s.
     """
     clock = [("device_s", "<f4")] if wire == "binary-clock" else []
     return np.dtype([*clock, ("txyz", "<f4", (chips_n, NUMBERS_PER_CHIP_N)), ("end", "S2")])
@@ -67,7 +71,11 @@ def line_bytes_max_n(chips_n: int) -> int:
 
 
 def encode(frames: Frames, wire: Wire) -> bytes:
-    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` has the board's time."""
+    """Encode frames as the firmware does.
+
+    In text formats, numbers are rounded to two decimals. Only format `binary-clock` contains the time on the board's
+    clock.
+    """
     frames_n, chips_n = frames.temperature_degC.shape
     b_uT = frames.b_uT.reshape(frames_n, chips_n, 3)
     if wire in TEXT_WIRES:
@@ -97,7 +105,10 @@ def _encode_lines(
 def decode_runs(
     octets: UInt8[np.ndarray, " bytes"], runs: Sequence[Run], wire: Wire, chips_n: int
 ) -> tuple[Frames, Bool[np.ndarray, " f"]]:
-    """Decode the binary frames in `runs` of `octets`; the mask marks the frames whose values are all finite."""
+    """Decode the binary frames in the given runs of `octets`.
+
+    Returns the frames, and a mask of the frames whose values are all finite.
+    """
     record = record_type(wire, chips_n)
     frames = _allocate(sum(frames_n for _, frames_n in runs), chips_n)
     finite = np.ones(len(frames), bool)
@@ -107,8 +118,8 @@ def decode_runs(
     for first_byte, frames_n in _blocks(runs, record.itemsize):
         rows, stop_byte = slice(row_i, row_i + frames_n), first_byte + frames_n * record.itemsize
         records = octets[first_byte:stop_byte].view(record)
-        # Reading unaligned floats is slow, so copy the values once. With mode "clip", `take` writes to `out` without a
-        # buffer.
+        # Reading unaligned floats is slow, so copy the values once. Mode "clip" makes `take` write directly to `out`;
+        # in the default mode, it would first write to a buffer.
         values = np.ascontiguousarray(records["txyz"]).reshape(frames_n, -1)
         values.take(b_i, axis=1, out=frames.b_uT[rows], mode="clip")
         values.take(temperature_i, axis=1, out=frames.temperature_degC[rows], mode="clip")
@@ -125,10 +136,10 @@ def decode_runs(
 def decode_lines(
     octets: UInt8[np.ndarray, " bytes"], line_end: Int64[np.ndarray, " lines"], wire: Wire, chips_n: int
 ) -> tuple[Frames, Bool[np.ndarray, " lines"]]:
-    """Decode the lines that end at `line_end` (LF included); the mask marks the lines that are frames.
+    """Decode lines of text; `line_end` is the position after the LF of each line.
 
-    Tabs between numbers may be missing. Because every number has exactly two decimals, `-56.7825.00` can still be split
-    into two numbers.
+    Returns the frames, and a mask of the lines that are frames. Tabs between numbers may be missing. The numbers can
+    still be separated, because each has exactly two decimals: `-56.7825.00` means -56.78 and 25.00.
     """
     start = np.concatenate([[0], line_end[:-1]])
     dot = np.flatnonzero(octets == DOT)
@@ -150,9 +161,13 @@ def _numbers(
     line_start: Int64[np.ndarray, " f"],
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
-    """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
-    # Subtract the code of "0" from each byte. Unsigned bytes wrap around, so characters that are not digits give values
-    # above 9. Two zeros are appended, so that two digits can be read even if a decimal point is the last byte.
+    """Read the number around each decimal point.
+
+    Returns the numbers, and a mask of the lines that consist only of numbers and tabs.
+    """
+    # Subtract the code of "0" from each byte, so that digits give 0 to 9. Unsigned bytes wrap around, so all other
+    # characters give values above 9. Two zeros are appended, so that two digits can be read even if a decimal point is
+    # the last byte.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
     previous_stop = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends
@@ -192,7 +207,7 @@ def _allocate(frames_n: int, chips_n: int) -> Frames:
 
 
 def _blocks(runs: Sequence[Run], frame_bytes_n: int) -> Iterator[Run]:
-    """Divide runs into runs of at most `BLOCK_FRAMES_N` frames."""
+    """Divide long runs of frames into runs of at most `BLOCK_FRAMES_N` frames."""
     for first_byte, frames_n in runs:
         for done_n in range(0, frames_n, BLOCK_FRAMES_N):
             yield first_byte + done_n * frame_bytes_n, min(BLOCK_FRAMES_N, frames_n - done_n)

@@ -1,4 +1,10 @@
-"""Clocks: arrival times of frames, and the linear map from stream time to probe time."""
+"""The clocks of a capture: the times at which frames arrived, and the conversion of these times to the rig's clock.
+
+Stream time is the time of a frame: a time of arrival, or a time computed from a constant frame rate. Probe time is the
+time on the clock of the rig, which the probe log uses. A linear map converts stream time to probe time. It is fitted
+either to sync marks (pairs of times at which both clocks recorded the same event), or to the contacts that are visible
+in the field.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -18,7 +24,11 @@ TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Arrival time of each chunk of a stream, and number of bytes from the start of the stream to the chunk's end."""
+    """The times at which the chunks of a stream arrived.
+
+    `byte_end` is the number of bytes from the start of the stream to the end of each chunk, and `t_s` is the chunk's
+    time of arrival.
+    """
 
     byte_end: Int64[np.ndarray, " c"]
     t_s: Float64[np.ndarray, " c"]
@@ -28,7 +38,10 @@ class Arrivals:
 
 
 def parse(source: str | Path, where: str) -> Arrivals:
-    """Read arrivals from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
+    """Read times of arrival from CSV text (`source` is a str) or from a file (`source` is a path).
+
+    Raises `CaptureError` if a row is wrong; the error names the first such row.
+    """
     table = tables.parse_csv(source, TYPES, where)
     if len(table) < 2:
         raise CaptureError(
@@ -49,16 +62,17 @@ def parse(source: str | Path, where: str) -> Arrivals:
 
 
 def render(arrivals: Arrivals) -> str:
-    """Write arrivals as CSV; `parse` returns the same arrivals."""
+    """Return times of arrival as CSV text, from which `parse` returns the same times."""
     return tables.render_csv(pa.table({name: getattr(arrivals, name) for name in TYPES}))
 
 
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
-    """Return the time of each frame's last byte, interpolated linearly between the ends of chunks.
+    """Return the time at which the last byte of each frame arrived.
 
-    Apart from the delay in the port's buffer, a byte arrived after the previous chunk was read and before its own chunk
-    was read. Therefore, the error is less than the time between these two reads. In the first chunk, times are
-    extrapolated at the stream's mean rate. The time of a frame after the last chunk is NaN.
+    Only the times at which whole chunks were read are known, so the times are interpolated linearly between the ends of
+    chunks. If the delay in the port's buffer is neglected, a byte arrived between two reads: that of the previous chunk
+    and that of its own chunk. Therefore, the error is less than the time between these two reads. In the first chunk,
+    times are extrapolated at the stream's mean rate of bytes. The time of a frame after the last chunk is NaN.
     """
     byte_end, t_s = arrivals.byte_end, arrivals.t_s
     s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
@@ -67,52 +81,59 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 
 
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Return the time of each frame in s from the start of a stream with a constant frame rate.
+    """Return the time of each frame in s, counted from the start of the stream, if the frame rate is constant.
 
-    `frame` is the position of each frame's end in the stream, in units of frames. If all frames have the same length,
-    this position is the number of bytes up to the frame's end, divided by the length, so that damaged bytes also take
-    time. Otherwise, it is the number of the frame, from 1. If frames were lost before the stream was saved, all later
-    times are too early.
+    `frame` is the position in the stream at which each frame ends, measured in frames. If all frames have the same
+    length, this is the number of bytes up to the frame's end, divided by the length of a frame; damaged bytes then also
+    count as time. If the lengths differ, it is the number of the frame, counted from 1. If frames were lost before the
+    stream was saved, all later times are too early.
     """
     return frame / rate_hz
 
 
-# Maximum deviation of a clock's fitted rate from 1. Real deviations are a few per cent, because the nominal frame rate
-# may be inaccurate. A larger deviation means that a mark is in milliseconds, or that its two times belong to different
-# events.
+# The fitted rate of the clock (seconds of probe time per second of stream time) may differ from 1 by at most this
+# value. Real differences are up to a few per cent, because the nominal frame rate may be inaccurate. A larger
+# difference means that a mark is in milliseconds, or that the two times of a mark belong to different events.
 RATE_LIMIT = 0.1
 
-# To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for the first
-# SEARCH_STEPS_N steps. Then `_follow` finds one offset per window of about WINDOW_STEPS_N steps. Finally, `_line` fits
-# a line to the offsets of the windows.
-STEPS_PER_DWELL_N = 16  # number of steps in the median contact dwell, which is called a dwell length below
-STEPS_MAX_N = 2**27  # maximum length of a stream: 128 MB, or 1e6 indentations of 8 dwell lengths each
+# To align the clocks without marks, the stream is divided into time steps. For each step, the field shows whether the
+# skin was in contact; this is the contact signal. The probe log states when it should have been in contact. The offset
+# is probe time minus stream time. `_search` finds the offset at which both agree best in the first SEARCH_STEPS_N
+# steps. Then `_follow` finds one offset for each window of about WINDOW_STEPS_N steps. Finally, `_line` fits a line to
+# the offsets of the windows.
+STEPS_PER_DWELL_N = 16  # number of steps in the median contact dwell, whose duration is called a dwell length below
+# Maximum number of steps of a stream. With 1 byte per step, they take 128 MB; this is enough for 1e6 indentations of 8
+# dwell lengths each.
+STEPS_MAX_N = 2**27
 SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm accumulates to 0.2 dwell lengths
 WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
-# Minimum match between dwells and field, as a fraction of the largest possible match. The fraction is 1 if the field
-# agrees with every dwell. For a random offset, it is 0 on average.
+# The match is a measure of the agreement between the contact signal and the dwells of the probe log. It must be more
+# than this fraction of its largest possible value. The fraction is 1 if the field agrees with every dwell. For a random
+# offset, it is 0 on average.
 EXPLAINED_MIN = 0.5
-# The best offset must match this many more indentations than every other offset. The number exceeds 1, because an
-# offset that is wrong by one period of a periodic protocol matches only one indentation less, and one contact may be
-# too weak to detect.
+# The match is counted in indentations. The best offset must match this many more indentations than every other offset.
+# If the rig repeats the same indentation periodically, an offset that is wrong by one period matches only one
+# indentation less than the right offset. One contact may also be too weak to detect. Therefore, the number exceeds 1.
 MARGIN_MIN = 1.5
-# Minimum overlap of stream and dwells, relative to the largest overlap at any offset. If the overlap is small, its few
-# dwells can fit by chance.
+# At each offset, stream and dwells overlap in a part of the time. Offsets are ignored if this overlap is less than this
+# fraction of the largest overlap at any offset, because the few dwells in a small overlap can fit by chance.
 OVERLAP_MIN = 0.5
-# A peak of the match can have a flat top. Its position is therefore the middle between the two points where the match
-# has dropped to 5 % below the top.
+# As a function of the offset, the match has a peak, whose top can be flat. The position of the peak is therefore taken
+# as the middle between the two offsets at which the match is 5 % below the top.
 PEAK_DROP = 0.05
-# Contact threshold for the distance of a frame's field from the no-load field, as a multiple of the median distance of
-# frames without contact. For 15 channels, the threshold is 2.7 standard deviations of these distances above their
-# median.
+# A frame is in contact if the distance of its field from the no-load field exceeds this multiple of the noise. The
+# noise is the median distance of frames without contact. With 15 channels, this threshold is 2.7 standard deviations
+# above the median of these distances.
 AWAY_NOISES = 1.5
-# the no-load field is updated once per stretch of the stream; a stretch has this many indentations
+# The stream is divided into stretches, and the no-load field is updated once in each stretch. A stretch lasts about as
+# long as this many indentations.
 STRETCH_PERIODS_N = 32
-START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
-REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
+START_FRAMES_N = 4  # the no-load field at the start of the stream is the median field of this many frames
+REFERENCE_FRAMES_N = 4096  # about this many frames of a stretch, at most, are used to estimate the no-load field
 _REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S (the times of one event on the two clocks)."
 
-# Stream times [f] and fields in uT [f ch]. The annotations do not name the axes, because f differs from block to block.
+# A block of frames: their stream times [f] and their fields in uT [f ch]. The annotations do not name the axes, because
+# the number of frames f differs from block to block.
 Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 
 
@@ -120,9 +141,10 @@ Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 class ClockMap:
     """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
-    `residual_s` is the largest misfit of the sync marks, or of the windows, to which the line was fitted. `explained`
-    states how well the dwells coincide with contacts in the field. It is 1 if all dwells coincide or if marks were
-    given, and on average 0 for a random offset.
+    The line was fitted to sync marks or, if there are none, to the offsets of windows of the stream. `residual_s` is
+    the largest distance of a mark or window from this line. `explained` states how well the dwells of the probe log
+    agree with the contacts in the field. It is 1 if all dwells agree, or if marks were given. For a random offset, it
+    is 0 on average.
     """
 
     offset_s: float
@@ -136,9 +158,9 @@ class ClockMap:
 
 
 def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
-    """Fit the clock map to sync marks, one row (stream time, probe time) each.
+    """Fit the clock map to sync marks; each row of `marks` is a stream time and a probe time of the same event.
 
-    A single mark determines only the offset, and the rate is 1. Several marks also determine the rate.
+    A single mark determines only the offset; the rate is then assumed to be 1. Several marks also determine the rate.
     """
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
@@ -151,8 +173,8 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
 def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMap:
     """Find the clock map that aligns the contacts visible in the field with the dwells of the probe log.
 
-    The stream must begin with the robot lifted. The function needs 1 byte of memory per time step; a step is 1/16 of
-    the median contact dwell.
+    At the start of the stream, the robot must be lifted. The function needs 1 byte of memory for each time step of the
+    stream. A step is 1/16 of the median duration of a contact dwell.
     """
     if not log.contact.any():
         raise CaptureError(f"{where}: the probe log has no contacts. Record the capture again.")
@@ -179,7 +201,10 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
 
 
 class _Pattern:
-    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with a sum of zero."""
+    """The contact signal that is expected from the probe log.
+
+    It is positive in contact dwells, negative in no-load dwells, and 0 between dwells; its sum is 0.
+    """
 
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
@@ -189,17 +214,17 @@ class _Pattern:
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
         # Fraction of the time without contact.
         self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
-        scaled = len(firsts) * weight * dwell_s  # scaled so that one indentation has weight 1
+        scaled = len(firsts) * weight * dwell_s  # scaled so that the mean total weight of an indentation is 1
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
         self._signed = _running(np.where(log.contact, scaled, -scaled))
         self._unsigned = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the weights of `steps_n` steps of probe time; they are 0 between dwells."""
+        """Return the expected contact signal in `steps_n` steps, which begin at probe time `start_s`."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
     def unsigned(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the magnitudes of the weights of `signed`."""
+        """Return the magnitudes of the values that `signed` returns for the same arguments."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._unsigned))
 
 
@@ -210,19 +235,20 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Return the best offset (probe time minus stream time, in s); raise if another offset fits about as well."""
+    """Return the best offset in s (probe time minus stream time); raise if another offset fits almost as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
     samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
     weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
     overlap = _correlate(unsigned, np.abs(samples))
-    # The score is the match minus the match of a barely acceptable fit with the same overlap. Without the second term,
-    # an offset with a larger overlap could have a higher score despite a mismatched dwell.
+    # The score is the match, minus the match that would be barely acceptable with the same overlap. Without the second
+    # term, a wrong offset with a larger overlap could have a higher score than the right offset.
     score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
     score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[elsewhere].max(initial=0.0)
-    # The overlap minus the match, in indentations. A dwell in which the signal has the wrong sign counts twice.
+    # The overlap minus the match, in indentations. If the signal has the wrong sign in a dwell, the dwell adds to the
+    # overlap and is subtracted from the match, so it counts twice.
     unexplained = (1 - EXPLAINED_MIN) * overlap[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
@@ -235,9 +261,10 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
 def _follow(
     window: Int8[np.ndarray, " g"], pattern: _Pattern, probe_s: float, step_s: float
 ) -> tuple[float, float, float]:
-    """Find the best shift in s of a window of the contact signal, which is expected to begin at `probe_s`.
+    """Find the shift in s at which a window of the contact signal agrees best with the probe log.
 
-    Also returns the window's match with the pattern, and the window's overlap with the dwells, which is the largest
+    The shift is relative to `probe_s`, the probe time at which the window is expected to begin. Also returns the match
+    of the window with the expected signal, and the overlap of the window with the dwells. The overlap is the largest
     possible match.
     """
     reach_n = int(pattern.period_s / step_s) // 2 + 1
@@ -250,11 +277,12 @@ def _follow(
 
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
-    """Correlate two signals at every lag at which they overlap, by FFT.
+    """Correlate two signals at every lag at which they overlap, by the fast Fourier transform.
 
-    This replaces scipy.signal.correlate, whose import takes a second.
+    The function scipy.signal.correlate is not used, because its import takes a second.
     """
-    from scipy.fft import irfft, next_fast_len, rfft  # imported late, because only captures without clock marks need it
+    # imported here, because only captures without clock marks need it
+    from scipy.fft import irfft, next_fast_len, rfft
 
     lags_n = len(signal) + len(window) - 1
     size = next_fast_len(lags_n, real=True)
@@ -262,7 +290,10 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
-    """Return the position of the peak at `top_i`, interpolated between steps; see `PEAK_DROP`."""
+    """Return the position of the peak whose highest value is at `top_i`, interpolated between steps.
+
+    The position is the middle between the two sides of the peak, see `PEAK_DROP`.
+    """
     level = (1 - PEAK_DROP) * score[top_i]
     below_i = np.flatnonzero(score < level)
     left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
@@ -277,7 +308,10 @@ def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
 def _contact_signal(
     blocks: Iterable[Block], pattern: _Pattern, step_s: float, where: str
 ) -> tuple[float, Int8[np.ndarray, " g"]]:
-    """Return the time of the first step, and +1 (contact), -1 (no-load) or 0 (no frame) for each step of the stream."""
+    """Return the time of the first step of the stream, and the contact signal.
+
+    The contact signal has one value for each step: +1 (contact), -1 (no contact) or 0 (no frame, or undecided).
+    """
     parts: list[tuple[int, Int8[np.ndarray, " g"]]] = []
     start_s = None
     for t_s, contact in _detect_contact(blocks, pattern):
@@ -287,7 +321,7 @@ def _contact_signal(
             rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
             raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
         first_i, index_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
-        # The sign of a step with several frames is that of the majority of these frames.
+        # If there are several frames in a step, the majority of these frames decides whether it is in contact.
         parts.append((first_i, np.sign(np.bincount(index_i, np.where(contact, 1, -1))).astype(np.int8)))
     if start_s is None:
         raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
@@ -300,11 +334,13 @@ def _contact_signal(
 def _detect_contact(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Yield times, and for each frame whether its field differs from the no-load field by more than noise.
+    """Yield the times of frames, and whether each frame is in contact.
 
-    The no-load field is updated in each stretch of frames. The probe log gives the fraction of time without contact.
-    This fraction of the frames, namely those with the smallest distance from the previous no-load field, is assumed to
-    be without contact. The half of these frames with the smaller distances gives the new no-load field and the noise.
+    A frame is in contact if its field differs from the no-load field by more than noise, see `AWAY_NOISES`. The no-load
+    field is updated in each stretch of the stream, as follows. The probe log gives the fraction of time without
+    contact. The same fraction of the frames is assumed to be without contact: those whose fields are nearest to the
+    previous no-load field. The new no-load field is the mean over the nearer half of these frames. The noise is the
+    distance from the new no-load field within which half of the frames without contact lie.
     """
     noload_uT, noise_uT = None, np.inf
     for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
@@ -320,7 +356,7 @@ def _detect_contact(
 
 
 def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
-    """Cut blocks into stretches of at most `stretch_s`; leave out frames whose time or field is not finite."""
+    """Cut blocks into stretches that last at most `stretch_s`; omit frames whose time or field is not finite."""
     for t_s, b_uT in blocks:
         good = np.isfinite(b_uT).all(axis=1) & np.isfinite(t_s)
         t_s, b_uT = t_s[good], b_uT[good]
@@ -333,8 +369,11 @@ def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
 def _line(
     stream_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
-    """Fit the clock map to offsets (probe time minus stream time) by least squares; with one offset, the rate is 1."""
-    # the times are centred for precision, because clocks may count from 1970
+    """Fit the clock map by least squares to offsets (probe time minus stream time) at several stream times.
+
+    If there is only one offset, the rate of the map is 1.
+    """
+    # Subtract the mean of the times, so that no precision is lost if a clock counts the seconds since 1970.
     mid_s, mean_s = stream_s.mean(), offset_s.mean()
     spread_s2 = ((stream_s - mid_s) ** 2).sum()
     slope = float(((stream_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(stream_s) > 1 else 0.0

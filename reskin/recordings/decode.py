@@ -1,4 +1,4 @@
-"""Decode a serial dump to a table with one row per frame, and read such a table."""
+"""Decode a serial dump (the bytes that a port sent) to a table with one row per frame, and read such a table."""
 
 import numpy as np
 import pyarrow as pa
@@ -30,8 +30,9 @@ def read_frames(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    The times are those of the board's clock if every frame has one. Otherwise, a time is computed from the frame's
-    position and the constant rate `rate_hz`; in binary formats, lost bytes also take time.
+    If every frame has a time of the board's clock, these times are returned. Otherwise, times are computed from the
+    constant frame rate `rate_hz`. In binary formats, they are computed from the positions of the frames in the stream,
+    so that lost bytes also count as time. In text formats, they are computed from the numbers of the frames.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(frame_columns(chips_n)):
@@ -44,7 +45,8 @@ def read_frames(
     if np.isfinite(device_s).all():
         t_s = device_s.astype(np.float64)
     else:
-        # a text frame is longer than this, so a frame of this length shows that the format is binary
+        # Text frames are longer than binary frames. If any frame has the length of a binary frame, the format is
+        # binary.
         frame_bytes_n = record_type("binary", chips_n).itemsize
         is_binary = (np.diff(end_byte, prepend=0) == frame_bytes_n).any()
         t_s = clocks.constant_rate(end_byte / frame_bytes_n if is_binary else 1.0 + np.arange(len(table)), rate_hz)

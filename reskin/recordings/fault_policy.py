@@ -1,7 +1,8 @@
-"""Policy for each kind of fault: drop the faulty readings, flag them (keep and count), or refuse the recording.
+"""Decide what happens to the faults of a recording, according to a policy with one action for each kind of fault.
 
-`FaultLog` applies the policy to a stream that arrives in portions, and `check_rows` applies it to a whole table. Both
-count the faults.
+There are three actions: drop the faulty readings; flag them, which means to keep and count them; or refuse the whole
+recording. `FaultLog` applies the policy to a stream, which may be passed in several parts of any length. `check_rows`
+applies it to a whole table. Both count the faults.
 """
 
 import math
@@ -28,22 +29,22 @@ from reskin.errors import CaptureError, ParamsError, did_you_mean
 USUAL_LSB = "that of the other chips, and not that of a reset chip"
 
 Action = Literal["drop", "flag", "refuse"]
-DropOrRefuse = Literal["drop", "refuse"]  # actions for stray bytes between frames, which cannot be kept
-FlagOrRefuse = Literal["flag", "refuse"]  # actions for faults that have no faulty reading that could be dropped
+DropOrRefuse = Literal["drop", "refuse"]  # actions for stray bytes between frames, which cannot be kept as readings
+FlagOrRefuse = Literal["flag", "refuse"]  # actions for faults for which no single reading could be dropped
 
 
 class FaultPolicy(Strict):
-    """The action taken for each fault; section `faults` of `params.yaml`."""
+    """The action that is taken for each kind of fault; section `faults` of `params.yaml` contains these actions."""
 
     failed_read: Action  # the I2C read of a chip failed
-    zeros: Action  # zeros in place of a reading
+    zeros: Action  # a chip's reading consists of zeros
     stuck: Action  # the readings of a chip stay the same while others change
     constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
     chip_reset: FlagOrRefuse  # a chip's LSB changes, or differs from the LSB of the other chips
     too_hot: Action  # a chip's temperature is out of range: too hot or too cold
-    saturated: Action  # field at the end of the chip's range
-    int16_wrap: Action  # field jumps by more than the range of int16
-    repeated: Action  # many frames equal the previous frame; a few are normal if the firmware reads fast
+    saturated: Action  # a field is at the end of the chip's range
+    int16_wrap: Action  # a field changes between two frames by more LSBs than an int16 can represent
+    repeated: Action  # many frames equal the previous frame; a few are normal if the firmware is faster than the chips
     dropped: FlagOrRefuse  # frames are missing, according to the board's clock
     clock_jump: FlagOrRefuse  # the board's clock goes backwards, or jumps
     unplug: FlagOrRefuse  # no data arrives for a second or more
@@ -52,13 +53,13 @@ class FaultPolicy(Strict):
 
 
 REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
-# A policy that never refuses a recording, to test whether the recording can be read. For each fault, it takes the first
-# possible action, which is the mildest.
+# A policy that never refuses a recording. It is used to test whether a recording can be read. For each fault, it has
+# the first of the possible actions, which is never "refuse".
 REFUSE_NONE = FaultPolicy.model_validate(
     {name: get_args(field.annotation)[0] for name, field in FaultPolicy.model_fields.items()}
 )
 
-# The policy of `reskin.load_recording`; the same as in `params.yaml` (tests compare them).
+# The policy of `reskin.load_recording`. It is the same as in `params.yaml`; a test compares the two.
 STANDARD_POLICY = FaultPolicy(
     failed_read="drop", zeros="drop", stuck="drop", torn="drop", wrong_baud="drop",
     constant_channel="refuse", chip_reset="refuse",
@@ -68,7 +69,9 @@ STANDARD_POLICY = FaultPolicy(
 
 
 def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> FaultPolicy:
-    """Change the actions for some faults, given as texts `NAME=ACTION`; errors name the command-line option `where`.
+    """Return a policy with other actions for some faults, which are given as texts `NAME=ACTION`.
+
+    `where` is the command-line option that contains these texts; error messages name it.
 
     >>> override(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
@@ -92,10 +95,11 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 
 @dataclass
 class FaultRecord:
-    """Number of times a fault occurred, its first and last position (stream time in s, or row), and the action taken.
+    """How often one kind of fault occurred, the positions of its first and last occurrence, and the action taken.
 
-    The positions are NaN if no faulty frame has a known time. This happens if the recorder was killed, because the last
-    bytes then may have no time.
+    In a stream, a position is the stream time in s; in a table, it is the number of a row. The positions are NaN if no
+    faulty frame has a known time. This is possible if the recorder was killed, because the time of the last bytes may
+    not have been written.
     """
 
     count_n: int
@@ -105,9 +109,10 @@ class FaultRecord:
 
 
 class CheckedRows(NamedTuple):
-    """Masks of the rows (or frames) to keep, and of the dropped rows, each under the first reason that applies.
+    """The rows (or frames) to keep, and the rows to drop, as masks.
 
-    `counts` is the result of `FaultLog.account`.
+    Each dropped row is marked in one of the masks `failed`, `stuck` and `out_of_range`. If several of these reasons
+    apply, it is marked in the first of these masks. `counts` is the result of `FaultLog.account`.
     """
 
     keep: Bool[np.ndarray, " f"]
@@ -117,7 +122,7 @@ class CheckedRows(NamedTuple):
     counts: Mapping[str, int]
 
     def account(self) -> dict[str, int]:
-        """Return the numbers of dropped rows by reason, and `counts`."""
+        """Return the number of dropped rows for each reason, together with `counts`."""
         out_of_range_n = int(self.out_of_range.sum())
         return {
             "dropped_failed_read_rows_n": int(self.failed.sum()),
@@ -127,18 +132,21 @@ class CheckedRows(NamedTuple):
         }
 
     def part(self, rows: slice) -> "CheckedRows":
-        """Return a slice of the rows; `counts` still covers all rows."""
+        """Return the masks for a slice of the rows; `counts` stays the same, although it counts all rows."""
         return CheckedRows(self.keep[rows], self.failed[rows], self.stuck[rows], self.out_of_range[rows], self.counts)
 
 
 class FaultLog:
-    """Apply a policy to the faults of a recording, and count them; `unit` is the unit of a fault's position."""
+    """A log of the faults of one recording, to which a policy is applied.
+
+    `where` is the name of the recording in errors. `unit` is the unit in which the position of a fault is reported.
+    """
 
     def __init__(self, policy: FaultPolicy, where: str, unit: Literal["ms", "row"]) -> None:
         self.records: dict[str, FaultRecord] = {}
         self._policy, self._where, self._unit = policy, where, unit
-        self._per_unit = {"ms": 1000, "row": 1}[unit]  # positions are passed in as s or rows
-        self._span: tuple[float, float] | None = None
+        self._per_unit = {"ms": 1000, "row": 1}[unit]  # factor from the unit of positions (s, or rows) to `unit`
+        self._span: tuple[float, float] | None = None  # first and last time of the stream in s
 
     def record(
         self,
@@ -149,8 +157,8 @@ class FaultLog:
     ) -> Bool[np.ndarray, " f"]:
         """Record the rows (or frames) that `mask` marks as faulty; return the mask of the rows that the policy drops.
 
-        `position` is the time in s or the number of each row. The fault is counted `count_n` times or, if this is None,
-        once per marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
+        `position` is the time in s, or the number, of each row. The fault is counted `count_n` times; if `count_n` is
+        None, it is counted once per marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         action: Action = getattr(self._policy, fault)
         if mask.any():
@@ -196,7 +204,8 @@ class FaultLog:
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
         """Record the faults that can be detected from a single reading.
 
-        Returns two masks of rows to drop: the rows with a failed read, and the other rows with a reading out of range.
+        Returns two masks of rows to drop. The first marks the rows with a failed read or with zeros; the second marks
+        those other rows that have a temperature or field out of range.
         """
         failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
         dropped = self.record("failed_read", failed, position) | self.record("zeros", zeros & ~failed, position)
@@ -214,8 +223,10 @@ class FaultLog:
         rule: str,
         position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
     ) -> None:
-        """Record fault `chip_reset` for all frames at `position`, if the LSB of any chip is `wrong`.
+        """Record fault `chip_reset` for a block of frames, if the LSB of any chip in this block is wrong.
 
+        `wrong` marks the chips with a wrong LSB, and `lsb_uT` is the LSB of each chip. `rule` says which LSB would be
+        right, for the error if there is no expected LSB. `position` is the time or row of each frame of the block.
         Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         if wrong.any() and self._policy.chip_reset == "refuse":
@@ -232,9 +243,10 @@ class FaultLog:
     def record_constant(
         self, channels: list[str], position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
     ) -> None:
-        """Record channels that never changed in a whole recording; raise `CaptureError` if the policy refuses this.
+        """Record channels that never changed in a whole recording.
 
-        `position` is the position of each reading. If it is None, the first and the last time of the stream are used.
+        `position` is the time or row of each reading. If it is None, the first and the last time of the stream are
+        used. Raises `CaptureError` if the policy refuses recordings with constant channels.
         """
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
@@ -247,7 +259,10 @@ class FaultLog:
             self.record("constant_channel", np.ones(len(position), bool), position)
 
     def account(self) -> dict[str, int]:
-        """Return the count, action and (if known) span of each fault that was found."""
+        """Return the count of each fault that was found and, if they are known, its first and last position.
+
+        The keys of the counts contain the action that was taken, as in `fault_stuck_dropped_n`.
+        """
         account: dict[str, int] = {}
         participles = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
         for fault, record in self.records.items():
@@ -269,11 +284,13 @@ def check_rows(
 ) -> CheckedRows:
     """Find the faults of a whole table of readings, and decide which rows to keep.
 
-    The LSB is checked in all rows without a failed read, including rows that are not kept.
+    The LSB of the chips is checked in all rows without a failed read. These include rows that are dropped for another
+    reason.
 
     Parameters
     ----------
-    row : number of each row in its file, if some rows of the file were left out; None: rows are counted from 1.
+    row : the number of each row in its file, needed if the table lacks some rows of the file. If it is None, the rows
+        are numbered from 1.
 
     Raises
     ------

@@ -1,7 +1,8 @@
 """The header of a capture, `header.json`: names, layout, units and clock.
 
-A capture is a folder `data/raw/<scene>/<capture>/` with `header.json` and either the byte stream of a port
-(`stream.bin`, `arrivals.csv`, `probe.csv`) or the unchanged files of a recording in another layout.
+A capture is a folder `data/raw/<scene>/<capture>/` that contains `header.json` and the files of a recording. In layout
+`native`, these files are `stream.bin` (the bytes that a port sent), `arrivals.csv` (their times of arrival) and
+`probe.csv` (places and forces). In other layouts, they are the unchanged files of another program's recording.
 """
 
 import json
@@ -36,10 +37,12 @@ class _Frozen(BaseModel):
 
 
 class Clock(_Frozen):
-    """Source of frame times: the file arrivals.csv, a constant rate, or the recording's own files (`recording`).
+    """The source of the times of frames.
 
-    `marks` are pairs (stream time, probe time) in seconds; each pair belongs to one event that both clocks recorded.
-    Without marks, ingestion aligns the clocks by the contacts.
+    `kind` is `arrivals` if the times are in the file arrivals.csv, `rate` if they are computed from the constant frame
+    rate `rate_hz`, and `recording` if they are in the files of a recording in another layout. `marks` are sync marks:
+    pairs (stream time, probe time) in seconds of the same event, which both clocks recorded. If there are no marks, the
+    clocks are aligned by the contacts when the capture is ingested.
     """
 
     kind: Literal["arrivals", "rate", "recording"]
@@ -54,7 +57,7 @@ class Clock(_Frozen):
 
 
 class Firmware(_Frozen):
-    """Gain and LSB of the magnetometers, as set by the firmware (MLX90393 data sheet, table 17)."""
+    """The gain of the magnetometers, as set by the firmware, and the resulting LSB (MLX90393 data sheet, table 17)."""
 
     gain_sel: Annotated[int, Field(ge=0, le=7)]
     lsb_xy_uT: Annotated[float, Field(gt=0)]
@@ -62,10 +65,10 @@ class Firmware(_Frozen):
 
 
 class Rate(_Frozen):
-    """Frame rate and repeated readings, as the recorder measured them; see `reskin.board.rates.RateMeasurement`.
+    """The frame rate and the fraction of repeated readings, as the recorder measured them.
 
-    `sent_hz` is the rate according to the board's clock (`method` is `clock`) or, if the board sends no time, the rate
-    of arrival.
+    `sent_hz` is the rate according to the board's clock if `method` is `clock`. If `method` is `arrivals`, the board
+    has no usable clock, and `sent_hz` is the rate of arrival. See `reskin.board.rates.RateMeasurement`.
     """
 
     sent_hz: Annotated[float, Field(gt=0)]
@@ -98,7 +101,7 @@ class Header(_Frozen):
     protocol: str
     contacts_before_n: Annotated[int, Field(ge=0)]
     options: dict[str, str]
-    files: dict[str, str]  # name -> sha256 of each file except this header
+    files: dict[str, str]  # names of all files except this header -> their SHA-256 hashes
     note: str
     rate: Rate | None = None
 
@@ -115,7 +118,7 @@ class Header(_Frozen):
 
 
 def parse(text: str, where: str) -> Header:
-    """Parse a header from JSON; raise `CaptureError` naming the first field that is wrong."""
+    """Parse a header from JSON; if a field is wrong, raise `CaptureError`, which names the first such field."""
     try:
         return Header.model_validate_json(text)
     except ValidationError as error:
@@ -127,7 +130,10 @@ def parse(text: str, where: str) -> Header:
 
 
 def make_header(where: str, **fields: Any) -> Header:
-    """Create and check a header; by default, its fields suit a recording in another layout than `native`."""
+    """Create and check a header.
+
+    Fields that are not given have default values, which are right for a recording in another layout than `native`.
+    """
     defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
@@ -138,22 +144,25 @@ def make_header(where: str, **fields: Any) -> Header:
 
 
 def render(header: Header) -> str:
-    """Write a header as JSON, indented by two spaces, with keys in the order of `Header`; omit a rate of None."""
+    """Return a header as JSON, indented by two spaces, with keys in the order of `Header`.
+
+    Key `rate` is omitted if the rate is None.
+    """
     without = {"rate"} if header.rate is None else set()
     return json.dumps(header.model_dump(mode="json", exclude=without), indent=2) + "\n"
 
 
 def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if a capture folder has another name than its header states, for example after it was renamed."""
+    """Raise if the name of a capture's folder is not the name in its header, for example because it was renamed."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
         raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename the folder.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
-    """Write the files of a capture (bytes, or paths to copy), and then the header with the hashes of these files.
+    """Write the files of a capture, and then the header with the hashes of these files; return the written header.
 
-    Returns the header that was written.
+    `contents` maps the name of each file to its bytes, or to the path of a file to copy.
     """
     with io.replacing(folder) as temporary:
         temporary.mkdir()
@@ -166,7 +175,7 @@ def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | P
 
 
 def seal(folder: Path, header: Header) -> Header:
-    """Write the header of a capture folder, with the hashes of the other files, and return it."""
+    """Write the header of a capture folder with the hashes of all other files in it; return the written header."""
     names = sorted(path.name for path in folder.iterdir() if path.name != HEADER_FILE)
     complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
     io.write_text(folder / HEADER_FILE, render(complete))

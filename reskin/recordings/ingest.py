@@ -1,7 +1,8 @@
 """Convert a capture of any layout to readings, and count all lost or dropped bytes, frames and rows in an account.
 
-In native captures, the clocks of the board and of the probe log are first aligned. Then frames are assigned to the
-dwells of the probe log by their times.
+A native capture consists of the stream of bytes that a board sent, and of the probe log of the rig. The probe log lists
+the dwells: the times in which the rig did not move. Stream and probe log have different clocks. Therefore, the clocks
+are first aligned. Then each frame of the stream is assigned to the dwell in which it was measured.
 """
 
 from collections import Counter
@@ -55,7 +56,10 @@ OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # this key is in the account onl
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames, their stream times, and which frames to keep. After an unknown time (NaN), all times are unknown."""
+    """Frames with their stream times, and the result of the check for faults.
+
+    If the time of a frame is unknown (NaN), the times of all later frames are unknown too.
+    """
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
@@ -64,7 +68,7 @@ class TimedFrames:
 
 @dataclass(frozen=True)
 class _DwellFrames:
-    """Frames within a dwell, in order of time."""
+    """Frames that were measured during dwells, in order of time; `dwell_i` is the index of each frame's dwell."""
 
     dwell_i: Int64[np.ndarray, " f"]
     t_s: Float64[np.ndarray, " f"]
@@ -75,7 +79,7 @@ class _DwellFrames:
         return _DwellFrames(self.dwell_i[rows], self.t_s[rows], self.b_uT[rows], self.temperature_degC[rows])
 
     def then(self, later: "_DwellFrames") -> "_DwellFrames":
-        """Return these frames, followed by the later ones."""
+        """Return these frames, followed by the frames of `later`."""
         pairs = ((getattr(self, name), getattr(later, name)) for name in self.__dataclass_fields__)
         return _DwellFrames(*map(np.concatenate, pairs))
 
@@ -99,16 +103,16 @@ def join(
 
 
 class Joiner:
-    """Assign frames to dwells, and convert each indentation to readings once it has ended.
+    """An object that assigns frames to dwells, and converts each indentation to readings once it has ended.
 
-    A dropped frame is counted under the first reason that applies: no time, not finite, failed read, stuck chip, out of
-    range, between dwells. The no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is
-    stream time.
+    A frame may be dropped for several reasons: no time, not finite, failed read, stuck chip, out of range, between
+    dwells. It is counted under the first reason of this list that applies. The no-load field of an indentation is the
+    mean field in its no-load dwell. The time `t_s` of a reading is stream time.
     """
 
     def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
         self._log, self._clock, self._header = log, clock, header
-        begins = ~log.contact  # because each indentation begins with its only no-load dwell
+        begins = ~log.contact  # whether a dwell begins an indentation: each one begins with its only no-load dwell
         self._group_i = np.cumsum(begins) - 1  # index of the indentation of each dwell
         touched = np.zeros(int(begins.sum()), np.int64)
         touched[self._group_i[log.contact]] = 1
@@ -124,19 +128,19 @@ class Joiner:
         if not len(known_s) or not len(pending.dwell_i):
             self._pending = pending
             return self._readings(self._empty())
-        # Times never decrease, so an indentation has ended when the time of a frame is in a later indentation.
+        # Times never decrease, so an indentation has ended when a frame has a time in a later indentation.
         now_i = np.searchsorted(self._log.t_start_s, known_s[-1], "right") - 1
         ended_n = int(np.searchsorted(self._group_i[pending.dwell_i], self._group_i[now_i], "left"))
         self._pending = pending.where(slice(ended_n, None))
         return self._readings(pending.where(slice(0, ended_n)))
 
     def close(self) -> Readings:
-        """Return the readings of the last indentation, of which only a part may have been recorded."""
+        """Return the readings of the last indentation, which may have been recorded only in part."""
         pending, self._pending = self._pending, self._empty()
         return self._readings(pending)
 
     def account(self) -> dict[str, int]:
-        """Return the counts of frames and indentations so far: in total, used, and dropped by reason."""
+        """Return the counts of frames and indentations so far: all, those used, and those dropped for each reason."""
         counted = {name: self._count[name] for name in COUNTS}
         counted |= {OUT_OF_RANGE: self._count[OUT_OF_RANGE]} if self._count[OUT_OF_RANGE] else {}
         logged_n = int((~self._log.contact).sum())
@@ -166,7 +170,8 @@ class Joiner:
     def _readings(self, pending: _DwellFrames) -> Readings:
         """Convert the frames of whole indentations to readings.
 
-        Indentations without a frame in the no-load dwell, or without a frame in contact, are dropped and counted.
+        An indentation needs at least one frame in its no-load dwell and one frame in contact. Other indentations are
+        dropped and counted.
         """
         group_i, contact = self._group_i[pending.dwell_i], self._log.contact[pending.dwell_i]
         with_noload, with_contact = group_i[~contact], group_i[contact]
@@ -205,9 +210,9 @@ class Joiner:
 def _means(
     b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
 ) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
-    """Return the mean field of each group of rows, and for each group number in `wanted_i` the index of its mean.
+    """Return the mean field of each group of rows, and the index of the mean for each group number in `wanted_i`.
 
-    `group_i` is the group number of each row, in increasing order.
+    `group_i` is the group number of each row of `b_uT`; it never decreases from one row to the next.
     """
     runs_i, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
     if not len(runs_i):
@@ -223,18 +228,21 @@ def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
 
 
 BLOCK_BYTES_N = 2**22
-# maximum spread of the temperatures in a block of frames, over time and over the chips of a board
+# In a block of frames, the temperatures of all chips at all times differ by less than this value. Larger differences
+# show that the numbers are not temperatures.
 SPREAD_MAX_degC = 10.0
-# Each entry has the key of a total, and the prefix and the suffix of the keys that count the losses of this total.
+# Which keys of an account count the losses of which total. Each entry contains the key of a total, and the prefix and
+# the suffix of the keys that count losses of this total.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
     ("frames_n", "dropped_", "_frames_n"),
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# Keys that do not count as losses. These are frames between dwells, frames of an indentation without a no-load dwell or
-# without a contact, and rows of zeros. A recorder writes zeros when it polls faster than the chips measure; the reader
-# of layout `eflash7` limits their number.
+# Keys with such a prefix and suffix that do not count as losses: frames between dwells, frames of an indentation
+# without a no-load reading or without a contact, and rows of zeros. In layout `eflash7`, the recorder writes a row of
+# zeros if it asks for a reading before the chips have measured again. The reader of this layout limits the number of
+# these rows.
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
@@ -242,7 +250,7 @@ NO_LOSS = (
     "dropped_zero_rows_n",
 )
 
-# a function of frames and the number of earlier frames, which returns the stream time of each frame
+# A function that returns the stream time of each frame. Its arguments are the frames, and the number of earlier frames.
 Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]
 
 
@@ -284,7 +292,7 @@ def read_header(folder: Path) -> Header:
 
 
 def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
-    """Raise if a capture lost a fraction of more than `limit` of its bytes, frames, rows or indentations."""
+    """Raise if a capture lost more than the fraction `limit` of its bytes, frames, rows or indentations."""
     for total, prefix, suffix in LOSSES:
         lost = [key for key in account if key.startswith(prefix) and key.endswith(suffix) and key not in NO_LOSS]
         lost_n = sum(account[key] for key in lost)
@@ -295,9 +303,10 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
-    """Return an iterator over the readings of a native capture, and the account (complete after the iteration).
+    """Return an iterator over the readings of a native capture, and its account.
 
-    Without sync marks, the stream is read twice: first to align the clocks, then to yield the readings.
+    The account is complete after the iteration. If the header has no sync marks (pairs of times at which both clocks
+    recorded the same event), the stream is read twice: first to align the clocks, then to yield the readings.
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
@@ -315,7 +324,10 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
 
 
 def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
-    """Return the clock map from the header's sync marks; without marks, from the contacts in the frames."""
+    """Return the map from stream time to probe time.
+
+    It is computed from the sync marks in the header or, if there are none, from the contacts that the fields show.
+    """
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
     pairs = ((block.t_s[block.checked.keep], block.frames.b_uT[block.checked.keep]) for block in blocks)
@@ -325,7 +337,7 @@ def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFr
 def _timed_frames(
     folder: Path, header: Header, times_of: Timer, account: dict[str, int], policy: FaultPolicy
 ) -> Iterator[TimedFrames]:
-    """Decode the stream block by block; at the end, add the counts of its bytes and faults to `account`."""
+    """Decode the stream in blocks; after the last block, add the counts of bytes, frames and faults to `account`."""
     wire, where = _wire(header), str(folder / STREAM_FILE)
     stream, log = FrameStream(wire, header.chips_n), FaultLog(policy, where, "ms")
     frame_bytes_n = None if wire in TEXT_WIRES else record_type(wire, header.chips_n).itemsize
@@ -350,9 +362,9 @@ def _timed_frames(
 
 
 def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
-    """Raise if the fault-free frames have wrong units or, in a text format, seem to be in the other text format.
+    """Raise if the fields of the fault-free frames are not in uT, or if the header states the wrong text format.
 
-    Returns False if nothing was checked because there are no fault-free frames.
+    Returns False if there are no fault-free frames, so that nothing was checked.
     """
     read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
     read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
@@ -361,7 +373,7 @@ def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
     b_uT, temperature_degC = frames.b_uT[read], frames.temperature_degC[read]
     if wire in TEXT_WIRES:
         other, axis = ("text-txyz", 0) if wire == "text-xyzt" else ("text-xyzt", 2)
-        # these are the temperatures if the columns have the order of the other text format
+        # if the numbers have the order of the other text format, these are the temperatures
         swapped_degC = b_uT[:, axis::3]
         (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
         is_swapped = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
@@ -379,7 +391,7 @@ def _mostly_possible(temperature_degC: Float32[np.ndarray, "f k"]) -> bool:
 
 
 def timer(folder: Path, header: Header) -> Timer:
-    """Return the function that assigns times to frames, depending on the kind of the header's clock."""
+    """Return a function that computes the stream times of frames; the header states which kind of clock to use."""
     rate_hz = header.clock.rate_hz
     if header.clock.kind == "arrivals":
         table = _arrivals(folder)
@@ -394,7 +406,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; raise if they list more bytes than the stream has, for example because it was truncated."""
+    """Read the times of arrival; raise if they list more bytes than the stream has, as when the stream was cut."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

@@ -1,4 +1,8 @@
-"""Sources of labels for a recording: a person who presses by hand, a robot's program or CSV file, or a force gauge."""
+"""Sources of labels (places and forces of contacts) during a recording.
+
+There are four sources: a person who presses by hand at places that the program names; a Python function or generator
+that moves a robot; a CSV file to which a robot's program appends rows; and a force gauge.
+"""
 
 import math
 import os
@@ -31,38 +35,36 @@ from reskin.recordings.labels import (
 
 @dataclass
 class LabelContext:
-    """The objects that a source of labels uses during a recording.
-
-    These are the writer of the probe log, this machine's clock in unix seconds, the event that stops the recording, and
-    a function that sets the clock mark in the capture's header.
-    """
+    """The objects that a source of labels uses during a recording."""
 
     writer: ProbeLogWriter
-    unix_s: Callable[[], float]
-    stop: threading.Event
-    # called with the unix time of an event, and the event's time on the clock of the label source
+    unix_s: Callable[[], float]  # function that returns the time on this machine's clock, in unix seconds
+    stop: threading.Event  # the event that stops the recording
+    # Function that writes a sync mark to the capture's header. Its arguments are two times of the same event: the unix
+    # time, and the time on the clock of the source.
     mark: Callable[[float, float], object]
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
-        """Wait for `dwell_s`, or until the recording stops; return a dwell that spans this time."""
+        """Wait for `dwell_s`, or until the recording stops; return a dwell with the label and the time of the wait."""
         start_s = self.unix_s()
         self.stop.wait(dwell_s)
         return Dwell(label, start_s, self.unix_s())
 
 
 class LabelSource(NamedTuple):
-    """A source of labels."""
+    """A source of labels, which a recording runs in a thread of its own (see `LabelThread`)."""
 
     name: str  # name of the source, for the capture's header
     scan: str | None  # order of the places
-    # function that writes labels until they end or the recording stops, and returns a summary
+    # function that writes labels until there are no more labels or the recording stops, and then returns a summary
     run: Callable[[LabelContext], str]
 
 
 def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> LabelSource:
-    """Take labels from a generator, or from a function that is called until it returns None.
+    """Make a source that takes labels from a generator, or from a function that is called until it returns None.
 
-    The generator or function moves the robot before it returns a label. The next label is requested after the dwell.
+    The generator or function first moves the robot, and then yields or returns the label. The robot then stays where it
+    is for `dwell_s`, after which the next label is requested.
     """
     label_iterator = iter(labels, None) if callable(labels) else iter(labels)
 
@@ -82,7 +84,10 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
 
 
 class LabelThread:
-    """Run a source of labels in a thread; if it fails, `failed` is the exception and `problem` describes it."""
+    """A thread that runs a source of labels.
+
+    If the source fails, `failed` is the exception, and `problem` is a text that describes it.
+    """
 
     def __init__(self, source: LabelSource, context: LabelContext) -> None:
         self.summary, self.problem = "", ""
@@ -92,9 +97,9 @@ class LabelThread:
         self._thread.start()
 
     def end(self, wait_s: float = 1.0) -> str:
-        """Stop the source and the recording; return a summary.
+        """Stop the source of labels and the recording; return a summary of the labels.
 
-        Wait at most `wait_s` for a source that does not stop. The labels that were written are kept.
+        The method waits for the source to stop, but at most `wait_s`. Labels that were written before are kept.
         """
         self._label_context.stop.set()
         self._thread.join(wait_s)
@@ -119,14 +124,17 @@ RANDOM, SNAKE = "random", "snake"
 
 @dataclass(frozen=True)
 class Places:
-    """Places (x, y) in mm, numbered row by row; `row_n` is the number of places in a row."""
+    """A grid of places (x, y) in mm, numbered row by row; `row_n` is the number of places in a row."""
 
     name: str
     xy_mm: Sequence[tuple[float, float]]
     row_n: int
 
     def order(self, scan: str, rng: np.random.Generator) -> list[int]:
-        """Return the numbers of all places in random order, or row by row with every other row backwards."""
+        """Return the numbers of all places in the order in which they are to be pressed.
+
+        If `scan` is `RANDOM`, the order is random. Otherwise, it is row by row, with every other row backwards.
+        """
         if scan == RANDOM:
             return [int(i) for i in rng.permutation(len(self.xy_mm))]
         rows = [list(range(first, first + self.row_n)) for first in range(0, len(self.xy_mm), self.row_n)]
@@ -134,7 +142,9 @@ class Places:
 
 
 def parse_places(text: str) -> Places | None:
-    """Parse `line:N:STEP_MM` (along x) or `grid:NXxNY:STEP_MM`; `@X_MM,Y_MM` at the end sets the first place.
+    """Parse a text that describes places: `line:N:STEP_MM` or `grid:NXxNY:STEP_MM`; return None for any other text.
+
+    A line is along x. The first place is (0, 0), unless the text ends with another place, as in `@X_MM,Y_MM`.
 
     >>> parse_places("line:3:2@0,8").xy_mm
     [(0.0, 8.0), (2.0, 8.0), (4.0, 8.0)]
@@ -152,11 +162,14 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a clock mark is replaced by a new mark if the new delay is shorter by more than this
+BETTER_s = 0.005  # a sync mark is replaced only if the delay of the new mark is shorter by more than this
 
 
 def from_table(file: Path) -> LabelSource:
-    """Take labels from a CSV file to which a robot's program appends rows; skip rows written before the recording."""
+    """Make a source that takes labels from a CSV file to which a robot's program appends rows.
+
+    Rows that were written before the recording are skipped.
+    """
 
     def run(context: LabelContext) -> str:
         table, dwells, least_delay_s = SampleTable(str(file)), DwellBuilder(), math.inf
@@ -166,8 +179,8 @@ def from_table(file: Path) -> LabelSource:
                 if not samples or not is_new:
                     continue
                 delay_s = arrival_s - samples[-1].t_s if table.clock == "t_s" else least_delay_s
-                # Rows are read some time after they were written, so the mark with the shortest delay is the most
-                # accurate.
+                # A sync mark pairs the time at which a row was read with the time in the row. Rows are read some time
+                # after they were written, so the mark with the shortest delay is the most accurate.
                 if delay_s < least_delay_s - BETTER_s:
                     least_delay_s = delay_s
                     context.mark(arrival_s, samples[-1].t_s)
@@ -184,10 +197,10 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
 
 
 def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Yield the content of a file, then all data that is appended to it, until `stop` is set.
+    """Yield the content of a file, and then all data that is appended to it, until `stop` is set.
 
-    Yields pairs of a chunk and a flag, which states whether the chunk was written after the call. If the file does not
-    exist, wait for it.
+    Each yielded pair consists of a chunk of bytes and a flag. The flag is True if the chunk was written after the call
+    of this function. If the file does not exist yet, the function waits for it.
     """
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
@@ -224,7 +237,11 @@ KEPT_N = 10_000  # number of latest samples that a gauge stores; a touch has a f
 
 
 class ForceGauge:
-    """A force gauge at a port; it can be read in a thread, which stores the latest samples."""
+    """A force gauge at a port.
+
+    The gauge can be read in a thread (see `listening`), which stores the latest samples. `during` then returns the mean
+    force between two times.
+    """
 
     def __init__(self, port: str, baud: int) -> None:
         self.port, self._baud, self._gauge = port, baud, GaugeLines()
@@ -242,7 +259,10 @@ class ForceGauge:
         return mean_label(labels) if labels else Label(True)
 
     def summary(self) -> str:
-        """Describe how many lines could not be read, and how many contacts have no force; "" if there are none."""
+        """Return a text on the problems of the gauge; "" if there are none.
+
+        The problems are lines that could not be read, a lost connection, and contacts without force.
+        """
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
         without = f"{self._without_force_n} touches during which the gauge at {self.port} sent no force"
         return "; ".join(filter(None, (bad, self._problem, without if self._without_force_n else "")))
@@ -266,7 +286,10 @@ class ForceGauge:
             self._problem = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
-        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged before."""
+        """Read samples from the gauge, and pass them to the function `use`, until the recording stops.
+
+        Raises `CaptureError` if the gauge is unplugged before.
+        """
         while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
@@ -279,7 +302,7 @@ class ForceGauge:
 
 
 def from_gauge(port: str, baud: int) -> LabelSource:
-    """Take labels from a force gauge: the times and forces of contacts, without places."""
+    """Make a source that takes labels from a force gauge: the times and forces of contacts, without places."""
 
     def run(context: LabelContext) -> str:
         forces, dwells = ForceGauge(port, baud), DwellBuilder()
@@ -295,22 +318,26 @@ def from_gauge(port: str, baud: int) -> LabelSource:
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
-# A place, a force, or both, separated by a space. The space is needed, because 12N could also mean place 1 with 2 N.
+# The person types a place, a force, or both. The space between them is needed: without it, 12N could mean a force of 12
+# N or place 1 with a force of 2 N.
 REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Prompts:
-    """Ask a person to press one place after another, and to hit the Enter key while the tip does not move."""
+    """A source of labels that asks a person to press one place after another.
+
+    The person hits the Enter key when the tip does not move. The dwell then begins, and lasts for `dwell_s`.
+    """
 
     places: Places
     dwell_s: float
     say: Say
     lines: Callable[[], Iterable[str]]  # function that returns the lines that the person types
-    forces: ForceGauge | None
+    forces: ForceGauge | None  # the gauge that measures the forces; None if there is no gauge
     rng: np.random.Generator
-    scan: str = RANDOM
+    scan: str = RANDOM  # the order of the places, see `Places.order`
 
     def source(self) -> LabelSource:
         return LabelSource(self.places.name, self.scan, self.run)
@@ -344,9 +371,9 @@ class Prompts:
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Return the label that a person types for a press; None if the person ends the recording.
+        """Return the label of a press from the line that the person types; return None to end the recording.
 
-        For a skipped place, the label is one without contact.
+        If the person skips the place, the label is one without contact.
         """
         for line in typed:
             match = REPLY.fullmatch(line)
@@ -369,7 +396,10 @@ class Prompts:
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:
-    """Yield typed lines without surrounding spaces until they end or `stop` is set; a thread waits for the input."""
+    """Yield the lines that a person types, without surrounding spaces, until the input ends or `stop` is set.
+
+    A thread waits for the input, so that `stop` is noticed even if nothing is typed.
+    """
     typed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def read() -> None:

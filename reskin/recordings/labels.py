@@ -1,6 +1,8 @@
-"""Labels during a recording: combine samples of a table or a force gauge into dwells; write dwells to `probe.csv`.
+"""Labels that arrive during a recording: combine them into dwells, and write the dwells to the probe log `probe.csv`.
 
-The sources of labels are in `label_sources`.
+A label states whether the skin is touched and, if known, where, how deep and how hard. A sample is the label at one
+time, which a robot's table or a force gauge provides. A dwell is a time in which nothing moves, so that one label is
+valid. The sources of labels are in `label_sources`.
 """
 
 import math
@@ -22,22 +24,29 @@ from reskin.recordings.units import SAME_PLACE_mm
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # resolution of the written times
 TIME_MAX_s = 1e11  # unix time in seconds stays below this value for 3,000 years; unix time in milliseconds is above it
-CLOCKS = ("unix_s", "t_s")  # column names of the time: on this machine's clock, or on the clock of the label source
+# Possible names of the column of times: `unix_s` if the times are those of this machine's clock, `t_s` if the source of
+# labels has a clock of its own.
+CLOCKS = ("unix_s", "t_s")
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
-CONTACT_N = 0.05  # assumed: a force of this or more is a contact; it is above the noise of a gauge
-# below this force, there is no contact; between it and CONTACT_N, a contact may be beginning or ending
+CONTACT_N = 0.05  # assumed: a force of at least this magnitude is a contact; it is above the noise of a gauge
+# Below this force, there is no contact. If the force is between NOLOAD_N and CONTACT_N, a contact may be beginning or
+# ending, so the sample has no label.
 NOLOAD_N = 0.025
-# Assumed limits of a dwell. A longer contact is split into several dwells, each with its own mean force.
+# Assumed limits of the duration of a dwell. A longer contact is split into several dwells, each with its own mean
+# force.
 DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5
-DWELL_SAMPLES_MAX_N = 10_000  # limits the memory if the clock of the label source has stopped
+# A dwell also ends after this many samples. Otherwise, it could grow without limit if the source's clock has stopped.
+DWELL_SAMPLES_MAX_N = 10_000
 LINE_BYTES_MAX_N = 4096
-GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # number of values in a gauge's line -> their names
+# names of the forces in a line of a gauge, by the number of values in the line
+GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}
 
 
 class Label(NamedTuple):
-    """The label of a dwell, a time in which nothing moves; unknown numbers are NaN.
+    """Whether the skin is touched, and the place, depth and force of the touch.
 
-    Forces have the signs of `reskin.schema`: they are forces on the skin, and `Fz_N` is positive in compression.
+    Unknown numbers are NaN. Forces have the signs of `reskin.schema`: they are forces on the skin, and `Fz_N` is
+    positive in compression.
     """
 
     contact: bool
@@ -51,7 +60,7 @@ class Label(NamedTuple):
 
 
 class Dwell(NamedTuple):
-    """A label with the start and end of the time for which it is valid, on the clock of the label's source."""
+    """A time in which nothing moves, on the clock of the source of labels, and the label that is valid in this time."""
 
     label: Label
     t_start_s: float
@@ -59,10 +68,12 @@ class Dwell(NamedTuple):
 
 
 class ProbeLogWriter:
-    """Write the probe log of a recording as labels arrive; write a contact together with the no-load dwell before it.
+    """A writer of the probe log of a recording, which writes dwells as they arrive.
 
-    Therefore, `probe.parse` accepts the log even if the recorder is killed. Contacts that `probe.parse` would refuse
-    are counted and not written.
+    A no-load dwell is written together with the contact that follows it. Therefore, the log is complete at any time,
+    and `probe.parse` accepts it even if the recorder is killed. Contacts that `probe.parse` would refuse are not
+    written. They are counted: in `without_noload_n` if no no-load dwell precedes them, and in `out_of_order_n` if they
+    begin before the end of an earlier dwell.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -82,14 +93,15 @@ class ProbeLogWriter:
 
     @contextmanager
     def locked(self) -> Iterator[bool]:
-        """Lock the writer during the `with` block; yield whether it still accepts labels."""
+        """Lock the writer during the `with` block; yield True if it still accepts labels, and False if it is closed."""
         with self._lock:
             yield not self._file.closed
 
     def write(self, dwell: Dwell) -> None:
-        """Write a dwell with contact; store a dwell without contact until the next contact.
+        """Write a dwell with contact, or store a dwell without contact until the next contact.
 
-        A contact may consist of several dwells at one place. A no-load dwell must precede a contact at another place.
+        A contact at one place may consist of several dwells. Before a contact at another place, there must be a no-load
+        dwell.
         """
         _check(dwell)
         with self.locked() as is_open:
@@ -120,7 +132,10 @@ class ProbeLogWriter:
 
 
 def same_place(a: Label, b: Label) -> bool:
-    """Return whether two labels have the same place; a coordinate that is unknown in both labels counts as equal."""
+    """Return whether two labels have the same place.
+
+    A coordinate that is unknown (NaN) in both labels counts as equal.
+    """
     return all(
         abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
         for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))
@@ -150,14 +165,14 @@ def _check(dwell: Dwell) -> None:
 
 
 class Sample(NamedTuple):
-    """A label at one time; the label is None while the rig moves."""
+    """A label at one time. It is None if there may be motion, for example while a contact begins or ends."""
 
     t_s: float
     label: Label | None
 
 
 class LineBuffer:
-    """Split bytes that arrive in portions into lines of text; a line longer than `LINE_BYTES_MAX_N` is cut in two."""
+    """A buffer that splits arriving bytes into lines of text; a line longer than `LINE_BYTES_MAX_N` is cut in two."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -170,7 +185,11 @@ class LineBuffer:
 
 
 class SampleTable:
-    """Parse samples from CSV text that arrives in portions; `bad_n` counts unreadable lines."""
+    """A parser of samples in CSV text, which may be passed in several parts of any length.
+
+    `clock` is the name of the column of times. `bad_n` is the number of lines that could not be read, and `first_bad`
+    is the first of them.
+    """
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -179,7 +198,10 @@ class SampleTable:
         self.clock, self.bad_n, self.first_bad = "", 0, ""
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Process the next bytes; return the complete samples. Raises `CaptureError` if columns are missing."""
+        """Process the next bytes; return the samples whose lines are now complete.
+
+        Raises `CaptureError` if the line with the column names lacks necessary columns.
+        """
         samples = []
         for line in self._lines.feed(data):
             if not self._names:
@@ -219,14 +241,18 @@ class SampleTable:
 
 
 class GaugeLines:
-    """Parse lines of a force gauge: one number (Fz) or three (Fx Fy Fz), in N and with the signs of `Label`."""
+    """A parser of the lines that a force gauge sends.
+
+    A line contains one number (Fz) or three numbers (Fx Fy Fz). Forces are in N and have the signs of `Label`. `bad_n`
+    is the number of lines that could not be read, and `first_bad` is the first of them.
+    """
 
     def __init__(self) -> None:
         self._lines = LineBuffer()
         self.bad_n, self.first_bad = 0, ""
 
     def feed(self, data: bytes, arrival_s: float) -> list[Sample]:
-        """Process the next bytes, given their time of arrival; return the forces of the complete lines."""
+        """Process bytes that arrived at time `arrival_s`; return a sample for each line that is now complete."""
         samples = []
         for line in self._lines.feed(data):
             try:
@@ -241,11 +267,11 @@ class GaugeLines:
 
 
 class DwellBuilder:
-    """Combine samples into dwells with mean force and depth.
+    """An object that combines samples into dwells, whose labels have the mean force and depth of the samples.
 
-    A dwell is made of the samples of a contact at one place, or of a period without contact. A contact longer than
-    `DWELL_MAX_s` is cut into several dwells, so that some of its labels are already written if the recorder is killed.
-    `short_n` counts contacts that are too short for a dwell.
+    A dwell consists of the samples of a contact at one place, or of the samples of a period without contact. A contact
+    longer than `DWELL_MAX_s` is cut into several dwells. If the recorder is killed during a long contact, the dwells
+    that were complete have then already been written. `short_n` counts the contacts that are too short for a dwell.
     """
 
     def __init__(self) -> None:
@@ -260,7 +286,7 @@ class DwellBuilder:
             if run and not _continues(run[0], run[-1], sample):
                 yield from self.close()
             if sample.label is not None:
-                # without contact, keep only the first and the last sample
+                # Without contact, a dwell needs only its first and its last sample, so replace the last one.
                 if len(self._run) > 1 and not sample.label.contact:
                     self._run.pop()
                 self._run.append(sample)
@@ -269,7 +295,7 @@ class DwellBuilder:
                     self._cut = sample
 
     def close(self) -> Iterator[Dwell]:
-        """Yield a dwell of the samples since the last dwell, if these samples span at least `DWELL_MIN_s`."""
+        """End the current dwell; yield it if its samples span at least `DWELL_MIN_s`, or else yield nothing."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
         is_remainder = bool(run) and self._cut is not None and _continues(self._cut, self._cut, run[0])
         self._cut = None
@@ -279,9 +305,10 @@ class DwellBuilder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Describe how many contacts were too short for a dwell; return "" if there are none.
+        """Return a text that says how many contacts were too short for a dwell; return "" if there are none.
 
-        If a table has rows only at the start and the end of contacts, all contacts are too short.
+        All contacts may be too short if a program does not append rows continuously. Therefore, the text advises to
+        write lines continuously.
         """
         if not self.short_n:
             return ""
@@ -293,13 +320,16 @@ class DwellBuilder:
 
 
 def mean_label(labels: list[Label]) -> Label:
-    """Return the first label, with each number replaced by the mean over all labels (NaN if unknown in any label)."""
+    """Return the first label, with each number replaced by its mean over all labels.
+
+    If a number is unknown (NaN) in any of the labels, it is unknown in the result.
+    """
     means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
     return labels[0]._replace(**means)
 
 
 def _continues(first: Sample, last: Sample, sample: Sample) -> bool:
-    """Return whether `sample` belongs to the dwell that consists of the samples from `first` to `last`."""
+    """Return whether `sample` continues the dwell that consists of the samples from `first` to `last`."""
     a, b = first.label, sample.label
     if a is None or b is None or a.contact != b.contact or a.pass_i != b.pass_i or sample.t_s < last.t_s:
         return False
@@ -307,7 +337,7 @@ def _continues(first: Sample, last: Sample, sample: Sample) -> bool:
 
 
 def _is_contact(force_N: float) -> bool | None:
-    """Return whether a force indicates contact; None between the two thresholds, or for NaN."""
+    """Return whether a force indicates contact; None if it is NaN, or between `NOLOAD_N` and `CONTACT_N`."""
     if abs(force_N) >= CONTACT_N:
         return True
     return False if abs(force_N) < NOLOAD_N else None

@@ -1,4 +1,7 @@
-"""Load recordings: logs as arrays, and recordings of any kind as a pandas DataFrame with units."""
+"""Load recordings: a log as arrays, or a recording of any kind as a pandas DataFrame with units.
+
+A log is a sequence of frames without labels.
+"""
 
 import re
 from collections.abc import Mapping
@@ -27,7 +30,10 @@ EXTRA = "learn"  # the extra of pyproject.toml that installs pandas
 
 
 def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
-    """Read the frames of a capture's folder, of a table that `reskin decode` wrote, or of an SD card's log."""
+    """Read the frames of a log: a capture folder, a table that `reskin decode` wrote, or the log of an SD card.
+
+    `rate_hz` is the frame rate of a table that has no times.
+    """
     if log.is_dir():
         return _read_capture(log)
     if not 0 < rate_hz <= RATE_MAX_HZ:
@@ -72,7 +78,7 @@ def load_recording(path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
 
 
 def _hint(path: Path, *, frames: bool) -> str:
-    """Return advice for a recording that cannot be loaded; "" if there is no advice."""
+    """Return a text with advice on how to load a recording that cannot be loaded; "" if there is no advice."""
     layouts = [layout for layout in layouts_of(path) if layout != "table"]
     if layouts == ["capture"]:
         return "" if frames else "To load the frames without labels, try: frames=True"
@@ -102,7 +108,7 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
 
 
 def _kind_of(file: Path) -> str:
-    """Return the kind of a file by its column names: `table`, `ingested`, or `log` for all other names."""
+    """Return the kind of a file: `table` or `ingested` if it has the column names of this kind, and `log` otherwise."""
     if not file.is_file():
         raise CaptureError(f"{file}: file not found. Check the path.")
     with file.open("rb") as stream:
@@ -115,7 +121,7 @@ def _kind_of(file: Path) -> str:
 
 
 def _read_labelled(folder: Path) -> tuple[Readings, Mapping[str, int]]:
-    """Read the readings in contact of a capture."""
+    """Return those readings of a capture that are in contact, and the account."""
     _, blocks, account = open_capture(folder, STANDARD_POLICY)
     parts = list(blocks)
     if not parts:
@@ -129,7 +135,7 @@ def _read_ingested(file: Path) -> tuple[Readings, Mapping[str, int]]:
 
 
 def _read_table(file: Path) -> tuple[Readings, Mapping[str, int]]:
-    """Read the readings in contact of a file of layout `table`."""
+    """Return those readings of a file of layout `table` that are in contact, and the account."""
     name = re.sub(r"[^A-Za-z0-9_-]", "_", file.stem).lstrip("_-")[:64]
     header, files = foreign(file, "table", CaptureNames(UNNAMED, UNNAMED, name or None), {})
     with TemporaryDirectory() as folder:

@@ -1,9 +1,9 @@
-"""Find captures whose places are rotated, mirrored or swapped, by comparing them with other captures of the scene.
+"""Find captures whose labels have rotated, mirrored or swapped coordinates, by comparing captures of the same scene.
 
-Boards of one scene give similar readings for similar presses, so the place of a press can be estimated from the most
-similar presses of other captures. If these estimates agree with the labels only after the labels are rotated or
-mirrored, the labels of this capture or of the other captures are probably wrong. This method assumes nothing about the
-board, so it cannot check a single capture.
+The boards of a scene give similar readings for similar presses. Therefore, the place of a press can be estimated from
+the most similar presses of other captures. If these estimates agree with the labels only after the labels are rotated
+or mirrored, the labels of this capture or of the other captures are probably wrong. The method needs no model of the
+board, but it cannot check a single capture without others.
 """
 
 from collections.abc import Iterable
@@ -15,8 +15,10 @@ from jaxtyping import Float
 from reskin.schema import Readings
 
 PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
-EXPLAINED_MIN = 0.5  # minimum fraction of the variance of the estimated places that another orientation must explain
-GAIN_MIN = 0.5  # minimum difference between this fraction and the fraction that the unchanged labels explain
+# Another orientation of the labels is reported if it explains at least the fraction EXPLAINED_MIN of the variance of
+# the estimated places, and if this fraction exceeds that of the unchanged labels by at least GAIN_MIN.
+EXPLAINED_MIN = 0.5
+GAIN_MIN = 0.5
 ORIENTATIONS = {
     "as they are": [[1, 0], [0, 1]],
     "with x and y swapped": [[0, 1], [1, 0]],
@@ -31,14 +33,17 @@ ORIENTATIONS = {
 
 @dataclass(frozen=True)
 class Presses:
-    """The place and the direction of the field change of each press."""
+    """The presses of one capture: the place of each press, and the direction of its field change."""
 
     place_mm: Float[np.ndarray, "n 2"]  # relative to the middle of all places
     direction: Float[np.ndarray, "n ch"]  # unit vector along the mean field change
 
 
 def presses_of(blocks: Iterable[Readings]) -> Presses:
-    """Average the readings of each press with a known place, in the blocks of one capture."""
+    """Return the presses of a capture that have a known place; the readings of a press are averaged.
+
+    `blocks` are the readings of the capture.
+    """
     place_mm, change_uT = [], []
     for block in blocks:
         known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
@@ -56,12 +61,12 @@ def presses_of(blocks: Iterable[Readings]) -> Presses:
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
-    """Return the change after which the labels of `own` agree with those of `others`; None if no change is needed.
+    """Return how the labels of `own` must be changed to agree with those of `others`.
 
-    The place of each press of `own` is estimated as the mean place of those three presses of `others` whose field
-    changes have the most similar directions. A change of the labels is reported if the changed labels explain at least
-    the fraction `EXPLAINED_MIN` of the variance of these estimates, and at least `GAIN_MIN` more than the unchanged
-    labels.
+    The result is a key of `ORIENTATIONS`, or None if no change is clearly better. The place of each press of `own` is
+    estimated from the three presses of `others` whose field changes have the most similar directions: it is the mean of
+    their places. A change is returned if the changed labels explain at least the fraction `EXPLAINED_MIN` of the
+    variance of these estimates, and if this fraction exceeds that of the unchanged labels by at least `GAIN_MIN`.
     """
     comparable = own.direction.shape[1:] == others.direction.shape[1:]
     if not comparable or min(len(own.place_mm), len(others.place_mm)) < PRESSES_MIN_N:

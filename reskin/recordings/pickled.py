@@ -1,7 +1,8 @@
 """Convert an .npz archive of pickled samples, as the rig of layout `lab` writes it, to a CSV file of layout `lab`.
 
-Pickles are not loaded with `pickle`. Instead, this module interprets their opcodes as data, so nothing is imported or
-executed. A pickle with anything but plain values and NumPy numbers is refused.
+The archive contains pickles, which could execute any code if they were loaded with `pickle`. Therefore, this module
+interprets their opcodes (the instructions of a pickle) itself, and imports or executes nothing that a pickle names. A
+pickle with anything but plain values and NumPy numbers is refused.
 """
 
 import pickletools
@@ -21,13 +22,14 @@ HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
 PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # phase -> name of its samples in the archive
 REMEDY = "Is it the recording of one port and depth, copied whole?"
 BYTES_MAX_N = 500_000_000  # the archives of scene lab have 10 to 30 MB
-MARK = object()
+MARK = object()  # the mark that opcode MARK puts on the stack
 
 
 def to_lab_csv(archive: bytes, where: str) -> bytes:
-    """Return the samples of an archive as CSV, sorted by indentation, with the no-load samples of an indentation first.
+    """Return the samples of an archive as CSV text.
 
-    Values are rounded to 1e-4 degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
+    The lines are sorted by indentation; in each indentation, the no-load samples come first. Values are rounded to 1e-4
+    degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
     """
     try:
         with zipfile.ZipFile(BytesIO(archive)) as file:
@@ -39,13 +41,13 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
-    # an archive may contain anything, so any exception is possible; the error message gives the reason
+    # An archive may contain anything, so any exception is possible. Its text becomes part of the error message.
     except Exception as error:
         samples_of = " and ".join(PHASES.values())
         raise CaptureError(
             f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
         ) from None
-    rows.sort(key=lambda row: row[0])  # the sort is stable, so no-load rows stay before contact rows
+    rows.sort(key=lambda row: row[0])  # the sort is stable, so the no-load rows of an indentation stay first
     return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
 
 
@@ -71,8 +73,8 @@ def decode_array(npy: bytes, where: str) -> Any:
 def decode(pickled: bytes, where: str) -> Any:
     """Return the content of a pickle as lists, tuples, dicts, numbers, text and bytes.
 
-    NumPy numbers and arrays become numbers and lists. Supports protocols 3 and 4, in which NumPy writes arrays of
-    objects.
+    NumPy numbers become numbers, and NumPy arrays become lists. The function supports protocols 3 and 4, which NumPy
+    uses to write arrays of objects.
     """
     stack = _Stack([], {})
     try:
@@ -86,13 +88,18 @@ def decode(pickled: bytes, where: str) -> Any:
         return plain(stack.values.pop())
     except CaptureError:
         raise
-    except Exception as error:  # arbitrary bytes may cause any exception: in pickletools, on an empty stack, in NumPy
+    # Arbitrary bytes may cause any exception, for example in pickletools, in NumPy, or because the stack is empty.
+    except Exception as error:
         raise CaptureError(f"{where}: the pickle cannot be read: {_describe(error)}. {REMEDY}") from None
 
 
 @dataclass
 class Call:
-    """A function call in a pickle: the arguments, and the function's name, which is never used to find a function."""
+    """A call of a function that a pickle contains.
+
+    The function is never called: only its name and its arguments are stored. `state` is the state that opcode BUILD
+    would set on the result of the call.
+    """
 
     name: str
     args: Any
@@ -104,7 +111,10 @@ NESTED = (list, tuple, dict, Call)
 
 @dataclass
 class _Stack:
-    """The stack and the memo of a pickle machine, on which opcodes work."""
+    """The memory of the virtual machine that executes the opcodes of a pickle.
+
+    `values` is the machine's stack. `memo` contains values that later opcodes use again.
+    """
 
     values: list[Any]
     memo: dict[int, Any]
@@ -174,8 +184,8 @@ STEPS: Mapping[str, Step] = {
 def plain(value: Any, converted: dict[int, Any] | None = None) -> Any:
     """Convert calls of NumPy functions in a value to lists and numbers; raise `ValueError` for any other call.
 
-    A value that a pickle uses several times is converted only once, because nested references could otherwise take
-    exponential time. `converted` maps the `id` of a value to the result.
+    A pickle may use a value several times. Such a value is converted only once, because the time could otherwise grow
+    exponentially with the depth of nested values. `converted` maps the `id` of a value to the result of its conversion.
     """
     converted = {} if converted is None else converted
     if not isinstance(value, NESTED):
@@ -187,7 +197,7 @@ def plain(value: Any, converted: dict[int, Any] | None = None) -> Any:
 
 def _plain(value: Any, converted: dict[int, Any]) -> Any:
     match value:
-        # for speed, `plain` is not called for numbers, because a list may have a million of them
+        # A list may contain a million numbers, so `plain` is called only for items that need a conversion.
         case list() | tuple():
             return type(value)(plain(item, converted) if isinstance(item, NESTED) else item for item in value)
         case dict():
@@ -196,7 +206,7 @@ def _plain(value: Any, converted: dict[int, Any]) -> Any:
 
 
 def _numbers(call: Call) -> Any:
-    """Convert the call that creates a NumPy number or array to a number or nested lists."""
+    """Convert a call that creates a NumPy number to a number, and a call that creates an array to nested lists."""
     match call.name.replace("numpy._core", "numpy.core"):  # NumPy 2 renamed the module to numpy._core
         case "numpy.core.multiarray scalar":
             return np.frombuffer(plain(call.args[1]), _dtype(call.args[0]))[0].item()

@@ -1,6 +1,6 @@
-"""Prepare a recording of any layout for `reskin add`: make the header of the new capture, and collect the files.
+"""Prepare a recording of any layout for `reskin add`: make the header of the new capture, and collect its files.
 
-This module writes no capture; see `header.write_capture`.
+The capture itself is written by `header.write_capture`.
 """
 
 import re
@@ -33,7 +33,7 @@ Prepared = tuple[Header, Mapping[str, bytes | Path]]
 class CaptureNames:
     """The names of a board, a skin and a capture.
 
-    If the capture's name is None, a name is made from the names of the board, the skin and the file.
+    If the name of the capture is None, its name is made from the names of the board, the skin and the recording's file.
     """
 
     board: str
@@ -43,7 +43,10 @@ class CaptureNames:
 
 @dataclass(frozen=True)
 class Dump:
-    """The data that a serial dump lacks: wire format, number of chips, frame rate, probe log and clock marks."""
+    """What must be known to use a serial dump, a file that contains only the bytes of a port.
+
+    `probe` is the probe log, and `marks` are sync marks (pairs of stream time and probe time of the same event).
+    """
 
     wire: Wire
     chips_n: int
@@ -53,7 +56,7 @@ class Dump:
 
 
 def parse_marks(texts: list[str]) -> Marks:
-    """Parse clock marks, each written as `STREAM_S,PROBE_S`.
+    """Parse sync marks, each of which is written as `STREAM_S,PROBE_S`.
 
     >>> parse_marks(["0,12.5"])
     ((0.0, 12.5),)
@@ -69,10 +72,10 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Add to the errors of a `with` block the layouts in which the recording can be read.
+    """Add a suggestion to the errors of a `with` block: the layouts in which the recording can be read.
 
-    An error is not changed if the recording can be read in `layout`, or if it is a `ParamsError`, because such an error
-    is about names or options.
+    An error is not changed if the recording can be read in `layout`, because the layout is then right. A `ParamsError`
+    is not changed either, because it is about names or options.
     """
     try:
         yield
@@ -92,8 +95,8 @@ def layouts_of(recording: Path) -> list[str]:
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
     if layouts := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
-        # Layout `table` may also accept a recording of another layout, but lose its labels. Therefore, suggest `table`
-        # only if no other layout is possible.
+        # A recording of another layout may also be readable in layout `table`, but would lose its labels. Therefore,
+        # suggest `table` only if no other layout is possible.
         return [layout for layout in layouts if layout != "table"] or layouts
     formats = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in formats})
@@ -113,7 +116,7 @@ def _is_readable(recording: Path, layout: ReaderLayout) -> bool:
 
 
 def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options: Mapping[str, str]) -> Prepared:
-    """Prepare a recording in a layout that has a reader: make a header, and collect the recording's files unchanged."""
+    """Prepare a recording in a layout that has a reader: make a header, and find the files, which are not changed."""
     _check_exists(recording, folder=True)
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
@@ -137,7 +140,10 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
 
 
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe`, if given, becomes the capture's probe log."""
+    """Prepare a capture folder that `reskin record` wrote.
+
+    If `probe` is given, this file becomes the probe log of the capture.
+    """
     _check_exists(recording, folder=True)
     header = read_header(recording)
     for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):
@@ -146,12 +152,14 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
                 f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct the option or the "
                 "header."
             )
-    # If the recorder was killed, the header does not list the files, so also collect the files that exist.
+    # The recorder lists its files in the header when it ends. If it was killed, the list is empty, so the files that
+    # exist are collected too.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in header.files}
     marks_before = header.clock.marks
     if probe is not None:
         _check_exists(probe)
-        # The marks in the header belong to the folder's own probe log, if it has one, which `probe` replaces.
+        # If the folder has a probe log, the marks in the header belong to this log. They are dropped, because `probe`
+        # replaces the log.
         marks_before = () if headers.PROBE_FILE in files else marks_before
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:

@@ -1,8 +1,8 @@
 """The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in chronological order. A dwell is a time in which the robot does not move. An indentation consists of one
-no-load dwell, with the robot lifted, and the contact dwells after it. There are several contact dwells if the robot
-drags the indenter, or else one.
+Rows are in chronological order. A dwell is a time in which the robot does not move. An indentation begins with one
+no-load dwell, in which the robot is lifted. One contact dwell follows or, if the robot drags the indenter over the
+skin, several contact dwells.
 """
 
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ TYPES = {
 
 @dataclass(frozen=True)
 class ProbeLog:
-    """The dwells of one capture, one array element per dwell; unknown labels are NaN.
+    """The dwells of one capture, as arrays with one element per dwell.
 
-    `contact` is True for phase `contact`, and False for phase `noload`, when the robot is lifted. Forces have the signs
-    of `reskin.schema`.
+    `contact` is True for phase `contact`, and False for phase `noload`, in which the robot is lifted. Unknown places,
+    depths and forces are NaN. Forces have the signs of `reskin.schema`.
     """
 
     indentation: Int32[np.ndarray, " d"]
@@ -54,7 +54,10 @@ class ProbeLog:
 
 
 def parse(source: str | Path, where: str) -> ProbeLog:
-    """Parse a probe log from CSV text or from the file at a path; raise `CaptureError` naming the first bad row."""
+    """Parse a probe log from CSV text (`source` is a str) or from a file (`source` is a path).
+
+    Raises `CaptureError` if a row is wrong; the error names the first such row.
+    """
     table = tables.parse_csv(source, TYPES, where)
     if not len(table):
         raise CaptureError(f"{where}: the probe log has no rows. Record the capture again.")
@@ -75,7 +78,7 @@ def render(log: ProbeLog) -> str:
     """Return a probe log as CSV text, from which `parse` returns the same log."""
     arrays = {name: getattr(log, name) for name in TYPES if name != "phase"}
     arrays["phase"] = np.where(log.contact, CONTACT, NOLOAD)
-    # from_pandas: NaN becomes null, which CSV writes as an empty field
+    # With `from_pandas`, NaN becomes null, which is written as an empty field.
     fields = {name: pa.array(arrays[name], kind, from_pandas=True) for name, kind in TYPES.items()}
     return tables.render_csv(pa.table(fields))
 

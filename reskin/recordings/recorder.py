@@ -1,7 +1,8 @@
-"""Record a board to a capture folder for `reskin add`, with labels if a label source provides them meanwhile.
+"""Record a board to a capture folder for `reskin add`, together with the labels of a label source, if there is one.
 
-The capture is written to `<folder>.part`, beginning with the header, and renamed when the recording has ended. If the
-recorder is killed, the `.part` folder remains. It can still be added, with the labels that were received before.
+During the recording, the capture is the folder `<folder>.part`, which contains the header from the start. When the
+recording has ended, the folder is renamed. If the recorder is killed, the `.part` folder remains. It can still be
+added, with the data and labels that were received before.
 """
 
 import sys
@@ -29,7 +30,7 @@ CAPTURES = Path("captures")
 
 @dataclass(frozen=True)
 class CaptureInfo:
-    """Names for the header of a capture, and the source of its labels."""
+    """What a recorder must know about a capture: the names for its header, and the source of its labels."""
 
     board: str
     skin: str
@@ -39,7 +40,7 @@ class CaptureInfo:
 
 
 class CaptureResult(NamedTuple):
-    """A finished recording and its labels."""
+    """The result of a finished recording: the summaries of its stream and of its labels."""
 
     stream: Recording
     labels: str  # a summary of the labels for the user
@@ -52,9 +53,9 @@ NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 def record_capture(
     port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
 ) -> CaptureResult:
-    """Record a port as a native capture, with labels if `info` has a source of labels.
+    """Record a port to a capture folder, together with labels if `info` has a source of labels.
 
-    The recording stops when the port's stream or the labels end.
+    The recording stops when the stream of the port ends, or when the source of labels ends.
     """
     part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     stop, headers, label_thread = threading.Event(), [header], None
@@ -65,8 +66,8 @@ def record_capture(
     except CaptureError as error:
         if label_thread is not None:
             label_thread.end()
-        io.remove(part)  # no frame arrived, so the folder has nothing to keep
-        # the failure of the label source ended the recording
+        io.remove(part)  # no frame arrived, so there is nothing to keep
+        # If the source of labels failed, it ended the recording, so its error is the cause.
         if label_thread is not None and label_thread.failed is not None:
             raise label_thread.failed from error
         raise
@@ -74,7 +75,8 @@ def record_capture(
     failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         recording = replace(recording, ended="not written")
-    if recording.ended != "not written":  # if the disk is full, keep the .part folder, which can be added as it is
+    # If the disk is full, the header may not be writable. The .part folder is kept, and can be added as it is.
+    if recording.ended != "not written":
         end_capture(folder, headers[-1], recording.rate)
     return CaptureResult(recording, summary, failed)
 
@@ -82,9 +84,10 @@ def record_capture(
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
     """Make the context of a source of labels.
 
-    Unless the source calls `mark`, the clock mark states that labels and arrivals have times of the same clock.
+    A first sync mark is written to the header. It states that the times of labels and of arrivals are from the same
+    clock. If the source has a clock of its own, it calls `mark` to replace this mark.
     """
-    # The offset is determined only once, because the system's clock may be adjusted during the recording.
+    # This offset is determined only once, so that times stay consistent if the system's clock is adjusted meanwhile.
     offset_s = time.time() - time.monotonic()
     writer = ProbeLogWriter(part)
 
@@ -93,7 +96,7 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
     def mark(stream_s: float, source_s: float) -> None:
         with writer.locked() as is_open:
-            if is_open:  # if the writer is closed, the header must not change any more
+            if is_open:  # after the writer was closed, the header must not be changed any more
                 clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
                 headers[-1] = headers[-1].model_copy(update={"clock": clock})
                 io.write_text(part / HEADER_FILE, render(headers[-1]))
@@ -104,9 +107,9 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
 
 def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
-    """Create `<folder>.part` and its header; return the path of this folder, for the stream, and the header.
+    """Create the folder `<folder>.part` and its header; return the path of this folder, and the header.
 
-    `by` is the name of the recording program, for the header's note.
+    `by` is the name of the recording program, which becomes part of the note in the header.
     """
     part = _part_of(folder)
     for path in (folder, part):
@@ -127,7 +130,7 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
 
 
 def end_capture(folder: Path, header: Header, rate: RateMeasurement) -> None:
-    """Write the header of `<folder>.part` with its rate and the hashes of its files, and rename it to `folder`."""
+    """Complete the header of `<folder>.part` with the rate and the hashes of the files, and rename the folder."""
     measured = None
     if rate.known:
         measured = Rate.model_validate({name: getattr(rate, name) for name in Rate.model_fields})
@@ -145,7 +148,11 @@ def new_folder() -> Path:
 
 
 def print_progress(alarms: Callable[[], Sequence[str]]) -> Report:
-    """Return a `Report` function that prints rate, losses and alarms once a second, if stderr is a terminal."""
+    """Return a function for the argument `report` of `record_capture`.
+
+    The function prints the frame rate, the number of lost bytes and the alarms to stderr once a second, if stderr is a
+    terminal. `alarms` is a function that returns the current alarms.
+    """
     start_s = last_s = time.monotonic()
     last_n = 0
 

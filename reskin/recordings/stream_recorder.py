@@ -1,4 +1,7 @@
-"""Record what a board's port sends: the files `stream.bin` and `arrivals.csv` of a capture."""
+"""Record the bytes that a board's port sends: write the files `stream.bin` and `arrivals.csv` of a capture.
+
+`stream.bin` contains the bytes, and `arrivals.csv` contains the times at which they arrived.
+"""
 
 import math
 import signal
@@ -22,33 +25,36 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # number of bytes from the start that are stored, to suggest a wire format if no frame arrives
+# The first bytes of a stream, up to this number, are kept in memory. If they contain no frame, the error suggests wire
+# formats in which they can be decoded.
+HEAD_BYTES_N = 16384
 
-Report = Callable[[Mapping[str, int]], None]  # called many times a second with the counts of `FrameStream.account`
-Watch = Callable[[Frames], object]  # called with frames as they arrive
+# a function that is called many times a second during a recording, with the counts of `FrameStream.account`
+Report = Callable[[Mapping[str, int]], None]
+Watch = Callable[[Frames], object]  # a function that is called with the new frames whenever bytes have arrived
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
 
 
 @dataclass(frozen=True)
 class PortSettings:
-    """Settings of the port, and limits of the recording."""
+    """The settings of a port, and the limits at which a recording ends."""
 
     baud: int
     wire: Wire
     chips_n: int
-    duration_s: float  # math.inf: no limit
-    bytes_max_n: int | None  # None: no limit
+    duration_s: float  # the recording ends after this time; math.inf means no limit
+    bytes_max_n: int | None  # the recording ends after this many bytes; None means no limit
     silence_s: float  # the recording ends if the port sends nothing for this long
-    no_frame_s: float  # the recording ends if no frame arrives within this time of the first byte
+    no_frame_s: float  # the recording ends if no frame has arrived this long after the first byte
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Summary of a finished recording."""
+    """The summary of a finished recording; `ended` is the reason why it ended."""
 
     ended: Ended
     duration_s: float
-    partial_line_bytes_n: int  # bytes before the first whole line, which are not written
+    partial_line_bytes_n: int  # number of bytes before the first whole line of text, which were not written
     account: dict[str, int]  # counts of bytes and frames, see `FrameStream.account`
     rate: RateMeasurement
 
@@ -64,9 +70,9 @@ def record(
 ) -> Recording:
     """Write the bytes that a port sends to a capture folder.
 
-    The recording ends when `stop` is set, at Ctrl-C or SIGTERM, when the board is unplugged, when the port is silent,
-    or at a limit in the settings. The data received until then are kept. Raises `CaptureError` if the port cannot be
-    opened or no frame arrives.
+    The recording ends when `stop` is set, when the process receives Ctrl-C or SIGTERM, when the board is unplugged,
+    when the port is silent, when the files cannot be written, or at a limit in the settings. The data that were
+    received until then are kept. Raises `CaptureError` if the port cannot be opened or if no frame arrives.
     """
     with (
         open_port(port, settings.baud) as device,
@@ -79,9 +85,10 @@ def record(
 
 
 class CaptureWriter:
-    """Write the files `stream.bin` and `arrivals.csv` of a recording: each chunk of bytes, then its time of arrival.
+    """A writer of the files `stream.bin` and `arrivals.csv` of a recording.
 
-    Because of this order, no arrival refers to missing bytes. If the disk is full, a partly written chunk is removed.
+    For each chunk of bytes, the bytes are written first, and their time of arrival second. Therefore, if the recorder
+    is killed between the two, no time refers to missing bytes. If the disk is full, a partly written chunk is removed.
     The written bytes are also decoded, to count the frames and to measure their rate.
     """
 
@@ -89,10 +96,10 @@ class CaptureWriter:
         self.bytes_n = self.partial_line_bytes_n = 0
         self.decoder = FrameStream(wire, chips_n)
         self._chips_n = chips_n
-        self._meter: RateMeter | None = None  # None before the first bytes
+        self._meter: RateMeter | None = None  # None until the first bytes arrive
         self._in_partial_line = wire in TEXT_WIRES
-        # The files are unbuffered, so that no written data is lost if the process is killed, and closing them cannot
-        # fail.
+        # The files are not buffered. Therefore, no written data is lost if the process is killed, and closing the files
+        # cannot fail because of a full disk.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
         self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
         self._arrivals.write(b"byte_end,t_s\n")
@@ -136,19 +143,19 @@ class CaptureWriter:
 
 
 class _Recorder:
-    """A recording in progress."""
+    """A recording in progress, which reads from a port and writes to a capture."""
 
     def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
         self._port, self._settings, self._writer, self._watch = port, settings, writer, watch
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
         self._first_byte_s = math.inf
-        # Unix time minus monotonic time. It is determined once, because the system's clock may be adjusted during the
-        # recording, but arrival times must not go backwards.
+        # Unix time minus monotonic time. This offset is determined only once, so that times of arrival do not go
+        # backwards if the system's clock is adjusted during the recording.
         self._unix_offset_s = time.time() - self._start_s
 
     def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
-        """Read and write chunks until there is a reason to end; return the reason."""
+        """Read chunks from the port and write them to the capture until there is a reason to end; return the reason."""
         while not (ended := self._reason_to_end(stop)):
             report(self._writer.decoder.account())
             try:
@@ -200,7 +207,10 @@ class _Recorder:
 
 @contextmanager
 def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Set `stop` at Ctrl-C and SIGTERM during the `with` block; outside the main thread, change nothing."""
+    """Set `stop` if the process receives Ctrl-C or SIGTERM during the `with` block.
+
+    Only the main thread can handle signals, so nothing is changed in other threads.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -26,9 +26,10 @@ COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
-    """Read CSV text, or the CSV file at a path, with exactly the columns of `types`, in any order.
+    """Read a table from CSV text (`source` is a str) or from a CSV file (`source` is a path).
 
-    Row numbers in errors are line numbers in the file; the column names are in row 1.
+    The table must have exactly the columns of `types`, in any order. Errors name the row; row 1 is the line with the
+    column names.
     """
     try:
         table = pacsv.read_csv(
@@ -64,9 +65,9 @@ def _column_names(source: str | Path) -> list[str]:
 
 
 def render_csv(table: pa.Table) -> str:
-    """Return a table as CSV text; null is an empty field.
+    """Return a table as CSV text, in which a null is an empty field.
 
-    A number is written with as few digits as possible such that reading them gives the same number.
+    Each number is written with as few digits as are needed to read the same number again.
     """
     sink = pa.BufferOutputStream()
     pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
@@ -74,10 +75,10 @@ def render_csv(table: pa.Table) -> str:
 
 
 def refuse_row(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str, values: Any, remedy: str) -> None:
-    """Raise `CaptureError` for the first row that `bad` marks, if any.
+    """Raise `CaptureError` for the first row that `bad` marks; do nothing if it marks no row.
 
-    `what` is the name of the wrong value, and `rule` is the rule that it violates. `values` contains the values of all
-    rows, or is a text that describes the wrong value.
+    `what` is the name of the wrong value, and `rule` is the rule that this value violates. `values` contains the values
+    of all rows, or is a text that describes the wrong value.
     """
     if bad.any():
         row_i = int(bad.argmax())
@@ -97,13 +98,17 @@ def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
     return ",".join(names) or "none"
 
 
-# Limit for numbers in files. All readings, places and unix times are far below this limit, and float32 can represent
-# it.
+# Largest magnitude of a number in a file. All readings, places and unix times are below this limit, and float32 can
+# represent numbers up to it.
 MAGNITUDE_MAX = 1e10
 
 
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into one list of cells per line, all of equal length; separator None is any white space."""
+    """Split a text file into cells; return one list of cells per line.
+
+    Raises `CaptureError` if the lines do not have the same number of cells. If `separator` is None, cells are separated
+    by white space.
+    """
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
         raise CaptureError(
@@ -120,7 +125,10 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
 def to_numbers(
     cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int = 1
 ) -> Float64[np.ndarray, "f c"]:
-    """Parse cells as finite numbers; errors name the column, and the line if `cells[0]` is line `first_line_n`."""
+    """Parse cells as finite numbers.
+
+    Errors name the column and the line of a wrong cell; `first_line_n` is the number of the line with `cells[0]`.
+    """
     if cells and len(cells[0]) != len(names):
         problem = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
         raise CaptureError(f"{where}: {problem}. Are the layout and the number of chips right?")
@@ -138,7 +146,10 @@ def to_numbers(
 def make_readings(
     header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
 ) -> Readings:
-    """Make readings from the rows that `keep` marks; a missing column becomes NaN (unknown), or 0 for `reading_i`."""
+    """Make readings from the rows that `keep` marks.
+
+    A column that is not given becomes NaN (unknown), except `reading_i`, which becomes 0.
+    """
     unknown_degC = np.full((len(keep), header.chips_n), np.nan)
     columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": unknown_degC, **columns}
     unknown = np.full(len(keep), np.nan)
@@ -206,7 +217,10 @@ PHASES = ("noload", "contact")
 
 
 def count_chips_of(names: list[str]) -> int:
-    """Return 1 plus the largest chip number i in column names `T<i>`, `Bx<i>`, `By<i>`, `Bz<i>`."""
+    """Count the chips from the names of columns, which are `T<i>`, `Bx<i>`, `By<i>` and `Bz<i>` for chip i.
+
+    Chips are numbered from 0, so the result is 1 plus the largest i.
+    """
     numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"(?:T|Bx|By|Bz)(\d{1,3})", name))]
     return max(numbers, default=0) + 1
 
@@ -225,7 +239,10 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
-    """Mark the rows of phase `contact`; raise for other phases than `noload` and `contact`, or if none is `contact`."""
+    """Mark the rows of phase `contact`.
+
+    Raises `CaptureError` if a phase is neither `noload` nor `contact`, or if no row has phase `contact`.
+    """
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"

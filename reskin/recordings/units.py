@@ -1,4 +1,7 @@
-"""Check that fields, places, depths and forces of a recording have plausible values in uT, mm and N."""
+"""Check that the fields, places, depths and forces of a recording are in uT, mm and N.
+
+The checks raise `CaptureError` if the values are not plausible in these units, and suggest a conversion.
+"""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,34 +11,35 @@ from reskin.errors import CaptureError
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.tables import FIRST_ROW
 
-# Full scale of an MLX90393 at its coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3): 2^15 steps (data sheet, table 17).
+# Largest field that an MLX90393 can send: 2^15 steps of its coarsest LSB, which is 9.680 uT along z with GAIN_SEL 0 and
+# RES 3 (data sheet, table 17).
 FULL_SCALE_uT = 32768 * 9.680
-# If the median field is below this number, it is not in uT, because the earth's field alone is 25 to 65 uT, and a chip
-# under a skin reads 200 to 9000 uT. In mT or T, the numbers are smaller.
+# If the median field is below this number, the fields are not in uT but in a larger unit, such as mT or G. In uT, even
+# the earth's field is 25 to 65, and a chip under a skin reads 200 to 9000.
 WEAKEST_uT = 20.0
-# The field of the strongest known skin, 13000 uT, is 130 G. If the median field is below this number, and the steps
-# between values are finer than those of any chip in uT, the values are in gauss.
+# Values in gauss are recognised by two conditions. The median field is below this number: the field of the strongest
+# known skin is 13000 uT, which is 130 G. And the steps between values are smaller than the steps of any chip in uT.
 GAUSS_MAX = 200.0
-# If the steps between values are larger than this number, the values are in nT, because the steps of the chip are 0.150
-# uT (150 nT) to 9.68 uT.
+# If the steps between values are larger than this number, the values are in nT. The steps of the chip are 0.150 uT to
+# 9.68 uT, which are 150 or more in nT.
 NANO_STEP_MIN = 100.0
-# Forces on skins, which are a few mm thick, are smaller than this number. In grams, a force of 1 N would be 102.
+# Skins are a few mm thick, and forces on them are smaller than this number of N. In grams, a force of 1 N would be 102.
 FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # every recording has a touch with a larger force; in kg, 0.4 N would be 0.04
-SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
-EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-# If some places are far from the others, but at most this fraction of all places, these places are wrong. If they are
-# more, the unit is wrong.
+FORCE_MIN_N = 0.05  # every recording has a touch with a larger force in N; in kg, a force of 0.4 N would be 0.04
+SAME_PLACE_mm = 0.002  # two places are the same if they differ by less: the place of a robot at rest varies by a few um
+EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0  # limits of the extent of all places, unless there is only one place
+# Some places may be too far from the others. If they are at most this fraction of all places, these places are assumed
+# to be wrong. If they are a larger fraction, the unit is assumed to be wrong.
 FAR_SHARE_MAX = 0.1
-DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
+DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0  # limits of the greatest depth of a recording
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
     """Raise if raw fields are probably not in uT.
 
-    Fields are probably in another unit if they exceed the chip's full scale, if they are weaker than the earth's field,
-    or if the steps between their values are not possible for the chip in uT. The steps are visible only if the values
-    were neither averaged nor rounded to decimals.
+    There are three signs of another unit: the fields exceed the chip's full scale; they are weaker than the earth's
+    field; or the steps between their values are not possible for the chip in uT. The steps can be detected only if the
+    values were neither averaged nor rounded to a few decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
@@ -50,9 +54,10 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
 
 
 def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if field changes are probably not in uT: they exceed the chip's full scale or have impossible steps.
+    """Raise if field changes are probably not in uT.
 
-    Unlike raw fields, field changes may be weak.
+    There are two signs of another unit: the changes exceed the chip's full scale, or the steps between their values are
+    not possible for the chip in uT. Unlike raw fields, field changes may be weak.
     """
     _check_full_scale(db_uT, where, first_line_n)
     step_uT = _find_step(db_uT)
@@ -62,7 +67,7 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
-    """Raise if a force exceeds `FORCE_MAX_N`, as forces in grams do; NaN (unknown) is allowed."""
+    """Raise if a force exceeds `FORCE_MAX_N`, which suggests that forces are in grams or mN; ignore NaN (unknown)."""
     too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
     if len(too_strong):
         got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
@@ -70,7 +75,10 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if all known forces are below `FORCE_MIN_N`, as in kg or kN. Forces may be all 0 or all unknown (NaN)."""
+    """Raise if all known forces are below `FORCE_MIN_N`, which suggests that they are in kg or kN.
+
+    The forces may be all 0, or all unknown (NaN).
+    """
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
@@ -79,9 +87,9 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
-    """Raise if the spread of the places is too small or too large for a skin in mm, as for places in m or um.
+    """Raise if the extent of the places is too small or too large for a skin, which suggests another unit than mm.
 
-    A single place and NaN (unknown) are allowed.
+    Unknown places (NaN) are ignored. A recording with a single place is accepted.
     """
     known = np.isfinite(place_mm).all(axis=1)
     known_mm = place_mm[known]
@@ -102,9 +110,9 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
 
 
 def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
-    """Raise if the greatest depth is too small or too large for a skin, as depths in m or um are.
+    """Raise if the greatest depth is too small or too large for a skin, which suggests another unit than mm.
 
-    All 0 and NaN (unknown) are allowed.
+    Unknown depths (NaN) are ignored. Depths that are all 0 are accepted.
     """
     deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
@@ -113,7 +121,10 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
 
 
 def check_log(log: ProbeLog, where: str) -> None:
-    """Raise if places, depths or forces of a probe log are probably not in mm and N, or if compression is negative."""
+    """Raise if places, depths or forces of a probe log are probably not in mm and N.
+
+    Also raises if the force Fz is negative in compression.
+    """
     contact = log.contact
     force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
     for axis_N in force_N.T:
@@ -138,7 +149,11 @@ def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n:
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Return the median step of the chips along x and y; NaN if there is no step, or if rounding caused it."""
+    """Return the median over chips of the step between values along x and y.
+
+    The result is NaN if no step is detected, or if the step is a power of ten below that of any chip, because the
+    values were then rounded to decimals.
+    """
     steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
     steps_uT = steps_uT[np.isfinite(steps_uT)]
     if not len(steps_uT):

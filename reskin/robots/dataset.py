@@ -1,6 +1,7 @@
-"""Write recordings as a LeRobot dataset: format v3.0, which LeRobot 0.4 to 0.6 read and write.
+"""Write recordings as a LeRobot dataset, in format v3.0, which LeRobot 0.4 to 0.6 read and write.
 
-The package lerobot is not needed. The dataset is a folder:
+The package lerobot is not needed. A dataset consists of episodes, which are sequences of frames at equal intervals of
+time. The dataset is a folder with these files:
 
     meta/info.json                              features with their names and units, frames per second, totals
     meta/stats.json                             statistics of each feature over all frames
@@ -9,9 +10,9 @@ The package lerobot is not needed. The dataset is a folder:
     meta/reskin.json                            recording, board, skin and source of each episode (not read by LeRobot)
     data/chunk-000/file-000.parquet, ...        one row per frame
 
-The names of sensor features begin with `observation.`, so that policies use these features as inputs. The names of
-features that a rig measured (place, depth, force) begin with `label.`; LeRobot loads these features, but policies do
-not use them.
+A feature is a named array with one row per frame. The names of features that a robot's sensors measure begin with
+`observation.`, so that policies use these features as inputs. The names of features that a rig measured (place, depth,
+force) begin with `label.`; LeRobot loads these features, but policies do not use them.
 """
 
 import json
@@ -36,9 +37,9 @@ from reskin.schema import from_table
 
 VERSION = "v3.0"
 FPS_MAX = 10_000
-RATE_TOLERANCE = 0.05  # rates of recordings are treated as equal if their relative difference is at most this
-ROUNDING = 1e-6  # tolerance of times, as a fraction of the time between frames
-# an episode ends if the gap between two readings is longer than this, because the last reading is then outdated
+RATE_TOLERANCE = 0.05  # rates of recordings are treated as equal if their relative difference is at most this value
+ROUNDING = 1e-6  # tolerance when times are compared, as a fraction of the time between frames
+# If the time between two readings is longer than this, the earlier reading becomes outdated, so an episode ends there.
 GAP_S = 0.3
 FILES_PER_CHUNK_N, FILE_MB, VIDEO_FILE_MB = 1000, 100, 200  # LeRobot's default limits
 PATH = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -56,10 +57,17 @@ INDICES = {name: "float32" if name == "timestamp" else "int64" for name in (
 
 @dataclass(frozen=True)
 class Recording:
-    """The readings of one file. values: values by feature, NaN if unknown. t_s: None if the times are unknown.
+    """The readings of one file.
 
-    part: for each reading, the number of its part of the recording, such as its indentation. Each part becomes an
-    episode or, if it has gaps, several episodes. dropped_n: number of faulty frames, which are left out.
+    Parameters
+    ----------
+    where : name of the file in errors
+    about : names of the capture, board, skin and source, as far as they are known
+    values : the values of each feature; unknown values are NaN
+    t_s : times of the readings; None if they are unknown
+    part : for each reading, the number of the part of the recording to which it belongs, such as its indentation. Each
+        part becomes an episode or, if it has gaps, several episodes.
+    dropped_n : number of faulty frames in the file, which are omitted
     """
 
     where: str
@@ -72,7 +80,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Episode:
-    """The frames of one episode, and the recording and part from which they come."""
+    """The frames of one episode; `about` describes where they come from."""
 
     values: Mapping[str, Float32[np.ndarray, "f _"]]
     about: Mapping[str, str | int | float]
@@ -84,24 +92,27 @@ class Episode:
 def export_lerobot(
     files: Sequence[Path], out: Path, *, task: str, fps: int | None = None, rate_hz: float | None = None
 ) -> dict[str, float]:
-    """Write recordings as a LeRobot dataset; return size, rate, largest timestamp error and number of omitted frames.
+    """Write recordings as a LeRobot dataset.
+
+    Returns a dict with the number of episodes, the number of frames, the frame rate, the largest error of a timestamp,
+    and the number of faulty frames that were omitted.
 
     Parameters
     ----------
     files : folders of captures (`reskin record`), tables of ingested readings (data/indentations), tables that
-        `reskin decode` wrote, or logs of an SD card. A capture or log is one episode; a table of ingested readings has
-        one episode per indentation. A gap of more than `GAP_S` ends an episode.
+        `reskin decode` wrote, or logs of an SD card. A capture or log is one episode. In a table of ingested readings,
+        each indentation is one episode. An episode is split where the time between two readings exceeds `GAP_S`.
     out : folder to create
     task : what the robot does, in natural language
-    fps : frames per second of the dataset. If given, each frame is the latest reading at the frame's time. By default,
-        each reading is a frame, and the rate is that of the readings. LeRobot's timestamps are always multiples of 1 /
-        fps; the result contains their largest difference from the times of the readings.
-    rate_hz : rate of the readings of files without times
+    fps : frames per second of the dataset. If it is given, each frame is the latest reading at the frame's time. By
+        default, each reading is a frame, and `fps` is the rate of the readings. LeRobot's timestamps are always
+        multiples of 1 / fps, so they may differ from the times of the readings. The largest difference is returned.
+    rate_hz : rate of the readings in files that contain no times
 
     Raises
     ------
-    ReskinError : a file cannot be read; the files differ in their number of chips, kind of labels or kind of source; or
-        times or the rate are missing
+    ReskinError : a file cannot be read; the files differ in their number of chips, in the labels that are known, or in
+        being simulated or recorded; or the times or the rate are missing
     """
     if out.exists():
         raise ParamsError(f"--out: {out} exists. Choose another folder.")
@@ -169,7 +180,10 @@ def _about(header: Any) -> dict[str, str]:
 
 
 def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[str, Float32[np.ndarray, "f _"]]:
-    """Return for each reading of a capture the labels of the dwell in which it was taken; NaN between dwells."""
+    """Return the labels of each reading of a capture: those of the dwell in which it was taken, or NaN between dwells.
+
+    The result maps each feature to its values; it is empty if the capture has no probe log.
+    """
     file = folder / PROBE_FILE
     if not file.is_file():
         return {}
@@ -207,7 +221,11 @@ def _all_finite(column: pa.ChunkedArray) -> bool:
 
 
 def find_features(recordings: Sequence[Recording]) -> dict[str, list[str]]:
-    """Return the features with the names of their components; omit values that are unknown in all readings."""
+    """Return the features of a dataset: a mapping from the name of each feature to the names of its components.
+
+    Components that are unknown (NaN) in all readings are omitted. Raises `SchemaError` if the recordings differ in
+    their features, or if some are simulated and others recorded.
+    """
     first, *others = recordings
     features = _known(first)
     for other in others:
@@ -223,12 +241,12 @@ def find_features(recordings: Sequence[Recording]) -> dict[str, list[str]]:
 
 
 def _source(recording: Recording) -> str:
-    """Return whether a recording is simulated or recorded; files without a header count as recorded."""
+    """Return "simulated" or "recorded"; a file that does not state its source counts as recorded."""
     return recording.about.get("source", "recorded")
 
 
 def _known(recording: Recording) -> dict[str, list[str]]:
-    """Return the features of a recording with the names of those components that are known in any reading."""
+    """Return the features of one recording, each with the names of those components that are known in any reading."""
     chips_n = recording.values[FIELD].shape[1] // 3
     field = tuple(f"B{axis}{chip}_uT" for chip in range(chips_n) for axis in "xyz")
     temperature = tuple(f"T{chip}_degC" for chip in range(chips_n))
@@ -241,7 +259,10 @@ def _known(recording: Recording) -> dict[str, list[str]]:
 
 
 def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
-    """Return the median rate of the recordings; raise ParamsError if they differ by more than `RATE_TOLERANCE`."""
+    """Return the median rate of the recordings, rounded to a whole number.
+
+    Raises `ParamsError` if the rates differ by more than `RATE_TOLERANCE`, or if no rate is known.
+    """
     found = [rate_hz if recording.t_s is None else _rate_hz(recording) for recording in recordings]
     rates = sorted(rate for rate in found if rate is not None)
     if not rates:
@@ -253,7 +274,10 @@ def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
 
 
 def _rate_hz(recording: Recording) -> float | None:
-    """Return 1 / the median time between readings of the same part; None if no part has readings at two times."""
+    """Return the rate of a recording, from the median time between successive readings of the same part.
+
+    The result is None if no part has readings at two different times.
+    """
     assert recording.t_s is not None
     step_s = np.diff(recording.t_s)[np.diff(recording.part) == 0]
     return float(1 / np.median(step_s[step_s > 0])) if (step_s > 0).any() else None
@@ -264,7 +288,7 @@ def split(
 ) -> Iterator[Episode]:
     """Divide a recording into episodes.
 
-    A frame is a reading or, with `resample`, the latest reading at the frame's time.
+    If `resample` is False, each reading is a frame. If it is True, a frame is the latest reading at the frame's time.
     """
     known = {feature: np.isfinite(recording.values[feature]).any(axis=0) for feature in features}
     values = {feature: recording.values[feature][:, mask].astype(np.float32) for feature, mask in known.items()}
@@ -291,7 +315,8 @@ def split(
 # --- Writing ---
 
 
-Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]  # feature -> its values in the frames
+# a mapping from the name of a feature to its values in the frames of an episode
+Columns = Mapping[str, Float[np.ndarray, "f _"] | Int[np.ndarray, "f _"]]
 
 
 def write_dataset(
@@ -333,7 +358,10 @@ def write_dataset(
 
 
 def _columns(episode: Episode, episode_i: int, start: int, fps: int) -> Columns:
-    """Return the values of all features of an episode, whose first frame has the index `start`."""
+    """Return the values of all features of an episode, including LeRobot's indices and timestamps.
+
+    `episode_i` is the index of the episode, and `start` is the index of its first frame in the dataset.
+    """
     frame_i = np.arange(len(episode))[:, None]
     indices = {
         "timestamp": frame_i / fps, "frame_index": frame_i, "episode_index": np.full_like(frame_i, episode_i),
@@ -343,7 +371,10 @@ def _columns(episode: Episode, episode_i: int, start: int, fps: int) -> Columns:
 
 
 def _table(columns: Columns) -> pa.Table:
-    """Convert the features to a table: features with one component become numbers, others lists of fixed length."""
+    """Convert the values of features to a table with one row per frame.
+
+    A feature with one component becomes a column of numbers; other features become columns of lists of fixed length.
+    """
     arrays = {}
     for name, values in columns.items():
         flat, length = pa.array(np.ascontiguousarray(values).ravel()), values.shape[1]
@@ -352,7 +383,11 @@ def _table(columns: Columns) -> pa.Table:
 
 
 def _file_numbers(bytes_n: Sequence[int]) -> list[int]:
-    """Return for each episode the number of its data file; a file has several episodes, up to `FILE_MB` in total."""
+    """Return the number of the data file to which each episode is written.
+
+    `bytes_n` is the size of each episode. Successive episodes share a file, as long as their total size is at most
+    `FILE_MB`.
+    """
     numbers, size_n, number = [], 0, 0
     for episode_bytes_n in bytes_n:
         if size_n and size_n + episode_bytes_n > FILE_MB * 2**20:
@@ -367,7 +402,10 @@ def _location(number: int) -> dict[str, int]:
 
 
 def statistics(values: Float[np.ndarray, "f n"] | Int[np.ndarray, "f n"]) -> dict[str, list[float] | list[int]]:
-    """Return LeRobot's statistics of the known values of each component of a feature; NaN if a component has none."""
+    """Return the statistics that LeRobot stores for a feature, with one value for each component.
+
+    Unknown values (NaN) are ignored. If all values of a component are unknown, its statistics are NaN.
+    """
     known, count = np.isfinite(values), {"count": [len(values)]}
     if known.all():
         return count | {key: value.tolist() for key, value in _statistics(values).items()}
@@ -387,7 +425,10 @@ def _statistics(
 
 
 def _task_table(task: str) -> pa.Table:
-    """Return the table of tasks as pandas writes it: the task is the index of the data frame, not a column."""
+    """Return the table of tasks, with the metadata that pandas would write.
+
+    When pandas reads the table, the text of the task becomes the index of the data frame instead of a column.
+    """
     index = "__index_level_0__"
     kinds = {"task_index": ("int64", "int64"), index: ("unicode", "object")}
     described = [

@@ -16,23 +16,32 @@ Nothing may touch the skin in the first second.
 
 Service `~/zero` (std_srvs/Trigger) takes a new no-load reading.
 
-Parameters: `port` (default: the only connected board); `model` and `calibration` (files, as for `reskin live --model`;
-default: the universal model without calibration); `external_uT` (for a board that a robot moves); `baud`; `frame_id`;
-`rate_hz` (largest number of messages of a topic per second).
+Parameters of the node:
+
+* `port`: the port of the board. By default, this is the only connected board.
+* `model` and `calibration`: files, as for `reskin live --model`. By default, the universal model is used without
+  calibration.
+* `external_uT`: for a board that a robot moves, the standard deviation in uT of the change of the external field along
+  each axis, about 30 for the earth's field; see `reskin.load_universal`. The default 0 means that there is no such
+  change.
+* `baud`: the baud rate of the port.
+* `frame_id`: the name of the skin's coordinate frame.
+* `rate_hz`: the largest number of messages per second on each topic.
 
 Design decisions:
 
-* The field of each chip is a MagneticField message, because it has a stamp, a frame and SI units; a Float32MultiArray
-  has none of these. Its covariance is 0, which means that it is unknown. The frame of chip K is `<frame_id>_chipK`.
-* Frame `frame_id` has the axes and the origin of the places x and y; its z axis points out of the skin. Only x and y
-  are estimated; z is 0, which is the surface. The orientation of a place is that of the frame, and its entries in the
-  covariance are 0.
-* The force presses on the skin along -z, because the model estimates normal forces. The force acts at the place, and
-  the torque is its moment about the origin. No standard message has a wrench with a covariance, so the standard
-  deviation of the force is published as a separate message with the same stamp. In this message, components that are
-  not estimated are NaN.
-* A reading that is not usable is not published. Subscribers notice this by the age of the last message; the reason is
-  in `/diagnostics`. Stamps are times of arrival on the system's clock.
+* The field of each chip is published as a MagneticField message, because this message has a stamp (the time of the
+  reading), a frame and SI units. A Float32MultiArray has none of these. The covariance in the message is 0, which means
+  that it is unknown. The frame of chip K is `<frame_id>_chipK`.
+* The frame `frame_id` has the axes and the origin of the places x and y; its z axis points out of the skin. Only x and
+  y are estimated. The z of a place is always 0, which is the surface of the skin. The orientation of a place is always
+  that of the frame. The covariances of z and of the orientation are 0.
+* The model estimates normal forces, so the published force presses on the skin along -z. The force acts at the place of
+  the contact, and the torque is the moment of the force about the origin. There is no standard message with a wrench
+  and its covariance, so the standard deviation of the force is published as a separate message with the same stamp. In
+  this message, components that are not estimated are NaN.
+* A reading that is not usable is not published. Subscribers notice this because the last message becomes old; the
+  reason is in `/diagnostics`. Stamps are times of arrival on the system's clock.
 """
 
 import math
@@ -49,16 +58,20 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 T_PER_UT, M_PER_MM = 1e-6, 1e-3
-DIAGNOSTICS_S = 1.0
+DIAGNOSTICS_S = 1.0  # longest time between two messages with diagnostics
 QUEUE_N = 10  # number of messages that a publisher keeps for slow subscribers
-PARAMETERS = {  # name -> default
+PARAMETERS = {  # names of the node's parameters -> their default values
     "port": "", "model": "", "calibration": "", "external_uT": 0.0, "baud": 115200, "frame_id": "skin",
     "rate_hz": 100.0,
 }  # fmt: skip
 
 
 class SkinPublisher:
-    """Publishes contacts through a node of rclpy. It imports the packages of the messages when it is created."""
+    """An object that publishes contacts through a node of rclpy.
+
+    The packages of the messages are imported only when the object is created, because they exist only in an
+    installation of ROS 2.
+    """
 
     def __init__(self, node: Any, skin: LiveSkin, frame_id: str) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -82,7 +95,7 @@ class SkinPublisher:
         self._diagnosed_s = -math.inf
 
     def publish(self, contact: Contact) -> None:
-        """Publish a contact: its diagnostics and, if the reading is usable, all other messages."""
+        """Publish the diagnostics of a reading and, if the reading is usable, all other messages."""
         self._publish_diagnostics(contact)
         if contact.usable:
             self._publish_fields(contact)
@@ -153,19 +166,21 @@ class SkinPublisher:
 
 
 def limit_rate(contacts: Iterator[Contact], rate_hz: float) -> Iterator[Contact | None]:
-    """Yield at most `rate_hz` contacts per second, and None for each contact that is omitted."""
+    """Yield at most `rate_hz` contacts per second; in place of each contact that is omitted, yield None."""
     next_s, period_s = -math.inf, 1 / rate_hz
     for contact in contacts:
         now_s = time.monotonic()
         if now_s >= next_s:
-            next_s = max(next_s, now_s - period_s) + period_s  # the mean rate is exact, even if contacts are irregular
+            # The next time is counted from the planned time, so that the mean rate is right even if contacts are
+            # irregular.
+            next_s = max(next_s, now_s - period_s) + period_s
             yield contact
         else:
             yield None
 
 
 def find_model(model: str, calibration: str, external_uT: float) -> "Universal | Sequence[str]":
-    """Return the model for `reskin.open`, from the node's parameters."""
+    """Return the argument `model` for `reskin.open`, from the node's parameters."""
     if external_uT:
         return reskin.load_universal(calibration or None, file=model or None, external_uT=external_uT)
     return [file for file in (model, calibration) if file]
@@ -186,7 +201,7 @@ def main(args: Sequence[str] | None = None) -> None:
             publisher = SkinPublisher(node, skin, given["frame_id"])
             node.get_logger().info(f"publishing {skin.description}")
             for contact in limit_rate(iter(skin), given["rate_hz"]):
-                rclpy.spin_once(node, timeout_sec=0.0)  # serves calls of ~/zero
+                rclpy.spin_once(node, timeout_sec=0.0)  # answers calls of service ~/zero
                 if contact is not None:
                     publisher.publish(contact)
     except ReskinError as error:

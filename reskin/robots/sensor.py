@@ -1,8 +1,8 @@
 """A skin as a sensor of a robot in LeRobot, with the methods that LeRobot's cameras have.
 
-The package lerobot is not needed. A robot class creates the sensor from its configuration, and connects and disconnects
-it together with the motors and cameras. It adds `observation_features` to the robot's own features, and the values that
-`async_read` returns to each observation (docs/robots.md).
+The package lerobot is not needed. The class of a robot creates the sensor from its configuration, and connects and
+disconnects the sensor together with the motors and cameras. The class adds the sensor's `observation_features` to the
+features of the robot, and the values that `async_read` returns to each observation (see docs/robots.md).
 """
 
 import math
@@ -21,12 +21,12 @@ from reskin.errors import CaptureError
 from reskin.live.tracker import Estimates, LiveSkin
 
 WAIT_S = 0.1  # longest time for which the background thread waits for data before it checks whether it must stop
-READ_MS = 10_000.0  # longest time for which `read` and `zero` wait, as in `read` of LeRobot's cameras
+READ_MS = 10_000.0  # longest time for which `read` and `zero` wait; the same as for `read` of LeRobot's cameras
 ESTIMATE = ("x_mm", "y_mm", "F_N", "sd_x_mm", "sd_y_mm", "sd_F_N", "contact")
 
 
 class SkinConnectionError(CaptureError, ConnectionError):
-    """The sensor is not connected, is connected already, or cannot be connected."""
+    """Raised if the sensor is not connected, is connected already, or cannot be connected."""
 
 
 @dataclass(kw_only=True)
@@ -36,10 +36,11 @@ class SkinSensorConfig:
     Parameters
     ----------
     port : serial port or socket://host:port
-    model : as in `reskin.open`; by default, the universal model without calibration
+    model : the model, as in `reskin.open`; by default, the universal model without calibration
     baud : baud rate; USB ports ignore it
-    without_contact : value of x_mm, y_mm and the standard deviations without contact. The default is NaN. Policies
-        cannot use NaN: choose a value such as 0, and use `contact` and `F_N` as well.
+    without_contact : value of x_mm, y_mm and the standard deviations in readings without contact. The default is NaN.
+        Policies cannot use NaN. If a policy uses these values, choose a number such as 0, and give the policy `contact`
+        and `F_N` as well, so that it can distinguish this number from an estimate.
     """
 
     port: str
@@ -49,11 +50,12 @@ class SkinSensorConfig:
 
 
 class SkinSensor:
-    """A skin that a background thread reads continuously. Use it in a `with` statement, or call `connect`.
+    """A skin that a background thread reads continuously.
 
-    A reading is a dict of numbers: the field of each chip (Bx0_uT, By0_uT, Bz0_uT, Bx1_uT, ...) and, if the model is
-    for this board, the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are
-    not usable, such as failed reads of a chip, are never returned.
+    Use the sensor in a `with` statement, or call `connect` and `disconnect`. A reading is a dict of numbers. It
+    contains the field of each chip (Bx0_uT, By0_uT, Bz0_uT, Bx1_uT, ...). If the model can be used with this board, it
+    also contains the estimate: x_mm, y_mm, F_N, their standard deviations, and contact (1 or 0). Readings that are not
+    usable, such as failed reads of a chip, are never returned.
     """
 
     def __init__(self, config: SkinSensorConfig) -> None:
@@ -61,12 +63,10 @@ class SkinSensor:
         self._skin: LiveSkin | None = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._changed = threading.Condition()  # guards the following attributes
+        self._changed = threading.Condition()  # the lock under which the following attributes are read and written
         self._latest: dict[str, float] | None = None
-        self._latest_s, self._is_new = (
-            -math.inf,
-            False,
-        )  # arrival of the latest reading; whether it was not returned yet
+        # time of arrival of the latest reading, and whether this reading has not been returned yet
+        self._latest_s, self._is_new = -math.inf, False
         self._error: Exception | None = None
 
     def __str__(self) -> str:
@@ -90,18 +90,23 @@ class SkinSensor:
 
     @property
     def is_connected(self) -> bool:
-        """Whether `connect` was called, and `disconnect` was not. An unplugged board remains connected."""
+        """Whether `connect` was called, and `disconnect` was not called afterwards.
+
+        The value stays True while the board is unplugged.
+        """
         return self._skin is not None
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Names of the values of a reading, as LeRobot's robots describe their observations."""
+        """Names and types of the values of a reading, in the form in which LeRobot's robots describe observations."""
         skin = self._connected()
         estimated = ESTIMATE if skin.estimator is not None else ()
         return dict.fromkeys([*_field_names(skin.detected.chips_n), *estimated], float)
 
     def connect(self, warmup: bool = True) -> None:
-        """Open the port, and take the no-load reading: nothing may touch the skin for a second.
+        """Open the port, and take the no-load reading.
+
+        Nothing may touch the skin during the first second.
 
         Parameters
         ----------
@@ -140,19 +145,19 @@ class SkinSensor:
         self._skin = self._thread = None
 
     def read(self) -> dict[str, float]:
-        """Wait for the next reading, and return it; raise TimeoutError after 10 s."""
+        """Wait for the next reading, and return it; raise TimeoutError if none arrives within 10 s."""
         self._connected()
         with self._changed:
             self._is_new = False
         return self.async_read(READ_MS)
 
     def async_read(self, timeout_ms: float = 200.0) -> dict[str, float]:
-        """Return the latest reading if it was not returned before; otherwise, wait for the next reading.
+        """Return the latest reading; if it was returned before, wait for the next reading and return that.
 
         Raises
         ------
         SkinConnectionError : the sensor is not connected
-        TimeoutError : no usable reading arrived within `timeout_ms`; the message has the board's alarms
+        TimeoutError : no usable reading arrived within `timeout_ms`; the message contains the alarms of the board
         """
         skin = self._connected()
         with self._changed:
@@ -173,7 +178,10 @@ class SkinSensor:
             return self._reading()
 
     def zero(self) -> None:
-        """Take a new no-load reading, and wait for it: nothing may touch the skin for a second."""
+        """Take a new no-load reading, and wait until it is complete.
+
+        Nothing may touch the skin for a second. Raises TimeoutError if there is no new no-load reading within 10 s.
+        """
         skin = self._connected()
         with self._changed:
             skin.zero()
@@ -196,7 +204,7 @@ class SkinSensor:
         return dict(self._latest)
 
     def _follow(self, skin: LiveSkin) -> None:
-        """Store the latest usable reading, until the sensor is disconnected."""
+        """Store each usable reading as the latest reading, until the sensor is disconnected."""
         try:
             while not self._stop.is_set():
                 estimates = skin.poll(WAIT_S, latest=True)
@@ -204,10 +212,12 @@ class SkinSensor:
                     continue
                 reading = self._values(estimates, estimated=skin.estimator is not None)
                 with self._changed:
-                    if skin.zeroed:  # if not, `zero` was called while this reading was evaluated
+                    # If there is no no-load reading now, `zero` was called while this reading was evaluated. The
+                    # reading was then evaluated with the old no-load reading, so it is dropped.
+                    if skin.zeroed:
                         self._latest, self._latest_s, self._is_new = reading, float(estimates.t_s[-1]), True
                         self._changed.notify_all()
-        except Exception as error:  # raised by the reading methods, on the caller's thread
+        except Exception as error:  # stored here; the methods that read raise it in the caller's thread
             with self._changed:
                 self._error = error
                 self._changed.notify_all()

@@ -14,18 +14,21 @@ from reskin.schema import Readings
 
 
 class Reader(Protocol):
-    """The functions that each reader module defines."""
+    """The interface of a reader: the functions that each module of this package defines."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
-        """Find the files of a recording; return a mapping from each file's name in the capture folder to its path."""
+        """Find the files of a recording.
+
+        Returns a mapping from the name that each file gets in the capture folder to the path of the file.
+        """
 
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips from the columns of the collected files."""
 
     def read(self, folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, dict[str, int]]:
-        """Return the readings of a capture folder, and the account of its rows.
+        """Return the readings of a capture folder, and an account (counts by name) of its rows.
 
-        In the account, `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`.
+        In the account, `rows_read_n` is the sum of `rows_n`, `noload_rows_n` and all `dropped_*_rows_n`.
         """
 
 

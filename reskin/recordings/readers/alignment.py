@@ -1,4 +1,9 @@
-"""Find a change of the lag between fields and labels within a recording, and number the passes over the skin."""
+"""Find rows that are missing in a recording, and number the passes over the skin.
+
+In some recordings, fields and labels (places and forces) are in two files, and the fields lag behind the labels by a
+number of rows. If a row is missing in one of the files, the lag changes within the recording. `find_change` finds such
+a change. A pass is one visit to all places of a recording. `find_passes` finds the pass of each row.
+"""
 
 from typing import NamedTuple
 
@@ -7,23 +12,25 @@ from jaxtyping import Bool, Float, Float64, Int32, Int64
 
 LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in rows
 ROWS_MIN_N = 300  # in a shorter recording, a change of the lag cannot be detected
-BLOCK_ROWS_N = 500  # length of the blocks whose median field is subtracted, to remove slow drift
+BLOCK_ROWS_N = 500  # to remove slow drift, the median field of each block of about this many rows is subtracted
 ROUNDS_N = 4  # number of iterations in which `find_change` fits the lines and splits the rows
-OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
-# A change of the lag reduces the sum of the distances between fields and fitted lines. The change is reported if the
-# reduction is at least the mean cost of this many misaligned rows. In the two public recordings and in parts of them,
-# the reduction is that of at most 12 rows if the lag does not change, and that of 40 or more rows if a row is lost 100
-# rows before the end.
+OUTLIER = 4.0  # distances between fields and lines are clipped to this multiple of the median distance
+# `find_change` fits a line of field against force for each place. The cost of a misaligned row is the mean increase of
+# the distance between field and line if a row is assigned to a wrong lag. If the lag changes within the recording, two
+# lags give a smaller sum of distances than a single lag. The change is reported if this reduction is at least the cost
+# of this many misaligned rows. In the two public recordings and in parts of them, the reduction is the cost of at most
+# 12 rows if the lag does not change. It is the cost of 40 or more rows if a row is lost 100 rows before the end.
 EVIDENCE_ROWS_MIN_N = 30
-# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. In 300 rows, noise alone gives
-# up to 0.17.
+# The cost of a misaligned row, divided by the standard deviation of the cost over rows, must exceed this value. In
+# recordings of 300 rows, noise alone gives a ratio of up to 0.17.
 CONTRAST_MIN = 0.3
 
 
 class Change(NamedTuple):
-    """A change of the lag of the fields behind the labels, in rows.
+    """A change of the lag of the fields behind the labels.
 
-    The lag is `before` in the label rows before `row` (counted from 0), and `after` from `row` on.
+    The lag is `before` rows in the rows of labels before `row`, and `after` rows from `row` on. Rows are counted from
+    0.
     """
 
     row: int
@@ -35,11 +42,12 @@ def find_change(
     b_uT: Float64[np.ndarray, "f ch"], label: Float64[np.ndarray, "f 3"], contact: Bool[np.ndarray, " f"],
     sound: Bool[np.ndarray, " f"],
 ) -> Change | None:  # fmt: skip
-    """Return the change of the lag; None if a single lag explains the rows as well.
+    """Return the change of the lag; None if a single lag explains the rows about as well.
 
-    With the current estimate of the lags, a line of field against force is fitted for each place. Then the rows are
-    split into two parts with different lags, such that the fields are as near as possible to these lines. Both steps
-    are repeated. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
+    The lags are estimated iteratively. With the current estimate, a line of field against force is fitted for each
+    place. Then the rows are split into two parts with different lags, such that the fields are as near as possible to
+    these lines. Both steps are repeated. The columns of `label` are x in mm, y in mm and force in N. Rows of fields
+    that `sound` does not mark are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None
@@ -52,7 +60,7 @@ def find_change(
         lag = np.where(row < change_row, LAGS[before_i], LAGS[after_i])
     gain = distance.sum(axis=1).min() - distance[before_i, :change_row].sum() - distance[after_i, change_row:].sum()
     extra_cost = distance[after_i] - distance[before_i]
-    # Mean cost of a misaligned row: how much the distance of a row increases with the lag of the other part.
+    # Mean cost of a misaligned row: the increase of its distance if it has the lag of the other part.
     misaligned = float(np.where(row < change_row, extra_cost, -extra_cost).mean())
     if misaligned <= CONTRAST_MIN * extra_cost.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
@@ -81,7 +89,11 @@ def _fit_lines(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"], lag: Int64[np.ndarray, " f"],
 ) -> Float64[np.ndarray, "f ch"]:  # fmt: skip
-    """Return the expected field of each label row, from a least-squares line of field against force at its place."""
+    """Return the field that is expected for each row of labels.
+
+    For each place, a line of field against force is fitted by least squares, with the given lag of each row. The
+    expected field is the value of this line at the row's force.
+    """
     field_row = np.arange(len(place)) + lag
     used = (field_row >= 0) & (field_row < len(place))
     used[used] &= sound[field_row[used]]
@@ -102,7 +114,10 @@ def _fit_lines(
 def _distances(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], expected_uT: Float64[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, "l f"]:
-    """Return for each lag and label row the distance in uT of the field from the expected field; 0 if it is unknown."""
+    """Return the distance in uT between the measured and the expected field, for each lag and each row of labels.
+
+    The distances of a row are 0 if the field is unknown for one of the lags.
+    """
     distance = np.zeros((len(LAGS), len(field_uT)))
     row = np.arange(len(field_uT))
     known = (row + LAGS[0] >= 0) & (row + LAGS[-1] < len(row))
@@ -113,9 +128,9 @@ def _distances(
 
 
 def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
-    """Find the row of the change and the two different lags for which the sum of distances is smallest.
+    """Find the two different lags, and the row of the change between them, for which the sum of distances is smallest.
 
-    Returns the indices of the lags before and after the change, and the row.
+    Returns the indices of the lags before and after the change in `LAGS`, and the row of the change.
     """
     lags_n = len(distance)
     before = np.concatenate([np.zeros((lags_n, 1)), np.cumsum(distance, axis=1)], axis=1)  # sums over earlier rows
@@ -126,23 +141,26 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
     return int(before_i), int(after_i), int(row)
 
 
-# A move is a change of place between two contacts. A move can be compared if the rows one period later are in contact
-# too. A period, the number of rows of a pass, is accepted if at least this fraction of the moves that can be compared
-# has the same places one period later.
+# The period is the number of rows of a pass. To find it, moves are compared. A move is a change of place between two
+# contacts, and consists of the two rows before and after the change. A move can be compared if the two rows that are
+# one period later are in contact too. A period is accepted if the places are the same one period later, for at least
+# this fraction of the moves that can be compared.
 AGREEMENT_MIN = 0.95
-# Minimum fraction of the moves that can be compared. If the period is half the recording, only half of the moves have
-# a move one period later, and in some of them the rows may be without contact.
+# At least this fraction of all moves must be comparable. It is far below 1: if the period is half of the recording,
+# only half of the moves are followed by rows one period later, and some of these rows may be without contact.
 COMPARED_MIN = 0.25
-PROBES_N = 256  # number of moves in the sample with which most periods are excluded
-PROBES_MIN_N = 8  # if fewer of these moves can be compared for a period, the period is not excluded
-GOLDEN = (np.sqrt(5.0) - 1) / 2
+# Most periods are excluded quickly with a sample of this many moves. If fewer than PROBES_MIN_N moves of the sample can
+# be compared for a period, the sample does not exclude this period.
+PROBES_N = 256
+PROBES_MIN_N = 8
+GOLDEN = (np.sqrt(5.0) - 1) / 2  # the golden ratio modulo 1, with which the sample is chosen
 
 
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
-    """Return the pass number of each row, from 0; a new pass begins when the sequence of places repeats.
+    """Return the number of the pass to which each row belongs; passes are numbered from 0.
 
-    If the sequence does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass
-    may be incomplete.
+    A new pass begins when the sequence of places repeats. If the sequence does not repeat, all rows are in pass 0. The
+    places of rows without contact are ignored. The last pass may be incomplete.
     """
     rows_n = len(place_mm)
     moves = _find_moves(place_mm, contact)
@@ -161,14 +179,15 @@ def _likely_periods(
 ) -> Int64[np.ndarray, " p"]:
     """Return the periods, in rows, that fit a sample of the moves in the first half of the recording.
 
-    Testing all moves for all periods would take quadratic time.
+    Only a sample is tested, because the time to test all moves for all periods would grow quadratically with the length
+    of the recording.
     """
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Choose moves at multiples of the golden ratio modulo 1, which are spread evenly but do not repeat with the period
-    # of a grid.
+    # Choose the moves at multiples of the golden ratio modulo 1. They are spread evenly over the recording, but unlike
+    # equally spaced moves, their places do not repeat with the period of a grid.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:
@@ -184,8 +203,8 @@ def _likely_periods(
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
     """Return the moves: pairs of the last row in contact at a place and the first row in contact at the next place.
 
-    Both rows of a move are compared, because a period that is wrong by less than a dwell can match one of the places,
-    but not both.
+    Moves are compared instead of single rows, because several successive rows have the same place. If a period is wrong
+    by less than the duration of such a dwell, it may still match one of the two places of a move, but not both.
     """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)

@@ -1,10 +1,11 @@
 """Read layout `eflash7`: an eFlesh pad on a six-axis force sensor is pressed; a recording is one CSV file.
 
 In a recording, one or two places of a 3 x 3 grid are touched. The pitch of the grid is unknown, so `x_mm` and `y_mm`
-are NaN. The account contains the number of rows of the place with number n as `place_<n>_rows_n`; n is 1 + column + 3
-row, with columns and rows counted from 0. The recorder subtracted a baseline that the file does not contain, so `b_uT`
-lacks a constant in each channel. The no-load field is the mean field of the untouched rows at the start of a recording.
-Forces are relative to the mean force of these rows.
+are NaN. Places are identified by a number instead: the place in column i and row j of the grid, both counted from 0,
+has number n = 1 + i + 3 j. The account contains the number of rows of this place as `place_<n>_rows_n`. The recorder
+subtracted a baseline that the file does not contain. Therefore, each channel of `b_uT` differs from the raw field by an
+unknown constant. The no-load field is the mean field of the rows before the first touch, and forces are relative to the
+mean force of these rows.
 """
 
 import re
@@ -30,13 +31,15 @@ SIDE_N = 3  # places per side of the grid
 ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
 FORCES = ("fx", "fy", "fz")
 ON_SKIN = -1.0  # factor from fz in the file, which is negative in compression, to the force on the skin
-TOUCH_N = 0.5  # assumed: a touch begins when the force rises above this value, because the file does not mark touches
-# The chips measure about ten times a second, and the recorder writes a row of zeros if it polls before the next
-# reading. In 19 recordings, 4 to 10 % of the rows are such rows.
+# Assumed: a touch begins when the force rises above this value. The file does not mark touches.
+TOUCH_N = 0.5
+# The chips measure about ten times a second. If the recorder asks for a reading before the chips have measured again,
+# it writes a row of zeros. In 19 recordings, 4 to 10 % of the rows are such rows. A recording with more than this
+# fraction is refused.
 ZERO_FRACTION_MAX = 0.25
 GAP_s = 0.5  # a time between two rows that is longer than this is counted as a gap
-# 19 recordings begin with 1.4 to 17 s without contact. Before the first touch, the field varies by 3 to 6 uT (noise); a
-# touch changes it by 500 uT or more.
+# The first touch begins when a channel has changed by more than this value. All 19 recordings begin with 1.4 to 17 s
+# without contact, in which the field varies by 3 to 6 uT because of noise. A touch changes the field by 500 uT or more.
 STILL_uT = 40.0
 STILL_ROWS_MIN_N = 5
 
@@ -75,7 +78,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return all rows from the first touch on as readings; the rows before give the no-load field."""
+    """Return all fault-free rows from the first touch on as readings.
+
+    The no-load field is the mean field of the rows before the first touch.
+    """
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
@@ -86,8 +92,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    # Rows with zeros on all chips are recorded here. Rows with zeros on only some chips are counted by `check_rows`
-    # below.
+    # Here, the log counts the rows with zeros on all chips. Rows with zeros on only some of the chips are counted by
+    # `check_rows` below.
     written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
@@ -158,7 +164,7 @@ def _read_table(path: Path, where: str) -> _Table:
 
 
 def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
-    """Return the numbers of the touched places, one or two per recording, from their columns and rows (1 to 3)."""
+    """Return the numbers of the one or two touched places, from their columns and rows in the file (1 to 3)."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
         raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place separately.")
@@ -173,7 +179,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows with zeros for all chips, which mean that there was no new reading; raise if there are too many."""
+    """Mark the rows with zeros for all chips, in which there was no new reading; raise if there are too many rows."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         problem = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
@@ -206,9 +212,10 @@ def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarra
 
 
 def _number_touches(pressed_N: Float64[np.ndarray, " f"], whole: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the touches from 0: a touch begins when the force rises above `TOUCH_N`, and lasts until the next touch.
+    """Return the number of the touch to which each row belongs; touches are numbered from 0.
 
-    `pressed_N` is the force on the skin; rows before the first touch have number 0.
+    A touch begins when the force on the skin, `pressed_N`, rises above `TOUCH_N`, and lasts until the next touch
+    begins. Rows before the first touch also have number 0.
     """
     pressed = pressed_N >= TOUCH_N
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])

@@ -1,9 +1,10 @@
 """Read layout `eflesh`: a robot arm presses an eFlesh skin; a recording is a folder with three CSV files.
 
-Places are robot coordinates minus their minimum, so the smallest x and y are 0 mm. The depth is measured downwards from
-the highest z of the recording. This z may be above the skin, so the depth has an unknown offset. The force is known
-along one axis only. If this axis is x or y, the sign of the force is unknown, because the recorder does not state
-whether it is the force on the skin or on the gauge. The account contains the number of these rows.
+Places are the robot's coordinates minus their smallest values, so the smallest x and y are 0 mm. The depth is measured
+downwards from the highest z of the recording. At this z, the robot may be above the skin, so the depth has an unknown
+offset. The force was measured along one axis only. If this axis is x or y, the sign of the force is unknown, because
+the recorder does not state whether it is the force on the skin or the force on the gauge. The account contains the
+number of rows with such a force.
 """
 
 from collections.abc import Mapping
@@ -34,20 +35,23 @@ STATES = "states.csv"
 FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
-NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
-# index of the column of states.csv after time, x, y and z; there is no such column if only places were recorded
+NEWTON_PER_GRAM = 9.80665e-3  # weight of one gram in standard gravity
+# Index of the column of the weight in states.csv, after time, x, y and z. There is no such column if the force was not
+# recorded.
 WEIGHT_COLUMN = 4
-NO_NEW_WEIGHT = -1.0
-# the recorder writes a row to each of two files in one step of its loop, only milliseconds apart
+NO_NEW_WEIGHT = -1.0  # the recorder writes this number if the gauge has not measured since the previous row
+# The recorder writes a row to each of two files in one step of its loop, so the times in these rows differ by
+# milliseconds. If they differ by this value or more, the rows do not belong together.
 CLOCKS_APART_MAX_s = 0.05
-PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
-# Two no-load fields are the same if they differ by less than this. They are computed as raw field minus field change,
-# whose rounding errors in float32 are below 0.004 uT. In a new no-load reading, at least one channel changes by an LSB,
-# which is 0.15 uT or more.
+PLACE_DECIMALS = 3  # places are rounded, because the robot reports -84.999992 mm for -85 mm
+# Two no-load fields are treated as the same if they differ by less than this value. No-load fields are computed as raw
+# field minus field change, and the rounding errors of these float32 numbers are below 0.004 uT. If the recorder took a
+# new no-load reading, at least one channel changes by an LSB, which is 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# If z varies by less than this fraction of its largest value, the robot kept a constant height. For a robot at constant
-# height, z varies by a fraction of 1e-4; for presses whose z is in m instead of mm, by some hundredths.
+# If z varies by less than this fraction of its largest value, the robot is assumed to have kept a constant height. For
+# a robot at constant height, the fraction is about 1e-4. In a recording of presses whose z is by mistake in m instead
+# of mm, it is some hundredths.
 HELD_FRACTION = 1e-3
 
 Account = dict[str, int]
@@ -74,9 +78,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return each row as the reading of one indentation.
+    """Return each row as the single reading of an indentation.
 
-    The no-load field is the baseline that the recorder subtracted: the raw field minus the field change.
+    The no-load field is the baseline that the recorder subtracted. It is computed as the raw field minus the field
+    change, which are in two files.
     """
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)
@@ -117,7 +122,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 def _read_fields(
     folder: Path, header: Header
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
-    """Read times, raw fields and no-load fields; the times of both sensor files must agree."""
+    """Read times, raw fields and no-load fields; raise if the two files of the sensor have different times."""
     names = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
     sensor, changes = (
         to_numbers(read_cells(folder / name, where, separator=","), where, names=names)
@@ -133,7 +138,7 @@ def _read_fields(
 
 
 def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
-    """Read time, x, y, z and, if the recording has it, the weight."""
+    """Read the columns time, x, y, z and, if the force was recorded, the weight."""
     where = f"{header.capture}/{STATES}"
     cells = read_cells(folder / STATES, where, separator=",")
     names = ["time", "x", "y", "z"] + (["weight"] if len(cells[0]) > WEIGHT_COLUMN else [])
@@ -151,7 +156,7 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Raise unless the times in both files agree in every row, and increase."""
+    """Raise if the times in the two files differ too much in any row, or if the times do not increase."""
     disagreeing = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(disagreeing):
         where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
@@ -169,11 +174,11 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
 def _number_passes(
     place_mm: Float64[np.ndarray, "f 2"], noload_uT: Float64[np.ndarray, "f ch"]
 ) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
-    """Return for each row its pass number and the number of earlier touches.
+    """Return the pass number of each row, and the number of touches before it.
 
     In a recording of many places, each row is a touch, and a new pass begins when the sequence of places repeats. In a
     recording of a single place, the robot strokes up and down, and the recorder takes a new baseline before each
-    stroke. Therefore, each new no-load field begins a new pass, which has one touch.
+    stroke. Therefore, a change of the no-load field marks a new stroke, which counts as a new pass with one touch.
     """
     if place_mm.any():
         everywhere = np.ones(len(place_mm), bool)
@@ -184,7 +189,10 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the force by its column name, with NaN in rows without a new value; {} if there was no gauge."""
+    """Return a mapping from the name of the force's column to the force; {} if there was no gauge.
+
+    The force is NaN in rows without a new value of the gauge.
+    """
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
@@ -199,7 +207,10 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
 
 
 def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Return depths below the highest z; NaN if z was constant or the gauge measured a force along the skin."""
+    """Return the depths below the highest z.
+
+    The depths are NaN if z was constant, or if the gauge measured a force along x or y.
+    """
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
     z_mm = states[:, 3]
     return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm

@@ -1,13 +1,15 @@
 """Read layout `ini`: a 3-D printer with a force gauge presses the skin; two text files have one row per indentation.
 
-One file contains the readings, the other the truths: places and forces. Rows with a force below 0.02 N count as rows
-without contact, whatever their place in the truths is. Their place becomes NaN, and their force 0. In the first rows of
-a pass, the indenter is at a corner of the grid; these rows give the no-load field of the pass. `t_s` and `depth_mm` are
+One file contains the readings. The other file contains the truths, which are the places and forces. Rows with a force
+below 0.02 N count as rows without contact, even if the truths state a place. Their place becomes NaN, and their force
+becomes 0. A pass is one visit to all places of the grid. In the first rows of a pass, the indenter is off the skin, at
+a corner of the grid. The no-load field of the pass is the mean field of these corner rows. `t_s` and `depth_mm` are
 unknown (NaN).
 
 The fields may lag behind the truths: row i of the truths then belongs to a later row of the readings. The header may
-state the lag in rows (option `rows_late`). Otherwise, the lag is that at which the norm |dB| of the field change
-correlates best with the force. If the lag changes within a recording, a row is missing in one of the files, and the
+state the lag in rows (option `rows_late`). Otherwise, the lag is estimated: the norm |dB| of the field change is
+correlated with the force at several lags, and the lag with the highest correlation is used if this correlation is
+clearly higher than without a lag. If the lag changes within a recording, a row is missing in one of the files, and the
 recording is refused.
 """
 
@@ -28,20 +30,21 @@ from reskin.schema import Readings
 READINGS = "readings.txt"
 TRUTHS = "truths.txt"
 FILES = (READINGS, TRUTHS)
-# below this force, the recorder writes (x, y, F) = (10, 10, 0), although (10, 10) is also a real place
+# For forces below this value, the recorder writes (x, y, F) = (10, 10, 0). The place alone does not identify these
+# rows, because (10, 10) is also a real place.
 CONTACT_MIN_N = 0.02
 VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
-# An estimated lag is used only if the recording has at least LATE_ROWS_MIN_N rows, and the correlation exceeds that
-# without a lag by at least LATE_GAIN_MIN. In the public recording of 23300 rows, the lag increases the correlation from
-# 0.45 to 0.65.
+# An estimated lag is used only if the recording has at least LATE_ROWS_MIN_N rows, and if the correlation with this lag
+# exceeds the correlation without a lag by at least LATE_GAIN_MIN. In the public recording of 23300 rows, the lag
+# increases the correlation from 0.45 to 0.65.
 LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
 
 Account = dict[str, int]
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of readings, `b20_NAME.txt`, and its truths, `truths_NAME.txt`, in the same folder."""
+    """Find the two files of a recording: the readings `b20_NAME.txt`, and `truths_NAME.txt` in the same folder."""
     if not recording.is_file() or recording.name.startswith("truths_"):
         raise CaptureError(f"{recording}: not the text file of readings. Add b20_NAME.txt, not truths_NAME.txt.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
@@ -52,7 +55,7 @@ def collect(recording: Path) -> dict[str, Path]:
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
-    """Count the chips from the columns of the readings: X, Y, Z, T per chip."""
+    """Count the chips from the number of columns of the readings, which has four columns (X, Y, Z, T) for each chip."""
     where = str(files[READINGS])
     columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
@@ -61,9 +64,9 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return all fault-free rows as readings; the no-load field of a pass is the mean field of its corner rows.
+    """Return all fault-free rows as readings.
 
-    The corner rows are the first rows of a pass, before the first contact.
+    The no-load field of a pass is the mean field of its corner rows, which are the rows before its first contact.
     """
     given_late_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
@@ -109,7 +112,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 
 
 def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
-    """Read fields and temperatures, with one column per channel and per chip."""
+    """Read the fields (one column per channel) and the temperatures (one column per chip)."""
     names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
     where = f"{header.capture}/{READINGS}"
     numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names)
@@ -156,7 +159,7 @@ def _rows_late(header: Header) -> int | None:
 def _best_rows_late(
     b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: CheckedRows
 ) -> tuple[int, bool]:
-    """Return the lag in rows at which |dB| correlates best with the force, and whether the estimate is reliable."""
+    """Return the lag in rows at which |dB| correlates best with the force, and whether this estimate is reliable."""
     correlations = []
     for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
         whole = rows.keep[rows_late_n:]
@@ -190,7 +193,7 @@ def _check_lateness(
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark the rows of each pass before its first contact; the indenter is then at the first corner, off the skin."""
+    """Mark the corner rows: the rows of each pass before its first contact, when the indenter is off the skin."""
     touches_before_n = np.cumsum(contact)
     begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
     before_pass_n = (touches_before_n - contact)[begins]
@@ -200,7 +203,7 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
 def _noload_field(
     b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
 ) -> Float64[np.ndarray, "f ch"]:
-    """Return for each row the mean field over the corner rows of its pass."""
+    """Return the no-load field of each row: the mean field over the corner rows of the row's pass."""
     noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):

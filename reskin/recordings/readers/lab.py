@@ -1,8 +1,9 @@
-"""Read layout `lab`: a robot with a six-axis gauge; one CSV file per depth, about 100 readings per indentation.
+"""Read layout `lab`: a robot presses a skin, and a six-axis gauge measures the force.
 
-The file contains the force on the gauge (Fz is negative in compression). The force on the skin has the opposite sign,
-so all three components are negated; see `reskin.schema` and `ON_SKIN`. `depth_mm` is NaN, because the file's name
-contains only an index of the depth. `t_s` is NaN, because the file contains no times.
+A recording is one CSV file for each depth, with about 100 readings per indentation. The file contains the force on the
+gauge, whose Fz is negative in compression. The force on the skin has the opposite sign, so all three components are
+negated; see `reskin.schema` and `ON_SKIN`. `depth_mm` is NaN, because only an index of the depth is known, which is in
+the file's name. `t_s` is NaN, because the file contains no times.
 """
 
 from collections.abc import Mapping
@@ -31,11 +32,14 @@ from reskin.schema import Readings
 READINGS = "readings.csv"
 FILES = (READINGS,)
 FIRST_LINE_N = 2  # line number of the first row of numbers in the file
-# Factor from the force in the file (on the gauge) to the force on the skin. For z, the sign follows from compression
-# being negative. For x, there are two pieces of evidence: on both public boards, pokes shift the skin by 48 um along +x
-# (experiment `compare` fits this shift to the fields alone), and the mean Fx is negative in all six files. For y, the
-# shift and the mean force are too small for a decision. However, the sign of Fz implies that the gauge's z axis points
-# into the skin. If the gauge's axes are right-handed, its y axis then has the direction of the y axis of the places.
+# Factor from the force in the file, which is the force on the gauge, to the force on the skin. The axes of the gauge
+# may differ from those of the places, so the sign was derived separately for each axis.
+# For z: Fz is negative in compression, but the force on the skin must be positive in compression.
+# For x: on both public boards, indentations shift the skin by 48 um along +x (experiment `compare` fits this shift to
+# the fields alone). The mean Fx is negative in all six files, so the force on the skin has the opposite sign.
+# For y: the shift and the mean force are too small for a decision. However, the sign of Fz implies that the gauge's z
+# axis points into the skin. If the gauge's axes are right-handed, its y axis then has the direction of the y axis of
+# the places.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
@@ -43,7 +47,11 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class _Table:
-    """The columns of one file; `press` is the index of each block of rows with equal `indent`, in file order."""
+    """The columns of one file.
+
+    `press` is the number of the press to which each row belongs. A press is a block of rows with equal `indent`;
+    presses are numbered from 0 in the order of the file.
+    """
 
     press: Int[np.ndarray, " f"]
     contact: Bool[np.ndarray, " f"]
@@ -55,7 +63,7 @@ class _Table:
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of a recording: the CSV file itself, which contains one depth of one skin."""
+    """Find the file of a recording: the CSV file itself, which contains the presses of one skin at one depth."""
     if not recording.is_file():
         raise CaptureError(
             f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file separately."
@@ -69,7 +77,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the contact rows as readings; the no-load field of a press is the mean field of its `noload` rows."""
+    """Return the contact rows as readings.
+
+    The no-load field of a press is the mean field of its rows with phase `noload`.
+    """
     where = f"{header.capture}/{READINGS}"
     table, rows = _read_checked(folder, header, policy, where)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
@@ -110,7 +121,10 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 def read_noload(
     folder: Path, header: Header, policy: FaultPolicy
 ) -> tuple[Int[np.ndarray, " a"], Float64[np.ndarray, "a ch"]]:
-    """Return the press number (as in `read`) and the field of each single fault-free `noload` row."""
+    """Return the press number and the field of each fault-free row of phase `noload`.
+
+    Presses have the same numbers as the indentations of the readings that `read` returns.
+    """
     table, rows = _read_checked(folder, header, policy, f"{header.capture}/{READINGS}")
     noload = ~table.contact & rows.keep
     return table.press[noload], table.b_uT[noload]
@@ -147,7 +161,7 @@ def _read_table(path: Path, where: str) -> _Table:
 
 
 def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.ndarray, " f"]:
-    """Number the blocks of rows with equal `indent` from 0; raise if two blocks have the same `indent`."""
+    """Return the press number of each row; raise if two blocks of rows have the same `indent`."""
     begins = np.flatnonzero(np.diff(indent, prepend=np.nan) != 0)
     seen: set[float] = set()
     for row_i in begins:

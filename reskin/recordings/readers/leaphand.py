@@ -1,12 +1,13 @@
 """Read layout `leaphand`: magnetic pads on the fingers of a robot hand that moves without touching anything.
 
-The text file has one row per pose of the hand: the fields of all pads, then the positions of all joints. A capture
-contains one pad, a board of five chips, which option `pad` selects. The file contains no times, temperatures or labels.
-By choosing this layout, the user states that nothing touches the pads. Therefore, places are NaN and the normal force
-is 0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel.
+The text file has one row per pose of the hand. A row contains the fields of all pads, and then the positions of all
+joints. A pad is a board with five chips. A capture contains the readings of one pad, which option `pad` selects. The
+file contains no times, temperatures or labels. By choosing this layout, the user states that nothing touches the pads.
+Therefore, places are NaN and the normal force is 0. The recorder subtracted a baseline that the file does not contain.
+Therefore, each channel of `b_uT` differs from the raw field by an unknown constant.
 
-The no-load field is the mean over the first `NOLOAD_ROWS_N` successive rows in which the hand hardly moves. Joint
-positions are not part of `Readings`; `read_motion` returns them.
+The no-load rows are the first `NOLOAD_ROWS_N` successive rows in which the hand hardly moves, and the no-load field is
+their mean field. Joint positions are not part of `Readings`; `read_motion` returns them.
 """
 
 from collections.abc import Mapping
@@ -25,16 +26,16 @@ from reskin.schema import AXES_PER_CHIP_N, Readings
 
 READINGS = "readings.txt"
 FILES = (READINGS,)
-CHIPS_N = 5  # chips of a pad
+CHIPS_N = 5  # number of chips of a pad
 CHANNELS_N = AXES_PER_CHIP_N * CHIPS_N
-JOINTS_N = 4  # joints of a finger; each finger has one pad
+JOINTS_N = 4  # number of joints of a finger; each finger has one pad
 PADS_MAX_N = 4
 COUNTS_PER_TURN = 4096  # the hand's servos give joint positions as whole numbers (counts) from 0 to 4095
 NOLOAD_ROWS_N = 5
-# In the no-load rows, each joint moves by at most this many counts: 4.4 degrees. In recordings of four pads, the hand
-# rests in the first five rows. In recordings of two pads, the hand has another pose in the first row, and the joints
-# move by up to 39 counts in the next five rows. A rotation by 4.4 degrees changes the earth's field along an axis by at
-# most 5 uT, which is about the noise.
+# In the no-load rows, each joint moves by at most this many counts, which are 4.4 degrees. In recordings of four pads,
+# the hand rests in the first five rows. In recordings of two pads, the hand has another pose in the first row, and the
+# joints move by up to 39 counts in the next five rows. Moves below this limit do not disturb the no-load field: if a
+# pad rotates by 4.4 degrees, the earth's field along an axis changes by at most 5 uT, which is about the noise.
 STILL_COUNTS = 50
 
 Account = dict[str, int]
@@ -42,7 +43,10 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions of all joints in the readings that `read` returns, and the fields of the no-load rows."""
+    """The motion of the hand: the positions of all joints, and the fields of the no-load rows.
+
+    `joint_counts` has one row for each of the readings that `read` returns.
+    """
 
     joint_counts: Int64[np.ndarray, "f j"]
     noload_uT: Float64[np.ndarray, "n ch"]
@@ -50,7 +54,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class _Pad:
-    """All rows of one pad. The no-load rows are the `NOLOAD_ROWS_N` rows from index `first_i` on."""
+    """All rows of one pad, and the result of the check for faults.
+
+    The no-load rows are the `NOLOAD_ROWS_N` rows from index `first_i` on. `pads_n` is the number of pads in the file.
+    """
 
     b_uT: Float64[np.ndarray, "f ch"]
     joint_counts: Int64[np.ndarray, "f j"]
@@ -85,7 +92,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the rows after the no-load rows as readings without contact."""
+    """Return all fault-free rows after the no-load rows as readings without contact."""
     pad = _read_pad(folder, header, policy)
     noload, keep = pad.is_noload, pad.is_reading
     zeros = np.zeros(len(keep))
@@ -163,10 +170,10 @@ def _pad_number(header: Header, pads_n: int) -> int:
 
 
 def _find_rest(joint_counts: Float64[np.ndarray, "f j"], where: str) -> int:
-    """Return the index of the first no-load row: the first of `NOLOAD_ROWS_N` rows within which the hand is at rest.
+    """Return the index of the first no-load row.
 
-    The hand is at rest if no joint moves by more than `STILL_COUNTS`. Raises CaptureError if there are no such rows, or
-    no row after them.
+    The no-load rows are the first `NOLOAD_ROWS_N` successive rows in which the hand is at rest, which means that no
+    joint moves by more than `STILL_COUNTS`. Raises `CaptureError` if there are no such rows, or no row after them.
     """
     for first_i in range(len(joint_counts) - NOLOAD_ROWS_N):
         if np.ptp(joint_counts[first_i : first_i + NOLOAD_ROWS_N], axis=0).max() <= STILL_COUNTS:

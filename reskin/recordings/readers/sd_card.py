@@ -1,7 +1,8 @@
-"""Read and write the log that a board writes to an SD card (paper section 6): one CSV line per frame, without labels.
+"""Read and write the log that a board writes to an SD card (section 6 of the paper).
 
-A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as in wire format `text-txyz`.
-If all columns T are missing, temperatures are unknown (NaN).
+A log is a CSV file with one line per frame, and without labels. A line contains the time of the board's clock in
+seconds, and then T, Bx, By, Bz of each chip in degC and uT, in the same order as in wire format `text-txyz`. The
+columns T may be missing; the temperatures are then unknown (NaN).
 """
 
 from codecs import BOM_UTF8
@@ -20,13 +21,13 @@ from reskin.recordings.units import check_fields
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500 characters
-# assumed: no board logs at a lower rate, and no chip measures at a higher rate
+# Assumed limits of the frame rate: no board logs at a lower rate, and no chip measures at a higher rate.
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0
-SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long to be quoted in an error message
-KEPT_SHARE_MIN = 0.5  # assumed: if a smaller fraction of the frames is fault-free, contacts would be missed
-Log = tuple[
-    Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
-]  # times in s, fields in uT, temperatures in degC, account
+SHOWN_CHIPS_MAX = 5  # if there are more chips, the line of column names is too long for an error message
+# Assumed: if a smaller fraction of the frames is fault-free, the log is refused, because contacts would be missed.
+KEPT_SHARE_MIN = 0.5
+# times in s, fields in uT, temperatures in degC, and an account (counts by name)
+Log = tuple[Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]]
 GAP_FRAMES = 1.5  # frames are missing if the time between two frames exceeds the median time by this factor
 
 
@@ -39,7 +40,10 @@ def column_names(chips_n: int, *, temperatures: bool = True) -> list[str]:
 def render(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"]
 ) -> str:
-    """Return a log as CSV text, with times to 0.1 ms, and with two decimals for readings, as in the text firmware."""
+    """Return a log as CSV text.
+
+    Times are rounded to 0.1 ms. Readings are rounded to two decimals, as in the wire formats of text.
+    """
     frames_n, chips_n = temperature_degC.shape
     chips = np.concatenate([temperature_degC[:, :, None], b_uT.reshape(frames_n, chips_n, 3)], axis=2)
     line = ",".join(["%.4f", *["%.2f"] * (4 * chips_n)])
@@ -48,12 +52,12 @@ def render(
 
 
 def read_log(path: Path) -> Log:
-    """Read a log; return times in s, fields in uT and temperatures in degC of the fault-free frames, and an account.
+    """Read a log; return its fault-free frames, and an account.
 
     Temperatures are NaN if the log has none. Frames with failed reads or stuck chips are dropped and counted. Raises
-    `CaptureError` if fewer than half of the frames remain, or if a chip lost its settings. In the account, `gaps_n` is
-    the number of overlong times between two frames, and `gap_frames_n` is the number of frames that are missing in
-    them.
+    `CaptureError` if fewer than half of the frames remain, or if a chip lost its settings. A gap is a time between two
+    frames that is so long that frames must be missing. In the account, `gaps_n` is the number of gaps, and
+    `gap_frames_n` is the number of frames that are missing in all gaps together.
     """
     where = str(path)
     names = _read_names(path, where)
@@ -77,7 +81,10 @@ def keep_whole(
     *,
     first_row: int = 1,
 ) -> Log:
-    """Return the fault-free frames, and count the faulty ones; errors count the rows from `first_row`."""
+    """Return the fault-free frames, and an account that counts the faulty frames.
+
+    `first_row` is the number of the first row, for the row numbers in errors.
+    """
     _check_time(t_s, where, first_row)
     check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
@@ -93,7 +100,7 @@ def keep_whole(
 
 
 def _check_kept(account: dict[str, int], where: str) -> None:
-    """Raise an error that lists the faults, if too few fault-free frames remain."""
+    """Raise if too few fault-free frames remain; the error states how many frames have each fault."""
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
@@ -105,7 +112,11 @@ def _check_kept(account: dict[str, int], where: str) -> None:
 
 
 def _read_names(path: Path, where: str) -> list[str]:
-    """Read the column names in line 1; raise if they are wrong, or if the last line has no line break (a cut file)."""
+    """Read the column names in line 1.
+
+    Raises `CaptureError` if the names are wrong, or if the last line does not end with a line break, because the file
+    was then cut.
+    """
     try:
         with path.open("rb") as file:
             first = file.readline(HEADER_CHARACTERS_MAX)
@@ -116,7 +127,7 @@ def _read_names(path: Path, where: str) -> list[str]:
     except OSError as error:
         reason = "the file is empty" if path.is_file() and not path.stat().st_size else error.strerror
         raise CaptureError(f"{where}: cannot read the log: {reason}. Check the name.") from None
-    # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
+    # If the log was saved by a text editor or a spreadsheet, it may begin with a byte order mark, so remove this mark.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     temperatures = _has_temperatures(names)
     chips_n = (len(names) - 1) // (4 if temperatures else 3)
@@ -135,7 +146,7 @@ def _has_temperatures(names: list[str]) -> bool:
 
 
 def _header_fault(names: list[str]) -> str:
-    """Return what is wrong with the names in line 1, and what to do."""
+    """Return a text that says what is wrong with the column names in line 1, and what to do."""
     wanted = column_names(len(names), temperatures=_has_temperatures(names))
     rule = f"{','.join(column_names(1))}, then T1 and so on (all T may be missing)"
     if tables.is_number(names[0]):
@@ -197,7 +208,7 @@ def _faults(
 
 
 def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
-    """Count the overlong times between two frames, and the frames that are missing in them."""
+    """Count the gaps (times between two frames in which frames must be missing), and the frames missing in them."""
     steps = np.diff(t_s) / np.median(np.diff(t_s))
     wide = steps > GAP_FRAMES
     return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}

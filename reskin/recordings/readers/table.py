@@ -39,18 +39,18 @@ NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
 FIRST_LINE_N = 2  # line number of the first row of numbers in a CSV file
 EMPTY = ("", "nan", "NaN")
-# If an unknown column name begins with one of these words, it is probably the misspelt name of a known column.
+# If the name of an unknown column begins with one of these words, it is probably the misspelt name of a known column.
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
-# assumed: a baseline was subtracted if fields are weak, and fields without contact are below this fraction of those in
-# contact
+# Assumed: the recorder subtracted a baseline if all fields are weak, and if the fields without contact are below this
+# fraction of the fields in contact.
 SUBTRACTED_RATIO = 0.5
 
 Account = dict[str, int]
 
 
 def columns_of(chips_n: int) -> list[str]:
-    """Return the names of all columns that a file may have, in the order of a template file."""
+    """Return the names of all columns that a file of this layout may have, in the order of a template file."""
     fields = [f"{axis}{chip}" for chip in range(chips_n) for axis in ("Bx", "By", "Bz")]
     return [*NEEDED, *fields, *OPTIONAL, *(f"T{chip}" for chip in range(chips_n))]
 
@@ -69,7 +69,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return the contact rows as readings; their no-load field is the mean over the no-load rows before them."""
+    """Return the contact rows as readings.
+
+    The no-load field of a row is the mean field of the last run of no-load rows before it.
+    """
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     names, cells = _read_cells(folder / name, where)
@@ -90,7 +93,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
     rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     press = _number_presses(numbers, contact, where)
-    # Number the blocks; a block is a run of no-load rows and the contacts after it.
+    # Number the blocks of rows. A block is a run of no-load rows together with the contact rows after it.
     block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)
     rest = ~contact & rows.keep
     noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
@@ -136,7 +139,10 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
-    """Raise if the name of an unknown column, which would be ignored, resembles a known name, as `Fz` does `Fz_N`."""
+    """Raise if the name of an unknown column resembles a known name, as `Fz` resembles `Fz_N`.
+
+    Otherwise, the column would be ignored without notice.
+    """
     for name in names:
         if name not in columns and name.lower().split("_")[0] in STEMS:
             known = ", ".join((*NEEDED, *OPTIONAL))
@@ -146,7 +152,7 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
 
 
 def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
-    """Return whether an optional column is empty, as in a template that was filled in only partly."""
+    """Return whether a column is optional and all its cells are empty, as in a template that was filled in partly."""
     column_i = names.index(column)
     return (column in OPTIONAL or column[0] == "T") and all(row[column_i].strip() in EMPTY for row in cells)
 
@@ -154,7 +160,10 @@ def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]])
 def _to_numbers(
     names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
 ) -> Float64[np.ndarray, "f c"]:
-    """Parse the known columns as numbers; in rows without contact, place, depth and force may be empty."""
+    """Parse the known columns as numbers.
+
+    In rows without contact, all cells except those of the field may be empty; an empty cell becomes NaN.
+    """
     column_i = [names.index(column) for column in known]
     may_lack = {column for column in known if column[0] != "B"}
     picked = [[row[i].strip() for i in column_i] for row in cells]
@@ -189,10 +198,11 @@ def _check(
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
-    """Raise if fields are weak, and much weaker without contact than in contact, as after subtracting a baseline.
+    """Raise if the recorder seems to have subtracted a baseline from the fields.
 
-    A raw field without contact is larger than its change in contact. Wrong units also make fields weak, but do not
-    change the ratio of the fields with and without contact.
+    The signs are that the fields are weak, and that they are much weaker without contact than in contact. Raw fields
+    without contact are not: they are larger than the changes of the field in contact. Fields in a wrong unit may also
+    be weak, but the unit does not affect the ratio of the fields with and without contact.
     """
     chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
     if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
@@ -208,10 +218,10 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Return the number of each row's press, from 0.
+    """Return the number of the press to which each row belongs; presses are numbered from 0.
 
-    A press is a block of rows with equal `indentation`. Without column `indentation`, a new press begins with each
-    touch and with each new place within a touch.
+    A press is a block of rows with equal values in column `indentation`. If there is no such column, a new press begins
+    with each touch, and whenever the place changes within a touch.
     """
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
@@ -237,9 +247,10 @@ def _number_presses(
 def _find_passes(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
 ) -> Int[np.ndarray, " f"]:
-    """Return the number of each row's pass, from 0.
+    """Return the number of the pass to which each row belongs; passes are numbered from 0.
 
-    A new pass begins when the sequence of the presses' places and greatest depths repeats.
+    A new pass begins when the sequence of presses repeats. Two presses are the same if they have the same place and the
+    same greatest depth.
     """
     begins = np.flatnonzero(np.diff(press[contact])) + 1
     of_press = [
