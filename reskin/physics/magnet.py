@@ -18,8 +18,8 @@ from scipy.constants import milli, mu_0
 from reskin.config import Strict
 from reskin.errors import ParamsError
 
-# The magnetising array consists of magnet cubes below and above the skin. "CAD" refers to the drawings that the authors
-# of the paper published.
+# The magnetising array consists of magnet cubes below and above the skin. "CAD" refers to the drawings of the authors
+# of the paper.
 CUBE_SIDE_M = 6.35e-3  # the cubes have a side of 0.25 in
 CUBES_N = (4, 4)  # number of magnet cubes along x and y, for the authors' skin of 20 x 20 mm
 ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from the authors' CAD
@@ -75,7 +75,7 @@ def cubes_along(side_m: float) -> int:
 def seams_m(side_m: float) -> tuple[float, ...]:
     """Return the coordinates of the seams along a side of a skin.
 
-    A seam is the boundary between two adjacent cubes. At a seam, the magnetisation changes abruptly.
+    A seam is the boundary between two adjacent cubes. The magnetisation of the skin has a kink at each seam.
     """
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
@@ -171,8 +171,7 @@ def place_nodes(
 ) -> Nodes:
     """Place the quadrature nodes of a skin: at the midpoints of cells along x and y, and at Gauss nodes along z.
 
-    The cells are chosen such that no cell crosses a seam between magnet cubes, where the magnetisation changes
-    abruptly.
+    The cells are chosen such that no cell crosses a seam between magnet cubes, where the magnetisation has a kink.
     """
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
