@@ -290,7 +290,7 @@ class UniversalEstimator:
     def undo(self) -> str:
         """Revert the last calibration step; return a text for the user."""
         if not self.undoable:
-            return "nothing to undo: the model has not been calibrated on this page yet"
+            return "nothing to undo: the model has learnt nothing here yet"
         step = self._states.pop().step
         self._use(self.learnt)
         return f"undone: {step}"
