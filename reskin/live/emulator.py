@@ -1,6 +1,8 @@
-"""An emulated board, which sends the bytes of a capture or a simulation to a pseudo-terminal or TCP socket.
+"""An emulated board: a process that sends the bytes that a real board would send.
 
-Faults, such as a stuck chip or an unplugged cable, can be injected.
+The bytes are those of a recorded capture or of a simulation. They are sent to a pseudo-terminal or to a TCP socket,
+from which other programs read them as from a serial port. Faults can be added to the bytes, such as a chip that is
+stuck or a cable that is unplugged.
 """
 
 import os
@@ -37,26 +39,30 @@ from reskin.simulation.protocols import LIFTED_MM, Plan, Walk
 from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
-SEED = 2021  # default seed of a simulation, if the scene's YAML file has none
-TOUCH_PROTOCOL = "log"  # touches with pauses between them, similar to manual use
+SEED = 2021  # seed of a simulation, if the scene's YAML file does not set a seed
+TOUCH_PROTOCOL = "log"  # name of the protocol with touches and pauses between them, similar to a user's touches
 
-ROBOT_PASSES_N = 2  # passes of an emulated robot over the 65 places of the grid
-# For each press, an emulated robot stays above the skin for LIFTED_S, moves down or up for MOVING_S each, and presses
-# for PRESSING_S. Before the first press, it waits for ROBOT_QUIET_S, because the first frames are lost if the port is
-# opened late.
+ROBOT_PASSES_N = 2  # number of passes of an emulated robot over the 65 places of the grid
+# For each press, an emulated robot moves down for MOVING_S, presses for PRESSING_S, moves up for MOVING_S, and stays
+# above the skin for LIFTED_S. Before the first press, it waits for ROBOT_QUIET_S, because a reader that opens the port
+# late does not receive the first frames.
 LIFTED_S, MOVING_S, PRESSING_S, ROBOT_QUIET_S = 0.12, 0.02, 0.1, 4.0
 ROBOT_RATE_HZ = 100.0
-AT_REST = 0.999  # an emulated robot is at rest while the force is at least this fraction of the press's largest force
+# An emulated robot is considered to be at rest while the force is at least this fraction of the largest force of the
+# press.
+AT_REST = 0.999
 
 START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
-CRLF_TEMPERATURE_degC = 34.513275  # as float32, this number contains the bytes 0D 0A
+# Fault `crlf`: as a float32, this temperature contains the bytes 0D 0A, which also mark the end of a frame.
+CRLF_TEMPERATURE_degC = 34.513275
 FULL_SCALE_uT = 50_000.0  # largest field that a chip can measure
-WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolution, 0.15 uT per step
-MAGNET_uT = 400.0
-HOT_degC = 150.0
-CLOCK_JUMP_S = 3600.0
-SLOW_FRAMES_N = 3  # fault `slow-chips`: each chip has a new reading in every third frame only, and the chips take turns
+WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolution, which is 0.15 uT per step
+MAGNET_uT = 400.0  # fault `magnet`: change of the field along z
+HOT_degC = 150.0  # fault `too-hot`: temperature
+CLOCK_JUMP_S = 3600.0  # fault `clock-jump`: change of the time
+# Fault `slow-chips`: each chip has a new reading only in every third frame, and the chips take turns.
+SLOW_FRAMES_N = 3
 VALUE_FAULTS = (
     "failed-read", "zeros", "chip-reset", "stuck", "slow-chips", "saturated", "int16-wrap", "magnet", "too-hot", "crlf",
     "clock-jump",
@@ -64,36 +70,37 @@ VALUE_FAULTS = (
 BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
 
-TICK_S = 0.1  # longest time until `play` reacts to event `stop`
-# If sending is blocked for longer than this time, all later frames are delayed. If it is blocked for a shorter time,
-# `play` catches up.
+TICK_S = 0.1  # longest time until `play` notices that the event `stop` was set
+# Sending is blocked while the reader does not read. If it was blocked for longer than this time, all later frames are
+# delayed. If it was blocked for a shorter time, `play` sends the next frames faster until it has caught up.
 LATE_MAX_S = 0.1
-BATCH_MAX_N = 256  # maximum number of overdue frames that are sent at once
+BATCH_MAX_N = 256  # largest number of overdue frames that are sent at once
 HOST = "127.0.0.1"
 TCP_PORT_MAX = 65535
 
 
 @dataclass(frozen=True)
 class Script:
-    """A byte stream to send: decoded frames, the bytes of each frame (a piece), and the time when each piece is due."""
+    """The byte stream that an emulated board sends, and the time at which each frame is due."""
 
-    source: Source
-    wire: Wire
-    frames: Frames
-    pieces: list[bytes]
-    t_s: Float64[np.ndarray, " f"]  # due time of each piece, from the start of the script
-    # Maps the index of a piece to the time for which the board is unplugged before this piece is sent.
+    source: Source  # whether the stream was recorded or simulated
+    wire: Wire  # wire format of the bytes
+    frames: Frames  # the decoded frames
+    pieces: list[bytes]  # the bytes of each frame
+    t_s: Float64[np.ndarray, " f"]  # time at which each piece is due, from the start of the script
+    # maps the index of a piece to the time for which the board is unplugged before this piece is sent
     unplugged_s: dict[int, float] = field(default_factory=dict)
-    # True x_mm, y_mm and F_N of each frame; NaN without contact. None if the true contacts are unknown.
+    # True x_mm, y_mm and F_N in each frame, which are NaN in frames without contact. The value is None if the true
+    # contacts are unknown, as for a recorded capture.
     true_contacts: Float64[np.ndarray, "f 3"] | None = None
-    presses_per_pass_n: int | None = None  # if a robot presses the skin
+    presses_per_pass_n: int | None = None  # number of presses in one pass of a robot; None if no robot presses the skin
 
     def __len__(self) -> int:
         return len(self.pieces)
 
     @property
     def duration_s(self) -> float:
-        """Time after which the first frame is sent again when the script is sent in a loop."""
+        """Time from the start of the script until it starts again, if it is sent in a loop."""
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
@@ -102,11 +109,12 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
 
     Parameters
     ----------
-    source : folder of a capture, `nominal` (the nominal skin), or the YAML file of a scene with a section `simulate`
-    board : name of a simulated board, for `nominal`; each name gives another board with another skin. Default: the
-        first board.
-    robot : whether a robot presses the nominal skin at the places of the grid; otherwise, the skin is touched at random
-        places
+    source : folder of a capture, the YAML file of a scene with a section `simulate`, or `nominal`, which stands for a
+        simulation with the nominal settings
+    board : name of the simulated board, which is allowed only for the source `nominal`. For each name, another board
+        with another skin is drawn. By default, the first board of the simulation is used.
+    robot : whether a robot presses the skin at the places of the grid, which is allowed only for the source `nominal`.
+        By default, the skin is touched at random places.
     """
     folder = Path(source)
     if (board is not None or robot) and source != NOMINAL_SOURCE:
@@ -131,7 +139,10 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
 
 
 def read_capture(folder: Path) -> Script:
-    """Create a script from a recorded byte stream, or from an SD card log, whose readings are encoded as frames."""
+    """Create a script from a capture, which contains either a byte stream or the log of an SD card.
+
+    The bytes of a stream are sent unchanged. The readings in a log are encoded as frames of a byte stream.
+    """
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
@@ -146,16 +157,22 @@ def read_capture(folder: Path) -> Script:
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
-    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second frame
+    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames become part of the second frame's piece
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
 
 class RobotPresses(Walk):
-    """Presses of an emulated robot: passes over the grid in random order, as one recording like protocol `walk`."""
+    """Protocol of the presses of an emulated robot, which presses all places of the grid in each pass.
+
+    The order of the places is random. Like protocol `walk`, the result is one continuous recording.
+    """
 
     def plan(self, rng: np.random.Generator, skin_mm: tuple[float, float]) -> Plan:
-        """Draw the order of the places and the depth of each press; each frame is one stop, as in protocol `walk`."""
+        """Draw the order of the places and the depth of each press.
+
+        As in protocol `walk`, the plan is a single indentation, in which each frame is one stop.
+        """
         lifted_n, moving_n, pressing_n = (round(s * self.rate_hz) for s in (LIFTED_S, MOVING_S, PRESSING_S))
         ramp = np.arange(1, moving_n + 1) / (moving_n + 1)
         share = np.concatenate([ramp, np.ones(pressing_n), ramp[::-1]])
@@ -173,11 +190,18 @@ class RobotPresses(Walk):
 def simulate(
     section: Mapping[str, Any], seed: int, where: str, *, board: str | None = None, robot: bool = False
 ) -> Script:
-    """Create a script by simulating a skin as section `simulate` of a scene describes.
+    """Create a script by simulating a skin.
 
-    Protocol `log` is simulated if the section has it; otherwise, the scan over a grid of places. `board` is the name of
-    the board (default: the first board of the scene). With `robot`, the touches of protocol `log` are replaced by
-    presses of a robot.
+    If the settings contain the protocol `log`, this protocol is simulated. Otherwise, the main protocol is simulated,
+    in which a grid of places is pressed.
+
+    Parameters
+    ----------
+    section : settings of the simulation, as in section `simulate` of a scene
+    seed : seed of all random generators
+    where : name of the source for error messages
+    board : name of the board; the first board of the settings by default
+    robot : whether the touches of protocol `log` are replaced by presses of a robot
     """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
@@ -193,23 +217,25 @@ def simulate(
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
     script = _binary_script("simulated", capture.b_uT, capture.temperature_degC, capture.arrived_s[chunk_i])
     script = replace(script, true_contacts=true_contacts_of(capture))
-    if robot:  # frames are due one by one, so that each row of the robot's log has the time of its frame
+    if robot:
+        # The frames are due one by one instead of in chunks, so that each row of the robot's log has its own time.
         even_s = np.arange(len(script)) / ROBOT_RATE_HZ
         script = replace(script, t_s=even_s, presses_per_pass_n=len(points_mm()))
     return script
 
 
 def true_contacts_of(capture: SimulatedCapture) -> Float64[np.ndarray, "f 3"] | None:
-    """Return the true x_mm, y_mm and F_N of each frame, NaN without contact; None for a protocol with a robot.
+    """Return the true x_mm, y_mm and F_N in each frame; the values are NaN in frames without contact.
 
-    In protocol `log`, the probe log has one dwell per frame in contact, and its places, forces and times have no
-    errors. In other protocols, the probe log has the errors of the simulated robot.
+    The true contacts are taken from the probe log of the capture, which has one dwell per frame in contact and no
+    errors in protocols of kind `walk`, such as `log`. In all other protocols, the probe log contains the errors of the
+    simulated robot. The result is then None.
     """
     if capture.card_rate_hz is None:
         return None
     log, rate_hz = capture.probe, capture.card_rate_hz
     true = np.full((len(capture.b_uT), 3), np.nan)
-    # The dwell of frame i begins half a frame before the frame, at (i + 0.5) / rate.
+    # Frame i is at the time (i + 1) / rate, and its dwell begins half a frame earlier, at (i + 0.5) / rate.
     frame_i = np.rint(log.t_start_s[log.contact] * rate_hz - 0.5).astype(int)
     true[frame_i] = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[log.contact]
     return true
@@ -221,7 +247,7 @@ def _binary_script(source: Source, b_uT: np.ndarray, temperature_degC: np.ndarra
 
 
 def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
-    """Encode frames in a wire format of the firmware; return the bytes of each frame."""
+    """Encode frames in one of the firmware's wire formats; return the bytes of each frame."""
     data = encode(frames, wire)
     if wire in TEXT_WIRES:
         return data.splitlines(keepends=True)
@@ -230,15 +256,15 @@ def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
 
 
 class Fault(NamedTuple):
-    """A fault to inject, and the time in the script at which it occurs."""
+    """A fault that is added to a script."""
 
     name: str
-    start_s: float
+    start_s: float  # time from the start of the script
     duration_s: float
 
 
 def parse_fault(text: str) -> Fault:
-    """Parse NAME, NAME@START_S or NAME@START_S+DURATION_S.
+    """Parse the text of the option `--fault`: NAME, NAME@START_S or NAME@START_S+DURATION_S.
 
     >>> parse_fault("stall@2.5+1")
     Fault(name='stall', start_s=2.5, duration_s=1.0)
@@ -253,7 +279,10 @@ def parse_fault(text: str) -> Fault:
 
 
 def inject(script: Script, fault: Fault) -> Script:
-    """Return a copy of the script with a fault. Faults of a single chip affect chip 1, or the only chip of a board."""
+    """Return a copy of the script in which a fault occurs.
+
+    A fault of a single chip affects chip 1. If the board has only one chip, the fault affects this chip.
+    """
     inside = (script.t_s >= fault.start_s) & (script.t_s < fault.start_s + fault.duration_s)
     if not inside.any():
         raise ParamsError(
@@ -278,7 +307,7 @@ def inject(script: Script, fault: Fault) -> Script:
 
 
 def _change_values(frames: Frames, fault: str) -> None:
-    """Apply a fault to the measured values of all given frames, in place."""
+    """Change the values in the given frames as a fault would change them. The frames are changed in place."""
     b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
     chip_i = min(1, temperature_degC.shape[1] - 1)
     match fault:
@@ -300,7 +329,8 @@ def _change_values(frames: Frames, fault: str) -> None:
         case "int16-wrap":
             b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
         case "magnet":
-            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated only about z, so all chips measure the same change of Bz
+            # All chips measure the same change of Bz, because chips are rotated only about z.
+            b_uT[:, :, 2] += MAGNET_uT
         case "too-hot":
             temperature_degC[:, chip_i] = HOT_degC
         case "crlf":
@@ -312,7 +342,7 @@ def _change_values(frames: Frames, fault: str) -> None:
 
 
 def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
-    """Apply a fault of the connection to the bytes of all given frames."""
+    """Return the bytes of the given frames, changed as a fault of the connection would change them."""
     if fault == "repeated":
         return [2 * piece for piece in pieces]
     if fault == "dropped":
@@ -324,7 +354,10 @@ def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
 
 
 class EmulatedPort:
-    """Base class of emulated ports, which send bytes to a reader: a pseudo-terminal or a TCP server."""
+    """Base class of emulated ports, which are pseudo-terminals or TCP servers.
+
+    The board sends bytes to the port, and another program, the reader, reads them from the port.
+    """
 
     name: str
 
@@ -351,7 +384,11 @@ class EmulatedPort:
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal. A symbolic link, if any, has the same name after the board is plugged in again."""
+    """A pseudo-terminal, which a reader opens like a serial port.
+
+    When the board is plugged in again, the operating system may choose another name for the pseudo-terminal. A symbolic
+    link to the pseudo-terminal, if requested, keeps its name.
+    """
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):
@@ -374,7 +411,8 @@ class Terminal(EmulatedPort):
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # A reader that opens the terminal flushes its buffer. Packet mode reports this flush to this process.
+        # A reader that opens the pseudo-terminal discards the data in its buffer. In packet mode, this process is
+        # informed of this, and so notices that a reader has opened the port.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
@@ -386,7 +424,8 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            # Remove the link before closing the terminal, because afterwards another emulator may create the same link.
+            # Remove the link before the pseudo-terminal is closed. Once it is closed, another emulator may create a
+            # link with the same name, which must not be removed.
             self._link.unlink(missing_ok=True)
         for descriptor in self._open_ends:
             os.close(descriptor)
@@ -397,7 +436,7 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                # use only the first byte, which is the packet status, and ignore the data that the reader sends
+                # The first byte is the packet status. The other bytes are data from the reader, which are ignored.
                 if readable:
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
@@ -446,7 +485,11 @@ class TcpServer(EmulatedPort):
 
 
 def make_port(kind: str) -> EmulatedPort:
-    """Create the port that `kind` describes: `pty`, `tcp`, `tcp:NUMBER`, or the path of a link to a pseudo-terminal."""
+    """Create an emulated port.
+
+    The text `kind` is `pty` for a pseudo-terminal, the path of a link that is created to a pseudo-terminal, `tcp` for a
+    TCP server, or `tcp:NUMBER` for a TCP server with this port number.
+    """
     name, _, number = kind.partition(":")
     if kind == "pty":
         return Terminal()
@@ -457,7 +500,7 @@ def make_port(kind: str) -> EmulatedPort:
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))
     raise ParamsError(
-        f"--port: {kind} is none of pty, tcp, tcp:PORT and ./NAME (a link with this name is created). Try: pty"
+        f"--port: {kind} is not one of pty, tcp, tcp:PORT and ./NAME (creates a link with this name). Try: --port pty"
     )
 
 
@@ -474,14 +517,15 @@ def play(
 
     Parameters
     ----------
+    script, port : what is sent, and where
     stop : event that another thread sets to end sending
-    speed : factor by which due times are divided; with `math.inf`, the script is sent as fast as the reader reads
-    loop : whether to restart the script at its end and whenever a reader opens the port
-    on_sent : called with the index of the last piece that was sent
+    speed : factor by which all due times are divided. With `math.inf`, the script is sent as fast as the reader reads.
+    loop : whether the script starts again at its end, and whenever a reader opens the port
+    on_sent : function that is called after each batch with the index of the last piece of the batch
 
     Returns
     -------
-    Number of bytes sent.
+    The number of bytes that were sent.
     """
     sent_n, start_s, replugged = 0, time.monotonic(), False
     while not stop.is_set():
@@ -491,7 +535,7 @@ def play(
                 port.unplug()
                 stop.wait(script.unplugged_s[i])
                 port.plug_in()
-                replugged = True  # do not restart the script when the port is opened next
+                replugged = True  # the script must not start again when the reader opens the port again
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
@@ -512,7 +556,11 @@ def play(
 
 
 def _end_of_batch(script: Script, first: int, script_s: float) -> int:
-    """Return the index after the last piece of the batch to send now; a batch ends before the board is unplugged."""
+    """Return the index after the last piece of the batch that is sent next.
+
+    The batch starts with the piece `first` and contains all pieces that are due at the time `script_s`. If the board is
+    to be unplugged before one of these pieces, the batch ends before this piece.
+    """
     last = first + 1
     end = min(len(script), first + BATCH_MAX_N)
     while last < end and script.t_s[last] <= script_s and last not in script.unplugged_s:
@@ -521,7 +569,7 @@ def _end_of_batch(script: Script, first: int, script_s: float) -> int:
 
 
 class EmulatedBoard:
-    """A board that this process emulates, with its port and its current true contact."""
+    """The emulated board at a port, and the true contact in the frame that it sent last."""
 
     def __init__(self, script: Script, port: EmulatedPort) -> None:
         self.port, self.source = port.name, script.source
@@ -536,7 +584,10 @@ class EmulatedBoard:
         self._sent_i = piece_i
 
     def true_contact(self) -> tuple[float, float, float]:
-        """Return the true x_mm, y_mm and F_N of the last frame that was sent; NaN without contact, or if unknown."""
+        """Return the true x_mm, y_mm and F_N in the last frame that was sent.
+
+        The values are NaN if the skin is not touched, or if the true contacts are unknown.
+        """
         if self._true_contacts is None:
             return (np.nan, np.nan, np.nan)
         x_mm, y_mm, force_N = self._true_contacts[self._sent_i].tolist()
@@ -544,9 +595,10 @@ class EmulatedBoard:
 
 
 class RobotLog:
-    """Appends a row for each sent frame to a CSV file, as the program of a robot does for `reskin record --labels`.
+    """The log of an emulated robot: a CSV file to which a row is appended for each frame that was sent.
 
-    Columns: `unix_s`, `phase` (`noload`, `moving` or `contact`), `pass_i`, `x_mm`, `y_mm`, `Fz_N`.
+    The file has the format that a robot's program must write for `reskin record --labels`. Its columns are `unix_s`,
+    `phase` (`noload`, `moving` or `contact`), `pass_i`, `x_mm`, `y_mm` and `Fz_N`.
     """
 
     def __init__(self, script: Script, file: Path, speed: float = 1.0) -> None:
@@ -555,14 +607,16 @@ class RobotLog:
         self._cells = _robot_cells(script.true_contacts, script.presses_per_pass_n)
         self._due_s = script.t_s / speed
         self._sent_i, self._last_s = -1, 0.0
-        self._stream = file.open("w", encoding="utf-8", buffering=1)  # a buffer of one line
+        self._stream = file.open("w", encoding="utf-8", buffering=1)  # each line is written immediately
         self._stream.write("unix_s,phase,pass_i,x_mm,y_mm,Fz_N\n")
 
     def __call__(self, piece_i: int) -> None:
         if piece_i < self._sent_i:  # the script has restarted
             self._sent_i = -1
         now_s = time.time()
-        for i in range(self._sent_i + 1, piece_i + 1):  # late frames are sent together, but were due one after another
+        # Several late frames may have been sent together. Their rows have the times at which they were due, relative to
+        # the last of these frames.
+        for i in range(self._sent_i + 1, piece_i + 1):
             self._last_s = max(self._last_s, now_s - float(self._due_s[piece_i] - self._due_s[i]))
             self._stream.write(f"{self._last_s:.6f},{self._cells[i]}\n")
         self._sent_i = piece_i
@@ -572,17 +626,18 @@ class RobotLog:
 
 
 def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: int) -> list[str]:
-    """Return for each frame the cells that follow the time in its row: phase, pass, place and force."""
+    """Return the cells that follow the time in the row of each frame: phase, pass, place and force."""
     contact = np.isfinite(true_contacts[:, 0])
-    edges = np.flatnonzero(np.diff(contact, prepend=False, append=False)).tolist()  # starts and ends in turn
+    # The first frame of a press, the frame after its end, the first frame of the next press, and so on.
+    edges = np.flatnonzero(np.diff(contact, prepend=False, append=False)).tolist()
     cells = ["noload,0,,,"] * len(contact)
     for press_i, (first, end) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
         force_max_N = true_contacts[first:end, 2].max()
         for i, (x_mm, y_mm, force_N) in enumerate(true_contacts[first:end].tolist(), first):
             phase = "contact" if force_N >= AT_REST * force_max_N else "moving"
             cells[i] = f"{phase},{press_i // presses_per_pass_n},{x_mm:g},{y_mm:g},{force_N:.4f}"
-        # The rows without contact after a press have the pass of the next press, so that each no-load dwell is one run
-        # of rows.
+        # The rows without contact after a press belong to the pass of the next press. Otherwise, the no-load dwell
+        # between two passes would be split into two.
         following = edges[2 * press_i + 2] if 2 * press_i + 2 < len(edges) else len(contact)
         pass_i = (press_i + 1) // presses_per_pass_n
         cells[end:following] = [f"noload,{pass_i},,,"] * (following - end)
@@ -590,9 +645,14 @@ def _robot_cells(true_contacts: Float64[np.ndarray, "f 3"], presses_per_pass_n: 
 
 
 class TouchPrinter:
-    """Prints the true place and the largest true force of each touch when the touch's first frame has been sent.
+    """A function that prints the true place and the largest true force of each touch.
 
-    Raises `ParamsError` if the true contacts of the script are unknown.
+    The text of a touch is printed when the first frame of the touch has been sent.
+
+    Raises
+    ------
+    ParamsError
+        If the true contacts of the script are unknown.
     """
 
     def __init__(self, script: Script, source: str, say: Callable[[str], object]) -> None:
@@ -600,7 +660,8 @@ class TouchPrinter:
             remedy = "Use nominal, or a simulated scene with protocol log."
             raise ParamsError(f"--true-places: the true places of {source} are unknown. {remedy}")
         contact = np.isfinite(script.true_contacts[:, 0])
-        edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))  # starts and ends in turn
+        # The first frame of a touch, the frame after its end, the first frame of the next touch, and so on.
+        edges = np.flatnonzero(np.diff(contact, prepend=False, append=False))
         self._texts = {}
         for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             x_mm, y_mm, force_N = script.true_contacts[first:end].max(axis=0)
@@ -618,7 +679,7 @@ class TouchPrinter:
 
 @contextmanager
 def playing(script: Script) -> Iterator[EmulatedBoard]:
-    """Send a script in a loop from another thread; yield the emulated board."""
+    """Send a script in a loop in another thread, as long as the `with` block runs; yield the emulated board."""
     port, stop = (Terminal() if hasattr(os, "openpty") else TcpServer()), threading.Event()
     board = EmulatedBoard(script, port)
     options = {"loop": True, "on_sent": board.note_sent}

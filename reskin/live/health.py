@@ -1,4 +1,7 @@
-"""Alarms of a running board: faults of the data, a low frame rate, and external magnetic fields."""
+"""Alarms of a running board.
+
+An alarm is raised if the data have a fault, if the frame rate is low, or if an external magnetic field is detected.
+"""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,22 +14,33 @@ from reskin.board.rates import REPEATED_MAX, RepeatCounter
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
-BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
-REPEATS_FRAMES_N = 400  # frames per check for repeated readings of single chips, whose share is small
-RATE_WINDOW_S = 1.0
-SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
-# weight of a new rate in the running mean, which is the usual rate; its time constant is 25 s at 400 Hz
+# Number of frames in one check for faults that are visible only in several frames. For a board with five chips, these
+# frames take 0.1 s.
+BATCH_FRAMES_N = 40
+# Number of frames in one check for repeated readings of single chips. This number is larger, because only a small
+# fraction of the readings may be repeated.
+REPEATS_FRAMES_N = 400
+RATE_WINDOW_S = 1.0  # the frame rate is measured over this time
+# Frames are considered to be missing if the frame rate is below this fraction of the usual rate. The value is assumed.
+SLOW_FRACTION = 0.7
+# The usual rate is a running mean of the measured rates, in which a new rate has this weight. At 400 Hz, the time
+# constant of the running mean is 25 s.
 USUAL_GAIN = 1e-4
-ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
-# A field change dB has an external cause if only a small fraction of |dB|^2, below this limit, is not common to all
-# chips. For all presses of scenes `quick` and `lab`, this fraction is 0.45 or more.
+ACTIVE_S = 2.0  # an alarm remains active for this time after its last occurrence
+# A press changes the field differently at each chip, whereas an external field is nearly the same at all chips. A field
+# change dB is attributed to an external field if the part of |dB|^2 that is not common to all chips is below this
+# fraction. For all presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
-COMMON_MIN_uT = 50.0  # smallest external field that raises an alarm; about the strength of the earth's field
+# Smallest external field that raises an alarm. It is about as strong as the earth's field.
+COMMON_MIN_uT = 50.0
 READINGS_REPEAT = f"over {100 * REPEATED_MAX:.0f} % of readings repeat: the board sends faster than its chips convert"
-# if external fields are expected, a field that is larger than this multiple of their expected size raises an alarm
+# If external fields are expected, only a field that is larger than this multiple of their expected size raises an
+# alarm.
 EXTERNAL_SDS = 3.0
 
-# Default policy for live readings. Saturated readings are dropped, because a controller would use a wrong estimate.
+# What is done with faulty frames by default: "drop" means that they get no estimate, and "flag" means that they only
+# raise an alarm. Frames with saturated readings are dropped, because their estimates would be wrong and a robot's
+# controller might use them.
 LIVE_POLICY = FaultPolicy(
     failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
     constant_channel="flag", chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
@@ -36,37 +50,41 @@ LIVE_POLICY = FaultPolicy(
 
 @dataclass
 class Alarm:
-    """An alarm, with the number of affected frames or bytes, and the unix times of its first and last occurrence."""
+    """An alarm of a board, which may have occurred several times."""
 
     name: str
-    count_n: int
-    first_s: float
-    last_s: float
-    action: Action
+    count_n: int  # number of affected frames or bytes
+    first_s: float  # unix time of the first occurrence
+    last_s: float  # unix time of the last occurrence
+    action: Action  # what is done with the affected frames
 
 
 class Health:
-    """Detects faults in the frames of a running board, and stores its alarms and its frame rate."""
+    """The health of a running board: detects faults in its frames, stores its alarms, and measures its frame rate."""
 
     def __init__(self, chips_n: int, policy: FaultPolicy = LIVE_POLICY) -> None:
         self.policy = policy
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        # Fewer equal steps than in ingestion are enough for an estimate of a chip's LSB. In ingestion, a wrong estimate
-        # may reject a whole capture, but here it causes only an alarm, which has no lasting effect.
+        # The detector estimates a chip's resolution from equal steps between readings. Here it needs fewer equal steps
+        # than in the ingestion of a capture. In ingestion, a wrong estimate may cause a whole capture to be rejected,
+        # but here it causes only an alarm, which has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._repeats = RepeatCounter(chips_n)
-        self._frames_repeat = False  # whether whole frames were repeated since the last check of single readings
-        self._stuck = False  # whether frames are dropped now, because a chip was stuck at the end of the last batch
+        # whether whole frames were repeated since the last check for repeated readings of single chips
+        self._frames_repeat = False
+        # Whether a chip was stuck at the end of the last batch. If so, all frames are dropped until the next batch.
+        self._stuck = False
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 
     def note(self, name: str, count_n: int, now_s: float, fault: str | None = None) -> None:
-        """Add `count_n` occurrences to an alarm, which is created if necessary.
+        """Add `count_n` affected frames or bytes to the alarm with this name. Create the alarm if it does not exist.
 
-        The action that the alarm shows is that of the policy for `fault`, or `flag` if no fault is given.
+        The policy determines the action for `fault`, which is displayed with the alarm. If no fault is given, the
+        action is `flag`.
         """
         if count_n:
             action: Action = getattr(self.policy, fault) if fault is not None else "flag"
@@ -78,9 +96,10 @@ class Health:
         return [alarm for alarm in list(self.alarms.values()) if now_s - alarm.last_s <= ACTIVE_S]
 
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
-        """Check the next frames for faults; return the mask of frames that the policy does not drop.
+        """Check the next frames for faults; return for each frame whether it may be used.
 
-        Faults of single readings are detected immediately. Faults that span several frames are detected once per
+        A frame may be used unless it has a fault for which the policy is to drop the frame. Faults that are visible in
+        a single reading are detected immediately. Faults that are visible only in several frames are detected once per
         `BATCH_FRAMES_N` frames.
         """
         readings = find_reading_faults(frames.b_uT, frames.temperature_degC)
@@ -89,7 +108,8 @@ class Health:
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")
         faulty |= self._note_chips("field at the end of the range", readings.saturated, now_s, "saturated")
         self._measure_rate(len(frames), now_s)
-        self._batch.append(frames.where(~readings.faulty_rows))  # leave out failed reads, which would hide a stuck chip
+        # Frames with failed reads are left out of the batch, because they would hide that a chip is stuck.
+        self._batch.append(frames.where(~readings.faulty_rows))
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
             self._note_batch(batch, self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
@@ -104,10 +124,14 @@ class Health:
     ) -> None:
         """Raise an alarm if all chips measure nearly the same field change.
 
-        In this case, the cause is an external field or a rotation of the board, and not a press.
+        Such a field change is not caused by a press, but by an external field or by a rotation of the board.
 
-        `turn` rotates the axes of each chip to those of the board. External fields of size `expected_uT` are expected
-        and raise no alarm.
+        Parameters
+        ----------
+        db_uT : the latest field change
+        turn : rotation matrix of each chip, from the axes of the chip to the axes of the board
+        now_s : unix time of the field change
+        expected_uT : size of external fields that are expected and raise no alarm
         """
         b_uT = np.einsum("kij,kj->ki", turn, db_uT.reshape(-1, 3).astype(np.float64))
         common_uT = b_uT.mean(axis=0)
@@ -128,7 +152,10 @@ class Health:
             self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
-        """Raise an alarm if single chips repeat their previous reading; repeated whole frames have another alarm."""
+        """Raise an alarm if single chips repeat their previous reading.
+
+        If whole frames are repeated, this alarm is not raised, because there is another alarm for repeated frames.
+        """
         self._repeats.feed(batch.b_uT)
         self._frames_repeat |= bool(faults.repeated.any())
         if self._repeats.frames_n >= REPEATS_FRAMES_N:
@@ -139,7 +166,10 @@ class Health:
             self._frames_repeat = False
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
-        """Add a fault to the alarm of each affected chip; return the mask of the frames that the policy drops."""
+        """Raise an alarm for each chip that has a fault; return for each frame whether the policy is to drop it.
+
+        `mask` states whether each chip has the fault in each frame.
+        """
         for chip_i in np.flatnonzero(mask.any(axis=0)):
             self.note(f"chip {chip_i}: {name}", int(mask[:, chip_i].sum()), now_s, fault)
         return np.asarray(mask.any(axis=1)) & (getattr(self.policy, fault) != "flag")
@@ -147,7 +177,7 @@ class Health:
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
         """Measure the frame rate over one second, and raise an alarm if it is low.
 
-        Frames have no numbers, so only a low rate shows that frames are missing.
+        Frames are not numbered. Therefore, only a low rate can show that frames are missing.
         """
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n

@@ -1,8 +1,8 @@
-"""Ambient fields: the earth's field and the field of an iron ball. SI units.
+"""Ambient fields: the earth's field, and the field that an iron ball adds. All values are in SI units.
 
-In a uniform field, an iron ball produces the field of one dipole. Near magnetic dipoles, such as those of a skin, it
-produces the field of image dipoles and image poles. The effect of the ball on the magnetisation of these dipoles is
-neglected.
+In a uniform field, an iron ball adds the field of a single dipole at the centre of the ball. In the field of nearby
+dipoles, such as those of a skin, the ball adds the field of an image dipole and of image poles for each of the dipoles.
+In reality, the field of the ball also changes the magnetisation of the skin. This effect is neglected.
 """
 
 import numpy as np
@@ -12,13 +12,13 @@ from scipy.constants import micro, mu_0
 from reskin.physics import magnet
 from reskin.physics.magnet import MU0_4PI, Dipoles
 
-# The earth's field at a middle latitude; its magnitude is between 25 and 65 uT over the globe (IGRF). x is north, z is
-# up.
+# The earth's field at a middle latitude, with x towards the north and z upwards. On the surface of the earth, the
+# magnitude of the field is between 25 and 65 uT (IGRF).
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])
-# Relative permeability of soft iron. With this value, the moment of a ball is 0.3 % smaller than with infinite
-# permeability.
+# Relative permeability of soft iron. Its exact value hardly matters: the moment of a ball with this permeability is
+# only 0.3 % smaller than the moment of a ball with infinite permeability.
 IRON_MU_R = 1000.0
 
 
@@ -29,7 +29,7 @@ def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 
 
 
 def ball_moment(radius_m: float, b_T: Float[np.ndarray, "3"], mu_r: float = IRON_MU_R) -> Float[np.ndarray, "3"]:
-    """Return the moment in A m^2 of a ball in a uniform field.
+    """Return the magnetic moment in A m^2 of an iron ball in the uniform field `b_T`.
 
     For a ball of radius a in the field B, the moment is (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B.
     """
@@ -44,7 +44,10 @@ def ball_field(
     radius_m: float,
     mu_r: float = IRON_MU_R,
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T that a ball adds to the uniform field `b_T`, at points outside the ball."""
+    """Return the field in T that an iron ball adds to the uniform field `b_T`.
+
+    The observers must be outside the ball.
+    """
     return magnet.field(centre_m[None], ball_moment(radius_m, b_T, mu_r)[None], observers_m)
 
 
@@ -57,9 +60,12 @@ def ball_images(
 ) -> Float[np.ndarray, "o 3"]:
     """Return the field in T that a ball of infinite permeability adds to the field of dipoles outside the ball.
 
-    Each dipole has an image dipole and a magnetic pole at its inverse point in the ball, and an opposite pole at the
-    ball's centre. This is the solution for a conducting, uncharged sphere in electrostatics (Jackson, chapter 2). Close
-    to a skin, the field of a single dipole at the ball's centre would be much too small.
+    The inverse point of a dipole is on the line from the ball's centre to the dipole, at the distance a^2 / d from the
+    centre, where a is the radius of the ball and d is the distance of the dipole. For each dipole, the ball adds the
+    field of an image dipole and of a magnetic pole at the inverse point, and of an opposite pole at the ball's centre.
+    This is the solution for an uncharged conducting sphere in electrostatics (Jackson, chapter 2). The simpler model of
+    `ball_field`, a single dipole at the ball's centre, would give a much too small field if the ball is close to a
+    skin.
     """
     away_m = dipoles[0] - centre_m
     distance_m = np.linalg.norm(away_m, axis=1, keepdims=True)

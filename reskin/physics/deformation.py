@@ -1,10 +1,13 @@
-"""Finite deformation of the skin under a tip, computed in small steps and tabulated. SI units.
+"""Finite deformation of the skin under a spherical tip, computed in small steps and tabulated.
 
-The linear solution of `layer` is valid only for small depths. Here the depth increases in small steps (12 to 24 for the
-usual depths). Each step solves for the pressure change that keeps the deformed surface on the spherical tip, and
-displaces the material by the linear solution for this pressure. The result is axisymmetric. If all lengths are in units
-of the thickness, it depends only on R/h (tip radius over thickness). Therefore, a few tables for different R/h suffice
-for skins of any thickness, and an indentation is simulated by interpolation between the tables.
+All values are in SI units. The linear solution of module `layer` is valid only for small depths. In this module, the
+depth is therefore increased in small steps (12 to 24 steps for the usual depths). Each step first solves for the change
+of the pressure that keeps the deformed surface of the skin on the surface of the tip. It then displaces the material by
+the linear solution for this change of the pressure.
+
+The deformation is axisymmetric around the tip. If all lengths are divided by the thickness of the skin, the deformation
+depends only on the ratio R/h of the tip radius to the thickness. Therefore, a few tables for different values of R/h
+suffice for skins of any thickness. To simulate an indentation, the deformation is interpolated between these tables.
 """
 
 from dataclasses import asdict, dataclass
@@ -24,42 +27,56 @@ from reskin.physics import layer
 from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
 from reskin.physics.magnet import Dipoles
 
-# Depth of a step in units of `depth_scale`; about 0.05 mm for a skin of 2 mm. If the step is halved, the field change
-# dB changes by 0.3 % on a slipping base and by 0.6 % on a bonded base.
+# Increase of the depth in one step, in units of `depth_scale`; about 0.05 mm for a skin with a thickness of 2 mm. If
+# the steps were half as large, the field change dB would differ by 0.3 % on a slipping base and by 0.6 % on a bonded
+# base.
 STEP = 0.025
-# Depths after each step, in units of `depth_scale`. They do not depend on the requested depths. The first step is
-# divided in three, because the contact radius grows as the square root of the depth.
+# The ladder: the depth after each step, in units of `depth_scale`. The same depths are used for all indentations. The
+# first step is divided into three, because the contact radius grows as the square root of the depth, which is fast at
+# first.
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # largest height of the bulging rim, in thicknesses; above a height of 1, waves grow as exp(kz)
-MARKERS_N = 48  # number of markers on the surface; they are denser towards the axis
-# Number of basis pressures (see `pressure_change`). With 4 or 8 instead, the positions of the markers at a depth of 1.2
-# mm change by less than 0.03 mm.
+# Largest height of the bulging rim around the tip, in thicknesses. Above a height of 1, the waves of the linear
+# solution grow as exp(kz).
+RIM_MAX = 1.2
+MARKERS_N = 48  # number of markers on the surface; the markers are denser towards the axis
+# Number of basis pressures (see `pressure_change`). With 4 or 8 basis pressures, the positions of the markers at a
+# depth of 1.2 mm would differ by less than 0.03 mm.
 PRESSURES_N = 6
-DAMPING = 1e-3  # damping of the least squares for the pressure, relative to the largest singular value
+DAMPING = 1e-3  # damping of the least-squares solution for the pressure, relative to the largest singular value
 
 
 @dataclass(frozen=True)
 class Material:
-    """Current positions (r, z) of s material points, and the deformation gradient F in cylindrical coordinates.
+    """The current state of s points of the material, in cylindrical coordinates.
 
-    `f` is the part of F in the r-z plane, and `hoop` is the circumferential stretch. The other entries of F are zero.
+    The state of a point is its position and its deformation gradient F. Because the deformation is axisymmetric, F
+    consists of a part in the r-z plane and of the circumferential stretch. Its other entries are zero.
     """
 
-    r_m: Float[np.ndarray, " s"]
-    z_m: Float[np.ndarray, " s"]
-    f: Float[np.ndarray, "s 2 2"]  # rows and columns: r, z
-    hoop: Float[np.ndarray, " s"]
+    r_m: Float[np.ndarray, " s"]  # distance from the axis
+    z_m: Float[np.ndarray, " s"]  # height above the base
+    f: Float[np.ndarray, "s 2 2"]  # part of F in the r-z plane; both rows and columns are in the order r, z
+    hoop: Float[np.ndarray, " s"]  # circumferential stretch
 
 
 def follow(
     r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], depths_m: Float[np.ndarray, " d"], press: IndentedLayer
 ) -> list[Material]:
-    """Compute how material points move while a tip indents the layer step by step; return one `Material` per depth.
+    """Compute how points of the material move while a tip indents the layer step by step.
 
-    `depths_m` are the increasing depths of the tip and start with 0, where the points are at `r_m`, `z_m`. Markers on
-    the surface are moved too, and each step solves for the pressure that moves the markers onto the tip. If the
-    pressure were computed for the surface at rest, the deformed surface would be 0.3 mm off the tip at a depth of 1.2
-    mm.
+    The function also moves markers, which are points on the surface. Each step solves for the change of the pressure
+    that moves the markers onto the tip. If the pressure were computed for the undeformed surface instead, the deformed
+    surface would be up to 0.3 mm away from the tip at a depth of 1.2 mm.
+
+    Parameters
+    ----------
+    r_m, z_m : positions of the points before the indentation
+    depths_m : depths of the tip after each step, in increasing order; the first depth is 0
+    press : the layer and the tip
+
+    Returns
+    -------
+    One `Material` per depth, which contains the given points but not the markers.
     """
     path = [with_markers(r_m, z_m, press)]
     for depth_m in map(float, depths_m[1:]):
@@ -70,27 +87,30 @@ def follow(
 def depth_scale(size: float) -> float:
     """Return the greatest depth that can be computed, in thicknesses, for R/h = `size`.
 
-    The depth must be below the thickness and below the tip radius. The result, a smooth function of `size`, is
-    therefore below 1 and below `size`.
+    A depth can be computed only if it is below the thickness and below the tip radius. The result is therefore below 1
+    and below `size`, and it is a smooth function of `size`.
     """
     return size / (1 + size**4) ** 0.25
 
 
 def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
-    """Return the depths after each step: the requested depths, and all depths of `LADDER` below the largest of them."""
+    """Return the depths at which steps end.
+
+    These are the requested depths, and all depths of the ladder that are below the largest requested depth.
+    """
     ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
     return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
 
 
 def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
-    """Return material points at rest, with F = I."""
+    """Return points of the undeformed material, so that the deformation gradient F is the identity matrix."""
     return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))
 
 
 def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
-    """Return material points at rest: first `MARKERS_N` markers on the surface, then the given points.
+    """Return points of the undeformed material: first `MARKERS_N` markers on the surface, then the given points.
 
-    The markers are inside the widest possible contact.
+    The markers are inside the contact at the greatest depth, which is the widest contact that can occur.
     """
     widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
@@ -98,12 +118,13 @@ def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pre
 
 
 def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
-    """Solve for the pressure change that moves the surface markers onto the tip at a greater depth.
+    """Solve for the change of the pressure that moves the surface markers onto the tip at a greater depth.
 
-    The first points of `material` are the markers. The pressure is a weighted sum of `PRESSURES_N` basis pressures:
-    those that the same tip would exert at contact radii up to the current one. The weights are the damped least-squares
-    solution that moves all markers inside the contact from their current positions to the tip. Damping is needed,
-    because pressure waves that are shorter than the depth hardly move markers that are already deep.
+    The first points of `material` must be the markers. The change of the pressure is a weighted sum of `PRESSURES_N`
+    basis pressures. A basis pressure is the pressure that the same tip would exert in a smaller contact, or in the
+    contact at the new depth. The weights are determined by damped least squares, such that all markers inside the
+    contact move from their current positions to the surface of the tip. Damping is needed because the solution is
+    ill-conditioned: pressure waves that are shorter than the depth hardly move markers that are already deep.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
@@ -124,9 +145,10 @@ def pressure_change(material: Material, depth_m: float, press: IndentedLayer) ->
 
 
 def displace(material: Material, change: Waves, depth_m: float, press: IndentedLayer) -> Material:
-    """Displace material points by a pressure change (midpoint rule), and update F by the chain rule at the midpoint.
+    """Displace points of the material by a change of the pressure, and update their deformation gradients F.
 
-    `depth_m` is the depth after the change; it is used only in an error message.
+    The displacement is integrated by the midpoint rule. F is updated by the chain rule at the midpoint. `depth_m` is
+    the depth after the change and is used only in an error message.
     """
     first = displacement(material.r_m, material.z_m, change)
     half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
@@ -146,61 +168,73 @@ def _gradient(u: Displacement) -> Float[np.ndarray, "s 2 2"]:
 
 
 def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
-    """Return the angle, positive from z towards r, of the rotation R in the polar decomposition F = R U."""
+    """Return the angle of the rotation R in the polar decomposition F = R U of the deformation gradient.
+
+    The angle is positive for a rotation from z towards r.
+    """
     return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
 
 
-# Tables extend this far beyond the contact radius, in thicknesses. Farther away, material on a bonded base does not
-# move, and material on a slipping base moves outward rigidly, apart from waves that decay as exp(-pi r / h). If the
-# tables ended at 4 thicknesses from the axis, the error of dB would be up to 17 %.
+# Distance in thicknesses by which the tables extend beyond the contact radius. Farther away, material on a bonded base
+# does not move, and material on a slipping base moves outward by the same distance at all heights, apart from waves
+# that decay as exp(-pi r / h). If the tables ended at 4 thicknesses from the axis, the error of dB would be up to 17 %.
 REACH = 5.0
 SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
 STENCIL_N = 4  # number of points for cubic interpolation, both between tables and between depths
-DET_F_ERROR_MAX = 0.1  # largest relative error of the volume of the material, which is incompressible
+# Largest accepted relative error of the volume of the material. The material is incompressible, so that the determinant
+# of F should be 1.
+DET_F_ERROR_MAX = 0.1
 COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which displacements are computed, relative to `reach`
-FINE_R = np.linspace(0, 1, 512)  # radii at which displacements are tabulated; fine enough for linear interpolation
-PACKAGE = Path(__file__).parent  # tables are cached in this folder, and computed again if its source files change
+# Radii at which displacements are tabulated, relative to `reach`. They are so dense that linear interpolation suffices.
+FINE_R = np.linspace(0, 1, 512)
+# The cache of the tables depends on the source files in this folder: if they change, the tables are computed again.
+PACKAGE = Path(__file__).parent
 
 
 @dataclass(frozen=True)
 class DeformationMap:
-    """Displacement and rotation of the material, tabulated by depth d, height l and radius i.
+    """A table of the displacement and the rotation of the material, as a function of depth, height and radius.
 
-    The radii are equally spaced from 0 to `reach_m`.
+    The table has d depths, l heights and i radii. The radii are equally spaced from 0 to `reach_m`.
     """
 
     thickness_m: float
     reach_m: float
     depth_m: Float[np.ndarray, " d"]  # starts with 0
-    # Last axis: displacements outward and up, in thicknesses, and tan(angle / 2) of the rotation from z towards r.
+    # The last axis has three values: the outward displacement in thicknesses, the upward displacement in thicknesses,
+    # and tan(angle / 2), where `angle` is the angle of the rotation from z towards r.
     moved: Float[np.ndarray, "d l i 3"]
     base: layer.Base
 
 
 @dataclass(frozen=True)
 class RestingDipoles:
-    """Dipoles of a skin at rest; `height_i` is the index of each dipole's height in `heights` (in thicknesses)."""
+    """The dipoles of a skin without contact, grouped by their heights."""
 
-    nodes_m: Float[np.ndarray, "s 3"]
+    nodes_m: Float[np.ndarray, "s 3"]  # positions
     moments_A_m2: Float[np.ndarray, "s 3"]
-    height_i: Int[np.ndarray, " s"]
-    heights: tuple[float, ...]
+    height_i: Int[np.ndarray, " s"]  # index of each dipole's height in `heights`
+    heights: tuple[float, ...]  # distinct heights of the dipoles, in thicknesses
 
 
 @dataclass(frozen=True)
 class MovedDipoles:
-    """The dipoles that an indentation moves: indices `i`, positions and moments (before and after the motion)."""
+    """The m dipoles of a skin that an indentation moves."""
 
-    i: Int[np.ndarray, " m"]
-    before: Dipoles
-    after: Dipoles
+    i: Int[np.ndarray, " m"]  # indices of these dipoles among all dipoles of the skin
+    before: Dipoles  # positions and moments before the indentation
+    after: Dipoles  # positions and moments during the indentation
 
 
 def group_by_height(
     nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], thickness_m: float
 ) -> RestingDipoles:
-    """Group the dipoles of a skin by height; dipoles at quadrature nodes have few different heights."""
-    # Heights are rounded, so that a quadrature rule has the same heights in skins of any thickness.
+    """Group the dipoles of a skin by height.
+
+    The dipoles are at the nodes of a quadrature rule. Because many nodes have the same height, there are only few
+    different heights.
+    """
+    # The heights are rounded, so that the same quadrature rule has exactly the same relative heights in all skins.
     heights, height_i = np.unique(np.round(nodes_m[:, 2] / thickness_m, 12), return_inverse=True)
     return RestingDipoles(
         np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist())
@@ -208,7 +242,10 @@ def group_by_height(
 
 
 def reach(size: float, base: layer.Base) -> float:
-    """Return the radius of the tables for R/h = `size`, in thicknesses; farther away, material is not deformed."""
+    """Return the largest radius of the tables for R/h = `size`, in thicknesses.
+
+    Material that is farther away from the axis of the tip keeps its height and is not rotated.
+    """
     depth = layer.VERIFIED_DEPTH * depth_scale(size)
     return REACH + IndentedLayer(1.0, size, base).contact(depth).radius_m
 
@@ -216,19 +253,23 @@ def reach(size: float, base: layer.Base) -> float:
 def tabulate(
     thickness_m: float, tip_radius_m: float, deepest_m: float, *, heights: tuple[float, ...], base: layer.Base
 ) -> DeformationMap:
-    """Tabulate the displacement of material for depths up to `deepest_m`, or slightly beyond.
+    """Tabulate the displacement and the rotation of the material for all depths up to `deepest_m`.
 
-    The result is interpolated between tables whose ln(R/h) are multiples of `SIZE_STEP`. The values at a given depth do
+    The result is interpolated between tables for values of ln(R/h) that are multiples of `SIZE_STEP`. The depths in the
+    table are those of the ladder, so the last depth is slightly greater than `deepest_m`. The values at one depth do
     not depend on `deepest_m`.
 
     Parameters
     ----------
-    heights : heights of the material in thicknesses, as in `RestingDipoles`.
+    thickness_m, tip_radius_m : sizes of the skin and the tip
+    deepest_m : greatest depth for which the table is needed
+    heights : heights of the material in thicknesses, as in `RestingDipoles`
+    base : whether the skin is bonded to its base or slips on it
 
     Raises
     ------
     ParamsError
-        If thickness or tip radius is invalid, or `deepest_m` is above the greatest depth (see `depth_scale`).
+        If the thickness or the tip radius is invalid, or if `deepest_m` cannot be computed (see `depth_scale`).
     """
     layer.check_layer(np.array([deepest_m]), thickness_m, tip_radius_m)
     size = tip_radius_m / thickness_m
@@ -251,7 +292,8 @@ def _tabulate(
     weights = _lagrange(tables_i.astype(float), position)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(weights, parts, strict=True))
-    # The array is made contiguous, because `at_depth` would otherwise copy a part of it for each indentation.
+    # The array is made contiguous here, because otherwise `at_depth` would have to copy a part of the array for each
+    # indentation.
     moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
     # Material at height 0 stays on the base and, on a bonded base, does not move sideways. It may rotate.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
@@ -259,10 +301,11 @@ def _tabulate(
 
 
 def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
-    """Interpolate the table between depths, by cubic polynomials in the square root of the depth.
+    """Interpolate the table between depths; return displacements and rotation for each height and radius.
 
-    The square root is used because the displacement of distant material is almost proportional to depth^1.5, the cube
-    of the root. Below the first tabulated depth (about 10 um for a skin of 2 mm), all displacements are assumed to be
+    The interpolation uses cubic polynomials in the square root of the depth. This is accurate because the displacement
+    of distant material is almost proportional to depth^1.5, which is the cube of the square root. Between 0 and the
+    first tabulated depth (about 10 um for a skin with a thickness of 2 mm), all displacements are assumed to be
     proportional to depth^1.5, like the force of a light touch.
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
@@ -279,16 +322,17 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
 
 
 def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
-    """Move and rotate the dipoles within `reach_m` of an indentation (x, y, depth), or all dipoles on a slipping base.
+    """Move and rotate the dipoles of a skin for an indentation, which is given by x, y and the depth of the tip.
 
-    With the deformation gradient F = R U, a moment m becomes R m and not F m, because the magnetisation does not depend
-    on stretch (Danas & Reis 2024).
+    On a bonded base, only the dipoles within `reach_m` of the tip are moved. On a slipping base, all dipoles are moved.
+    The deformation gradient is F = R U, where R is a rotation and U is a stretch. A moment m becomes R m and not F m,
+    because a stretch does not change the magnetisation (Danas & Reis 2024).
     """
     result = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
     moved = at_depth(table, float(indentation_m[2]))
     if indentation_m[2] > 0:
-        # On a slipping base, r^2 of all material beyond `reach_m` grows by the same amount, because volume is
-        # conserved.
+        # On a slipping base, the material beyond `reach_m` moves outward. Because the volume of the material is
+        # conserved, r^2 grows by the same amount at all of these places.
         edge_m = table.reach_m + table.thickness_m * moved[:, -1, 0].mean()
         grown_m2 = float(edge_m**2 - table.reach_m**2) if table.base == "slipping" else 0.0
         tip = np.append(indentation_m[:2], (table.reach_m, table.thickness_m, grown_m2))
@@ -301,9 +345,10 @@ def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Flo
 def _displaced(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    """Load table `table_i`, for ln(R/h) = SIZE_STEP * table_i, from the cache, or compute and cache it.
+    """Return the table with the number `table_i`, which is for ln(R/h) = SIZE_STEP * table_i.
 
-    The last axis is (outward, up, tan(angle / 2)), as in `DeformationMap.moved`.
+    If the cache contains the table, it is loaded. Otherwise, it is computed and added to the cache. The last axis of
+    the table has the same three values as `DeformationMap.moved`.
     """
     name = f"flow {table_i} {heights} {base}"
     table = io.load_cached_array(PACKAGE, name)
@@ -316,7 +361,8 @@ def _displaced(
 def _follow_ladder(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    # Compute the table for the first `rungs_n` depths of `LADDER`; lengths are in thicknesses.
+    # Compute the table with the number `table_i` for the first `rungs_n` depths of `LADDER`. All lengths are in
+    # thicknesses.
     size = _size(table_i)
     material = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
     parts = np.zeros((rungs_n, 3, len(rest.r_m)))
@@ -332,7 +378,8 @@ def _follow_ladder(
 
 @lru_cache(maxsize=1024)
 def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
-    # Return the pressure change of step `rung_i`; it is cached, because it is the same for material at all heights.
+    # Return the change of the pressure in the step that ends at depth `rung_i` of `LADDER`. The result is cached,
+    # because it does not depend on the heights of the material.
     size = _size(table_i)
     depth = depth_scale(size) * float(LADDER[rung_i])
     return pressure_change(_markers(table_i, rung_i - 1, base), depth, IndentedLayer(1.0, size, base))

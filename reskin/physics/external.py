@@ -1,30 +1,38 @@
-"""External fields over a board that a robot moves: the earth's field, magnets, and other skins.
+"""External fields at a board that a robot moves, such as the fields of the earth, of magnets and of other skins.
 
-The change of an external field since the no-load reading is unknown. Its prior is the field of one magnetic dipole, at
-a known distance from the board's centre, in an unknown direction and with an unknown moment. Such fields are nearly
-uniform over the board; how much they vary depends on the distance.
+When the robot moves, the external field at the chips changes, and this change is not known. This module models the
+change since the no-load reading as the field of a single magnetic dipole. The distance of the dipole from the board's
+centre is fixed, but the direction from the board to the dipole and the moment of the dipole are random. The field of
+such a dipole is nearly uniform over the board. The larger the distance, the less the field varies from chip to chip.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-# Distance of the dipole from the board's centre, chosen on recordings and on simulated skins. For recordings of a
-# moving hand whose fingers have skins (data/leaphand), 40 mm has the largest likelihood. On simulated skins, estimates
-# are more accurate with a larger distance if the sources are farther away.
+# Distance of the dipole from the board's centre. It was chosen from two results. For recordings of a moving
+# hand whose fingers have skins (data/leaphand), a distance of 40 mm has the largest likelihood. On simulated skins with
+# sources that are farther away, estimates are more accurate with a larger distance.
 DISTANCE_MM = 50.0
-CHIP_RATIO = 3.0  # smallest distance of the dipole, in units of the distance of the farthest chip; assumed
-NOISE_MIN_uT = 0.1  # smallest noise for `suppressor`; the measured noise is 0 if a log begins with equal readings
-DIRECTIONS_N = 150  # directions of the dipole over which the covariance is averaged
+# Smallest distance of the dipole, as a multiple of the distance from the board's centre to the farthest chip. The value
+# is assumed.
+CHIP_RATIO = 3.0
+# Smallest standard deviation of the noise in `suppressor`. It is needed because the measured noise is 0 if all readings
+# at the start of a log are equal.
+NOISE_MIN_uT = 0.1
+DIRECTIONS_N = 150  # number of directions of the dipole over which the covariance is averaged
 
 
 def covariance(
     chips_mm: Float[np.ndarray, "k 2"], sd_uT: float, distance_mm: float = DISTANCE_MM
 ) -> Float[np.ndarray, "ch ch"]:
-    """Return the covariance of readings in an unknown external field, along the board's axes.
+    """Return the covariance matrix of the external field at all chips, along the board's axes.
 
-    chips_mm: positions of the chips relative to the board's centre. sd_uT: standard deviation of each component of the
-    field at the board's centre. On large boards, the dipole is farther away than `distance_mm`: `CHIP_RATIO` times the
-    distance from the centre to the farthest chip.
+    Parameters
+    ----------
+    chips_mm : positions of the chips relative to the board's centre
+    sd_uT : standard deviation of each component of the external field at the board's centre
+    distance_mm : distance of the dipole from the board's centre. For a large board, it is increased to `CHIP_RATIO`
+        times the distance from the centre to the farthest chip.
     """
     distance_mm = max(distance_mm, CHIP_RATIO * float(np.linalg.norm(chips_mm, axis=1).max()))
     at_mm = np.column_stack([chips_mm, np.zeros(len(chips_mm))])
@@ -34,10 +42,15 @@ def covariance(
 
 
 def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Float[np.ndarray, "ch ch"]:
-    """Return a symmetric matrix that shrinks external fields in a reading to the size of the noise.
+    """Return a symmetric matrix that removes most of the external field from a reading.
 
-    The matrix whitens the sum of external field and noise, and is multiplied by the standard deviation of the noise.
-    The part of a reading that no external field can explain is unchanged.
+    Multiplied by this matrix, the sum of an external field and noise has the same standard deviation in every
+    direction, namely that of the noise. The part of a reading that no external field can explain is unchanged.
+
+    Parameters
+    ----------
+    external_cov : covariance of the external field, from `covariance`
+    noise_uT : standard deviation of the noise of a channel
     """
     noise_uT = max(noise_uT, NOISE_MIN_uT)
     variances, axes = np.linalg.eigh(external_cov)
@@ -45,7 +58,7 @@ def suppressor(external_cov: Float[np.ndarray, "ch ch"], noise_uT: float) -> Flo
 
 
 def _per_moment(at_mm: Float[np.ndarray, "o 3"], dipoles_mm: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "o3 s3"]:
-    """Return the field at points per unit of each component of each dipole's moment (arbitrary unit)."""
+    """Return the field at each point for a moment of 1 along each axis of each dipole, in an arbitrary unit."""
     off_mm = at_mm[:, None] - dipoles_mm
     distance_mm = np.linalg.norm(off_mm, axis=2)[..., None, None]
     tensor = 3 * off_mm[..., None] * off_mm[..., None, :] / distance_mm**5 - np.eye(3) / distance_mm**3
@@ -53,7 +66,11 @@ def _per_moment(at_mm: Float[np.ndarray, "o 3"], dipoles_mm: Float[np.ndarray, "
 
 
 def _directions(n: int) -> Float[np.ndarray, "n 3"]:
-    """Return n unit vectors that are evenly spread over the sphere, on a spiral with golden-angle steps."""
+    """Return n unit vectors that are evenly spread over the sphere.
+
+    The vectors are on a spiral from pole to pole. The angle between successive vectors about the z axis is the golden
+    angle.
+    """
     i = np.arange(n) + 0.5
     z, angle = 1 - 2 * i / n, np.pi * (1 + 5**0.5) * i
     radius = np.sqrt(1 - z**2)

@@ -1,10 +1,13 @@
-"""An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
+"""Linear theory of an incompressible elastic layer under a spherical tip: contact, force and displacements.
 
-The layer is bonded to a rigid base or slips on it without friction. The pressure is a sum of waves J0(kr) with wave
-numbers k, and displacements are Hankel integrals over these waves. At the height z, a wave displaces the material
-vertically by W J0(kr) and radially by U J1(kr), with U = -W'. A prime on a function is its derivative with respect to
-kz. For a bonded base, W = a (sinh kz - kz cosh kz) + b kz sinh kz, with two constants a and b. In names, kh is the wave
-number times the thickness, and kz is the wave number times the height.
+All values are in SI units. The layer is either bonded to a rigid base, or slips on the base without friction. The
+pressure of the tip on the layer is written as a sum of waves J0(kr), where r is the distance from the axis of the tip
+and k is the wave number. The displacements of the material are then Hankel integrals over these waves.
+
+At the height z, a wave displaces the material vertically by W J0(kr) and radially by U J1(kr), where U = -W'. The prime
+denotes the derivative with respect to kz. For a bonded base, W = a (sinh kz - kz cosh kz) + b kz sinh kz, with two
+constants a and b. In the names of variables, kh is the wave number times the thickness h of the layer, and kz is the
+wave number times the height.
 """
 
 from dataclasses import dataclass
@@ -23,7 +26,8 @@ from reskin.errors import ParamsError
 
 Base = Literal["bonded", "slipping"]
 
-# Largest depth, as a fraction of the thickness, for which Long et al. 2011 verified their solution by finite elements.
+# Largest depth, as a fraction of the thickness, for which Long et al. (2011) verified their solution by comparing it
+# with finite elements.
 VERIFIED_DEPTH = 0.6
 CURVE_N = 48  # number of contact radii on the force curve
 
@@ -33,9 +37,11 @@ def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np
     return top * (x + 1) / 2, top * w / 2
 
 
-# Nodes and weights of three Gauss quadratures. CONTACT: over the contact, in units of its radius. KERNEL: over kh up to
-# 24; for larger kh, 1 - compliance is negligible, because it falls as exp(-2 kh). WAVES: over kh up to 40, for
-# displacements; in a skin of 2 mm, kh = 40 is a wavelength of 0.3 mm.
+# Nodes and weights of three Gauss quadratures:
+# CONTACT is for integrals over the contact, in units of the contact radius.
+# KERNEL is for the kernel of the integral equation, up to kh = 24. For larger kh, the integrand 1 - compliance is
+# negligible, because it decreases as exp(-2 kh).
+# WAVES is for displacements, up to kh = 40. In a skin with a thickness of 2 mm, this is a wavelength of 0.3 mm.
 CONTACT_X, CONTACT_W = _gauss(1.0, 48)
 KERNEL_KH, KERNEL_W = _gauss(24.0, 160)
 WAVES_KH, WAVES_W = _gauss(40.0, 240)
@@ -43,52 +49,54 @@ WAVES_KH, WAVES_W = _gauss(40.0, 240)
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact and its pressure, given by the Hankel transform p^(k) of the pressure.
+    """The contact between tip and layer: its radius, the depth of the tip, and the pressure.
 
+    The pressure is represented by its Hankel transform p^(k), which is given by
     p^(k) / 2G = sum_i weights_i cos(k x_i), where G is the shear modulus.
     """
 
     radius_m: float
     depth_m: float
-    x_m: Float[np.ndarray, " q"]
+    x_m: Float[np.ndarray, " q"]  # the lengths x_i
     weights_m2: Float[np.ndarray, " q"]
 
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure on the layer as a sum of waves J0(k r) with wave numbers k and amplitudes p^(k) dk / 2G (see
-    `Contact`)."""
+    """A pressure on the layer, represented as a sum of w waves J0(k r)."""
 
-    k_per_m: Float[np.ndarray, " w"]
-    amplitude_m: Float[np.ndarray, " w"]
+    k_per_m: Float[np.ndarray, " w"]  # wave numbers k
+    amplitude_m: Float[np.ndarray, " w"]  # p^(k) dk / 2G, where p^(k) is the Hankel transform (see `Contact`)
     thickness_m: float
     base: Base
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement of material points (outward `r_m`, up `z_m`), and the gradient of the displacement.
+    """The displacement of s points of the material, and the gradient of the displacement.
 
-    `r_z` is the derivative of the outward component with respect to z, and so on. `hoop` is `r_m` divided by the
-    radius.
+    In the names of the derivatives, the first letter is the component of the displacement, and the second letter is the
+    coordinate. For example, `r_z` is the derivative of the outward component with respect to z.
     """
 
-    r_m: Float[np.ndarray, " s"]
-    z_m: Float[np.ndarray, " s"]
+    r_m: Float[np.ndarray, " s"]  # outward component
+    z_m: Float[np.ndarray, " s"]  # upward component
     r_r: Float[np.ndarray, " s"]
     r_z: Float[np.ndarray, " s"]
     z_r: Float[np.ndarray, " s"]
     z_z: Float[np.ndarray, " s"]
-    hoop: Float[np.ndarray, " s"]
+    hoop: Float[np.ndarray, " s"]  # outward component divided by the distance from the axis
 
 
 def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
-    """Return the surface compliance of a bonded layer to a pressure wave, relative to that of a half-space.
+    """Return the compliance of the surface of a bonded layer to a pressure wave, relative to a half-space.
 
-    With A = kh, the relative compliance is (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1). Numerator and denominator are
-    divided by exp(2A) / 2 to avoid overflow.
+    The compliance is the displacement of the surface per pressure. It is divided here by the compliance of an
+    infinitely thick layer. With A = kh, the result is (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1). The code divides the
+    numerator and the denominator by exp(2A) / 2 to avoid overflow.
     """
-    double = np.minimum(2 * kh, 1e3)  # keeps `double**2` finite; at this limit, the compliance is 1
+    # The upper limit keeps `double**2` finite. It has no effect on the result, which is 1 at this limit.
+    double = np.minimum(2 * kh, 1e3)
     fade = np.exp(-double)
     s = double**2
     series = 2 * fade * double * s / 6 * (1 + s / 20 * (1 + s / 42 * (1 + s / 72 * (1 + s / 110))))
@@ -97,10 +105,11 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 
 
 def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
-    """Return the surface compliance of a slipping layer to a pressure wave, relative to that of a half-space.
+    """Return the compliance of the surface of a slipping layer to a pressure wave, relative to a half-space.
 
-    With A = kh, the relative compliance is (cosh 2A - 1) / (sinh 2A + 2A) (Johnson 1985, 5.8). Numerator and
-    denominator are divided by exp(2A) / 2 to avoid overflow. For long waves, the limit A / 2 is returned.
+    The compliance is defined as in `bonded_compliance`. With A = kh, the result is (cosh 2A - 1) / (sinh 2A + 2A)
+    (Johnson 1985, section 5.8). The code divides the numerator and the denominator by exp(2A) / 2 to avoid overflow.
+    For long waves, where A is close to 0, the result is replaced by its limit A / 2.
     """
     double = np.minimum(2 * kh, 1e3)
     fade = np.exp(-double)
@@ -110,12 +119,14 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 
 
 def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Solve a Fredholm equation for the pressure and the depth of a contact with this radius (Lebedev & Ufliand 1958).
+    """Compute the pressure and the depth of a contact with a given radius.
 
-    The Hankel transform of the pressure is expressed as the integral of chi(x) cos(kx) dx from 0 to the contact radius.
-    With this form, the pressure is zero outside the contact. The pressure deforms the surface to a sphere of radius R
-    if chi - K chi = 2/pi (depth - x artanh(x/R)), where K is the integral operator of `_kernel`. The depth follows from
-    chi(radius) = 0, because the pressure is finite at the edge of the contact.
+    The method is that of Lebedev & Ufliand (1958). The Hankel transform of the pressure is written as the integral of
+    chi(x) cos(kx) dx from 0 to the contact radius, where chi is an unknown function. With this form, the pressure is
+    zero outside the contact for any function chi. The surface in the contact takes the shape of a sphere of radius R if
+    chi solves the Fredholm equation chi - K chi = 2/pi (depth - x artanh(x/R)), where K is the integral operator whose
+    kernel is `_kernel`. This equation contains the depth, which is also unknown. The depth follows from the condition
+    chi(radius) = 0, which holds because the pressure is finite at the edge of the contact.
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
     points_m = np.append(x_m, radius_m)
@@ -129,14 +140,17 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
 
 @lru_cache(maxsize=4096)
 def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Solve for the contact at an indentation depth above 0."""
+    """Compute the contact at an indentation depth, which must be above 0.
+
+    The contact radius is determined by finding the root of the difference in depth.
+    """
 
     def depth_error_m(radius_m: float) -> float:
         contact = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return contact.depth_m - depth_m
 
-    # Bounds of the contact radius a. With tip radius R and depth d, a^2 is R d for a thick layer, and 4 R d for a thin
-    # layer, whose material can only flow sideways.
+    # Find bounds of the contact radius a. With the tip radius R and the depth d, a^2 is R d for a thick layer. It is 4
+    # R d for a thin bonded layer, whose material can only flow sideways.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(depth_error_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
@@ -144,11 +158,11 @@ def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float,
 
 @dataclass(frozen=True)
 class IndentedLayer:
-    """A layer, its boundary condition at the base, and the spherical tip that presses it."""
+    """An elastic layer, and the spherical tip that presses the layer."""
 
     thickness_m: float
     tip_radius_m: float
-    base: Base
+    base: Base  # whether the layer is bonded to the base or slips on it
 
     def contact(self, depth_m: float) -> Contact:
         """Return the contact at an indentation depth in m."""
@@ -156,7 +170,10 @@ class IndentedLayer:
 
 
 def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
-    """Return the mask of depths beyond the range in which the published solution was verified (`VERIFIED_DEPTH`)."""
+    """Return for each depth whether it is beyond the range in which the published solution was verified.
+
+    The range ends at `VERIFIED_DEPTH` times the thickness.
+    """
     return depth_m >= VERIFIED_DEPTH * thickness_m
 
 
@@ -168,9 +185,11 @@ def force(
     modulus_Pa: float,
     base: Base,
 ) -> Float[np.ndarray, " n"]:
-    """Return the normal force in N of a linear elastic layer on the tip; 0 at depths of 0 or less.
+    """Return the normal force in N between a linear elastic layer and the tip, at each depth.
 
-    For simulated skins that slide on their base, use `slide.force_at`, which includes the stiffening of the layer.
+    The force is 0 at depths of 0 or less, because then the tip does not touch the layer. This function does not include
+    the stiffening of the layer at large depths. For simulated skins that slide on their base, use `slide.force_at`,
+    which includes it.
 
     Raises
     ------
@@ -185,7 +204,13 @@ def force(
 
 
 def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
-    """Raise `ParamsError` if the thickness or the tip radius is invalid, or if a depth reaches one of them."""
+    """Check the sizes of the layer and the tip, and the depths of indentations.
+
+    Raises
+    ------
+    ParamsError
+        If the thickness or the tip radius is not positive and finite, or if a depth is not finite or is not below both.
+    """
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
             raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
@@ -196,17 +221,22 @@ def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
-    """Decompose a contact pressure into waves; a cos^2 window on the upper half of the wave numbers avoids ringing."""
+    """Decompose the pressure of a contact into waves.
+
+    The amplitudes of the upper half of the wave numbers are multiplied by a cos^2 window, which decreases to zero.
+    Without this window, the displacement would oscillate near the edge of the contact.
+    """
     window = np.cos(np.pi * np.maximum(WAVES_KH / WAVES_KH[-1] - 0.5, 0)) ** 2
     pressure_m2 = np.cos(np.outer(WAVES_KH / thickness_m, contact.x_m)) @ contact.weights_m2
     return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pressure: Waves) -> Displacement:
-    """Return the displacement of material points at (r, z) due to a pressure.
+    """Return the displacement of points of the material due to a pressure on the surface.
 
-    The components are u_r = sum of amplitude g'(kz) J1(kr) and u_z = -sum of amplitude g(kz) J0(kr), summed over all
-    waves. The function g is that of `depth_profile`.
+    The points are at the distance r from the axis and at the height z. The components of the displacement are
+    u_r = sum of amplitude g'(kz) J1(kr) and u_z = -sum of amplitude g(kz) J0(kr). Both sums are over all waves of the
+    pressure. The function g is computed by `depth_profile`.
     """
     top = float(np.max(r_m, initial=0.0) * pressure.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
@@ -218,10 +248,11 @@ def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pre
 def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Return the depth profile g(kz) of each wave, and its first two derivatives with respect to kz.
+    """Return the depth profile g(kz) of each wave, and the first two derivatives of g with respect to kz.
 
-    A pressure wave of amplitude p^ displaces material at the height z downwards by p^ g(kz) / (2G k), where G is the
-    shear modulus. At the surface, g(kh) is the compliance relative to that of a half-space.
+    The depth profile states how much a pressure wave displaces the material at each height: a wave of amplitude p^
+    displaces material at the height z downwards by p^ g(kz) / (2G k), where G is the shear modulus. At the surface,
+    g(kh) is the compliance of the layer relative to a half-space (see `bonded_compliance`).
     """
     factors_of, wave = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
     profiles = [[wave(z, h, factors_of(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
@@ -231,9 +262,9 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / (E d^1.5), with force F, Young's modulus E and depth d, is a smooth function of sqrt(d) and is therefore
-    # interpolated over sqrt(d). At d = 0, where the contact is small compared with the layer, its value is 16/9
-    # sqrt(R), from Hertz contact.
+    # Return a spline for F / (E d^1.5) as a function of sqrt(d), where F is the force, E is Young's modulus and d is
+    # the depth. This ratio is smooth in sqrt(d), so that few nodes suffice. At d = 0, the contact is small compared
+    # with the layer, so that the theory of Hertz is valid. It gives the value 16/9 sqrt(R), where R is the tip radius.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
@@ -246,8 +277,8 @@ def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSp
 def _kernel(
     points_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
-    # Return the kernel K of the Fredholm equation: 2/pi times the integral over k of (1 - compliance) cos(k point)
-    # cos(k x).
+    # Return the kernel K of the Fredholm equation in `contact_of_radius`. It is 2/pi times the integral over k of
+    # (1 - compliance) cos(k point) cos(k x).
     compliance = bonded_compliance if base == "bonded" else slipping_compliance
     missing = KERNEL_W / thickness_m * (1 - compliance(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
@@ -260,7 +291,7 @@ BESSEL_STEP = 1 / 256  # step of the argument in the table of Bessel functions
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _bonded_factors(kh):
-    """Return the factors in `_bonded_wave` that do not depend on the height."""
+    """Return the factors of g in `_bonded_wave` that are the same at all heights."""
     base = exp(-2 * kh)
     size = (1 + base) ** 2 + 4 * kh * kh * base
     return (1 + base) / size, 2 * kh / size * exp(-kh), 0.0
@@ -269,10 +300,11 @@ def _bonded_factors(kh):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _bonded_wave(kz, kh, factors):
-    """Return g of one wave at height z of a bonded layer, and its first two derivatives with respect to kz.
+    """Return the depth profile g of one wave in a bonded layer, and the first two derivatives of g.
 
-    With A = kh, z' = kz and t = A - z', g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2).
-    Numerator and denominator are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
+    The profile is evaluated at the height z. With A = kh, z' = kz and t = A - z', it is
+    g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2). The code divides the numerator and
+    the denominator by exp(2A) / 4, so that all exponents are negative or zero inside the layer.
     """
     t = kh - kz
     top, fade = exp(-t), exp(-kz)
@@ -287,7 +319,7 @@ def _bonded_wave(kz, kh, factors):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _slipping_factors(kh):
-    """Return the factors in `_slipping_wave` that do not depend on the height."""
+    """Return the factors of g in `_slipping_wave` that are the same at all heights."""
     fade, second = exp(-2 * kh), -expm1(-2 * kh)
     return second * (1 + fade) + 4 * kh * fade, (1 + kh) - (1 - kh) * fade, second
 
@@ -295,11 +327,13 @@ def _slipping_factors(kh):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _slipping_wave(kz, kh, factors):
-    """Return g of one wave at height z of a slipping layer, and its first two derivatives with respect to kz.
+    """Return the depth profile g of one wave in a slipping layer, and the first two derivatives of g.
 
-    With A = kh and z' = kz, g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A). This solution
-    is odd in z', because W and the shear stress, which is proportional to W'' + W, vanish at the base. Numerator and
-    denominator are multiplied by 4 exp(-2A), so that no exponent is positive inside the layer.
+    The profile is evaluated at the height z. With A = kh and z' = kz, it is
+    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A). At the base, both the vertical
+    displacement W and the shear stress, which is proportional to W'' + W, are zero. Therefore, g is an odd function of
+    z'. The code multiplies the numerator and the denominator by 4 exp(-2A), so that all exponents are negative or zero
+    inside the layer.
     """
     size, first, second = factors
     top, low = exp(kz - kh), exp(-kh - kz)
@@ -313,8 +347,8 @@ def _slipping_wave(kz, kh, factors):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _between(table, low, share):
-    # Interpolate J0 and J1 between rows `low` and `low + 1` of the table, by cubic Hermite polynomials with exact
-    # slopes. The error is below 1e-12.
+    # Interpolate J0 and J1 between the rows `low` and `low + 1` of the table. The interpolating polynomials are cubic
+    # and have the exact values and slopes of the functions at both rows. The error is below 1e-12.
     j0_a, j1_a, slope_a = table[low, 0], table[low, 1], table[low, 2]
     j0_b, j1_b, slope_b = table[low + 1, 0], table[low + 1, 1], table[low + 1, 2]
     rest = 1 - share
@@ -326,9 +360,10 @@ def _between(table, low, share):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_waves(r_m, z_m, waves, slipping, table):
-    """Sum the displacements due to all waves at s points; return rows u_r, hoop, u_z, -du_z/dz, du_r/dz, du_z/dr.
+    """Sum the displacements due to all waves at s points, and the derivatives of the displacements.
 
-    The rows of `waves` are k, kh and the amplitude.
+    The rows of `waves` are the wave number k, kh and the amplitude. The rows of the result are u_r, hoop, u_z,
+    -du_z/dz, du_r/dz and du_z/dr, where hoop is u_r divided by r.
     """
     sums = np.zeros((6, len(r_m)))
     for w in range(waves.shape[1]):
@@ -347,7 +382,7 @@ def _sum_waves(r_m, z_m, waves, slipping, table):
             sums[5, s] += steep * g * j1_
     for s in range(len(r_m)):
         if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # for r = 0, `sums[1]` already has the limit
+            sums[1, s] = sums[0, s] / r_m[s]  # for r = 0, `sums[1]` already contains the limit of this quotient
     return sums
 
 

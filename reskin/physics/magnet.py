@@ -1,4 +1,8 @@
-"""Magnetisation of a skin by an array of magnets, quadrature nodes, and fields of point dipoles. SI units."""
+"""Magnetisation of a skin by an array of magnets, and the field of the magnetised skin.
+
+All values are in SI units. For the computation of its field, a skin is divided into cells. Each cell is represented by
+a point dipole at a node of a quadrature rule.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -14,14 +18,17 @@ from scipy.constants import milli, mu_0
 from reskin.config import Strict
 from reskin.errors import ParamsError
 
-CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
+# The magnetising array consists of magnet cubes below and above the skin. "CAD" refers to the drawings of the authors
+# of the paper.
+CUBE_SIDE_M = 6.35e-3  # the cubes have a side of 0.25 in
 CUBES_N = (4, 4)  # number of magnet cubes along x and y, for the authors' skin of 20 x 20 mm
 ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from the authors' CAD
 ARRAY_ABOVE_M = 0.25e-3  # gap between the skin's top and the upper cubes, from the authors' CAD
-ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
+ARRAY_REMANENCE_T = 1.32  # remanence of magnets of grade N42; the grade is assumed
 
-# Polarity of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the lower cube
-# that is opposite to it.
+# Polarity of the cubes, which the paper does not specify: adjacent cubes are magnetised in opposite directions
+# (checkerboard) or in the same direction. In both cases, each upper cube attracts the lower cube that is opposite to
+# it.
 Polarity = Literal["checkerboard", "same"]
 
 
@@ -30,8 +37,9 @@ def cuboid_field(
 ) -> Float[np.ndarray, "o 3"]:
     """Return the field in T of a cuboid that is centred at the origin and magnetised along z.
 
-    The field is that of two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus the
-    polarization J inside the cuboid. The formula is singular on the lines through the edges.
+    Outside the cuboid, the field is the same as that of two rectangles with magnetic charges, which are the upper and
+    the lower face (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005). Inside, the polarization J is added to
+    this field. The formula is singular on the lines through the edges of the cuboid.
     """
     half_m = np.array(sides_m) / 2
     b_T = np.zeros_like(observers_m)
@@ -43,25 +51,32 @@ def cuboid_field(
 
 
 def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return the contribution of one corner of a cuboid to the cuboid's field, times 4 pi / J."""
+    """Return the term of one corner of a cuboid in the formula for the field of the cuboid, times 4 pi / J.
+
+    `from_m` are the vectors from the corner to the observers.
+    """
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
-    # The published formula contains log(y + r). asinh(y / hypot(x, z)) differs by a term that cancels in the sum over
-    # corners, and is also accurate for y < 0.
+    # The published formula contains log(y + r), which is inaccurate for y < 0. It is replaced here by
+    # asinh(y / hypot(x, z)). The two functions differ by a term that cancels in the sum over the corners.
     along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
     return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
 
 
 def cubes_along(side_m: float) -> int:
-    """Return the smallest number of magnet cubes that cover a side of a skin: 4 for the authors' skin.
+    """Return the smallest number of magnet cubes in a row that cover a side of a skin.
 
-    Skins of other sizes are assumed to be magnetised with the same cubes.
+    The result is 4 for the authors' skin. Skins of other sizes are assumed to be magnetised with cubes of the same
+    size.
     """
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
 
 def seams_m(side_m: float) -> tuple[float, ...]:
-    """Return the coordinates at which two cubes touch along a side; the magnetisation has kinks there."""
+    """Return the coordinates of the seams along a side of a skin.
+
+    A seam is the boundary between two adjacent cubes. The magnetisation of the skin has a kink at each seam.
+    """
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
 
@@ -71,15 +86,18 @@ def array_field(
 ) -> Float[np.ndarray, "s 3"]:
     """Return the field in T of the magnetising array at nodes inside the skin.
 
-    The array has `cubes_n` cubes (along x, along y) below the skin and the same number above. The field of a cube is a
-    sum of eight terms, one for each of its corners. Adjacent cubes share corners. Therefore, the term of each corner is
-    computed once, and multiplied by the sum of the signs of the cubes that share the corner.
+    The array has `cubes_n` cubes (along x, along y) below the skin, and the same number above the skin. The field of a
+    cube is a sum of eight terms, one for each corner of the cube. Each term has a sign, which depends on the position
+    of the corner in the cube and on the polarity of the cube. Adjacent cubes share corners. To save time, the term of
+    each corner is computed only once, and multiplied by the sum of the signs that it has in all cubes that share the
+    corner.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
-    # For each of x, y and z, the upper end of a cube has sign + and the lower end has sign -.
+    # The sign of a corner is the product of three signs, for x, y and z. Each is positive if the corner is at the upper
+    # end of the cube along this axis, and negative at the lower end. The differences sum these signs over the cubes.
     weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
     below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
     faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
@@ -92,17 +110,18 @@ def array_field(
 
 
 def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
-    """Return the remanent polarization J in T of the powder after magnetisation in the field B.
+    """Return the polarization J in T that remains in the powder after it was magnetised by the field B.
 
-    J = `saturation_T` u^3 / (1 + u^3) in the direction of B, with u = |B| / `half_field_T`.
+    J has the direction of B and the magnitude `saturation_T` u^3 / (1 + u^3), where u = |B| / `half_field_T`.
     """
     u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
-    # u^2 / half_field_T equals u^3 / |B|, but is also finite where four cubes meet and the field vanishes.
+    # The formula contains u^3 / |B|. The equal expression u^2 / half_field_T is used, because it is finite even where
+    # the field is zero. This happens where four cubes meet.
     return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
 
 
 def moments(j_T: Float[np.ndarray, "s 3"], volumes_m3: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 3"]:
-    """Return the dipole moment in A m^2 of each cell, from its polarization and its volume."""
+    """Return the dipole moment in A m^2 of each cell, given the polarization and the volume of each cell."""
     return j_T * (volumes_m3 / mu_0)[:, None]
 
 
@@ -112,10 +131,14 @@ SEAMS_M = seams_m(SKIN_SIDE_M)  # for the authors' skin, which is magnetised by 
 
 
 class QuadratureSettings(Strict):
-    """Section `quadrature` of a board's settings. Chips closer to the skin need smaller cells (experiment runtime)."""
+    """Section `quadrature` of a board's settings: the rule by which a skin is divided into cells.
 
-    cell_mm: Annotated[float, Field(gt=0, le=20)]
-    layers_n: Annotated[int, Field(ge=1, le=100)]
+    The closer the chips are to the skin, the smaller the cells must be. The experiment `runtime` measures the error and
+    the computing time for several rules.
+    """
+
+    cell_mm: Annotated[float, Field(gt=0, le=20)]  # largest width of a cell along x and y
+    layers_n: Annotated[int, Field(ge=1, le=100)]  # number of nodes over the thickness
 
     def in_si(self) -> "Quadrature":
         """Convert to SI units."""
@@ -124,30 +147,31 @@ class QuadratureSettings(Strict):
 
 @dataclass(frozen=True)
 class Quadrature:
-    """A quadrature rule for a skin: the largest width of a cell, and the number of Gauss nodes over the thickness."""
+    """The rule by which a skin is divided into cells, each of which is represented by a dipole at a node."""
 
-    cell_m: float
-    layers_n: int
+    cell_m: float  # largest width of a cell along x and y
+    layers_n: int  # number of Gauss nodes over the thickness
 
 
-# 42 x 42 x 6 nodes; halving the cell width changes dB by less than 2 % (test_skin).
+# This rule places 42 x 42 x 6 nodes in the authors' skin. With half the cell width, the field change dB differs by less
+# than 2 % (test_skin).
 DEFAULT_QUADRATURE = Quadrature(cell_m=0.5e-3, layers_n=6)
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Quadrature nodes of a skin at rest; x and y are relative to the skin's centre, z to the skin's base."""
+    """The s quadrature nodes of an undeformed skin."""
 
-    nodes_m: Float[np.ndarray, "s 3"]
-    volumes_m3: Float[np.ndarray, " s"]
+    nodes_m: Float[np.ndarray, "s 3"]  # x and y relative to the skin's centre, and z relative to the skin's base
+    volumes_m3: Float[np.ndarray, " s"]  # volume of the cell that each node represents
 
 
 def place_nodes(
     thickness_m: float, rule: Quadrature = DEFAULT_QUADRATURE, *, sides_m: tuple[float, float] = SKIN_SIDES_M
 ) -> Nodes:
-    """Place quadrature nodes: in x and y at the midpoints of cells, and in z at Gauss nodes.
+    """Place the quadrature nodes of a skin: at the midpoints of cells along x and y, and at Gauss nodes along z.
 
-    No cell crosses a seam between magnet cubes.
+    The cells are chosen such that no cell crosses a seam between magnet cubes, where the magnetisation has a kink.
     """
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
@@ -167,8 +191,9 @@ def _cells(side_m: float, rule: Quadrature) -> tuple[Float[np.ndarray, " i"], Fl
     return centres_m, np.concatenate([np.diff(edges) for edges in spans])
 
 
-Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
-MU0_4PI = mu_0 / (4 * np.pi)  # in T m / A (CODATA); since 2019 not exactly 1e-7
+Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, and moments in A m^2
+# mu0 / (4 pi) in T m / A, from CODATA. Since the SI was revised in 2019, this value is not exactly 1e-7.
+MU0_4PI = mu_0 / (4 * np.pi)
 
 
 def field(
@@ -183,10 +208,11 @@ def field_of_each(
 ) -> Float[np.ndarray, "o s 3"]:
     """Return the field in T of each dipole at each observer.
 
-    The field is mu0/4pi (3 (m.r) r / |r|^5 - m / |r|^3), with the moment m and the vector r from the dipole to the
-    observer.
+    The field is mu0/4pi (3 (m.r) r / |r|^5 - m / |r|^3), where m is the moment of the dipole and r is the vector from
+    the dipole to the observer.
     """
-    # The axis of the components x, y, z is first, so that every product is over long contiguous rows.
+    # The components x, y and z are along the first axis of the arrays. The products are faster in this order, because
+    # they are over long contiguous rows.
     separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
@@ -200,8 +226,9 @@ def field_of_each(
 def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return the field change in T at each observer due to dipoles that move and rotate from `rest` to `moved`.
 
-    The field changes of single dipoles are summed, because the difference of the two total fields would lose digits.
-    Arrays in Fortran order, as from `deformation.move_dipoles`, are not copied.
+    The field changes of the single dipoles are computed first and then summed. The difference of the two total fields
+    would be less accurate, because nearly equal numbers would be subtracted. Arrays in Fortran order are not copied.
+    The arrays from `deformation.move_dipoles` have this order.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
@@ -210,8 +237,9 @@ def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray
     return change_T
 
 
-# The loop over nodes has no running sum, so it can be vectorised without fastmath. Dipoles that do not move contribute
-# exactly 0. With error_model="numpy", a division by zero results in infinity, which the caller detects.
+# The loop over the dipoles stores the field change of each dipole instead of adding it to a sum, so that the compiler
+# can vectorise the loop without fastmath. The field change of a dipole that does not move is exactly 0. Because of
+# error_model="numpy", a division by zero results in infinity, which the caller detects.
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
@@ -237,7 +265,8 @@ def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
     return total
 
 
-# `reassoc` allows several partial sums in parallel. Unlike full fastmath, it preserves infinities and NaN.
+# The option `reassoc` allows the compiler to compute several partial sums in parallel. Unlike full fastmath, this
+# option does not assume that all numbers are finite, so that `change_of_field` can detect infinities and NaN.
 @njit(cache=True, fastmath={"reassoc"})
 @no_type_check
 def _total(parts):

@@ -1,7 +1,11 @@
-"""Magnetised skins: their design, random skins, and the field change and force due to indentations. SI units.
+"""Magnetised skins: their design, random skins, and the field change and the force due to indentations.
 
-Each skin is drawn with a random generator that is seeded by the skin's name. Therefore, adding skin 8 does not change
-skin 7. An indentation is (x, y, depth) in the board's frame: the true place of the tip, and the commanded depth.
+All values are in SI units. The random generator of each skin is seeded by the name of the skin. If a simulation is
+extended by one skin, the other skins therefore stay the same.
+
+An indentation is given by x, y and depth in the coordinate system of the board. The place (x, y) is the true place of
+the tip. The depth is the commanded depth, which differs from the true depth by a constant error for each skin
+(`Skin.depth_zero_m`).
 """
 
 from collections.abc import Iterator
@@ -21,16 +25,18 @@ from reskin.physics.board import Board, Spreads
 from reskin.physics.magnet import DEFAULT_QUADRATURE, SKIN_SIDES_M, Dipoles, Quadrature, change_of_field, place_nodes
 from reskin.seeds import rng_for
 
-FILLER_WAVES_N = 64  # number of random plane waves whose sum is the local variation of the filler
+FILLER_WAVES_N = 64  # number of random plane waves in the local variation of the magnetisation (see `_filler`)
 
 
 class SkinDesign(Strict):
     """Section `skin` of the settings: the design of all skins of a scene, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # whether the magnetisation is reversed, as by a rotation of a checkerboard skin by 90 degrees
-    base: layer.Base
-    # How a finite skin slides on its base. None: the skin is an infinite layer that does not slide (see `layer.force`).
+    # Whether the magnetisation is reversed. For a checkerboard skin, this is the same as a rotation by 90 degrees.
+    flipped: bool
+    base: layer.Base  # whether the skin is bonded to its base or slips on it
+    # How a finite skin slides on its base. If this is None, the skin is an infinite layer that does not slide, and its
+    # force is computed by `layer.force`.
     hold: slide.HoldDesign | None
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
@@ -47,15 +53,15 @@ class SkinDesign(Strict):
 
 @dataclass(frozen=True)
 class Skin:
-    """One skin at rest on its board: dipoles that represent its magnetisation, and properties of the layer.
+    """One skin on its board, without contact.
 
-    Positions are in the board's frame.
+    The magnetisation of the skin is represented by s dipoles. All positions are in the coordinate system of the board.
     """
 
     name: str
-    nodes_m: Float[np.ndarray, "s 3"]
+    nodes_m: Float[np.ndarray, "s 3"]  # positions of the dipoles
     moments_A_m2: Float[np.ndarray, "s 3"]
-    seat_m: Float[np.ndarray, " 2"]  # the skin's centre
+    seat_m: Float[np.ndarray, " 2"]  # x and y of the skin's centre
     sides_m: tuple[float, float]
     thickness_m: float
     modulus_Pa: float
@@ -76,10 +82,11 @@ def draw_skin(
     rule: Quadrature = DEFAULT_QUADRATURE,
     sides_m: tuple[float, float] = SKIN_SIDES_M,
 ) -> Skin:
-    """Draw the parameters of a skin on its board at random, from a generator that is seeded by `seed` and `name`.
+    """Draw a skin on its board at random, with a generator that is seeded by `seed` and `name`.
 
-    The quadrature rule affects only the discretisation of the skin, not the random numbers. The magnetising array has
-    as many magnets as are needed to cover a skin with the given side lengths.
+    The quadrature rule affects only how the skin is divided into cells, but not the random numbers. Therefore, skins
+    that differ only in `rule` approximate the same continuous skin. The magnetising array has as many cubes as are
+    needed to cover a skin with the given sides.
     """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
@@ -118,14 +125,16 @@ def changes_of_field(
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
     """Return the no-load field in T at the chips, and the field change in T for each indentation (x, y, depth).
 
-    Without contact (true depth of 0 or less), the field change is exactly zero.
+    If the true depth of an indentation is 0 or less, the tip does not touch the skin, and the field change is exactly
+    zero.
 
     Raises
     ------
     ParamsError
         If an indentation is outside the skin or too deep.
     """
-    # One chip at a time, to limit memory: a large skin on many chips has millions of pairs of a node and a chip.
+    # The no-load field is computed for one chip at a time to limit the use of memory, because for a large skin on many
+    # chips, there are millions of pairs of a node and a chip.
     rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
     changes_T = np.zeros((len(indentations_m), *board.chips_m.shape))
     for indentation_i, before, after in moved_dipoles(skin, indentations_m):
@@ -136,10 +145,18 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """For each indentation in contact, yield its index and the dipoles that it moves, before and after the motion.
+    """Yield the dipoles that each indentation moves; skip indentations that do not touch the skin.
 
-    `slid` is the fraction of the skin's rigid motion that takes place during each indentation (default: 1). The caller
-    may displace the dipoles further before calling `change_of_field`.
+    Parameters
+    ----------
+    skin : the skin
+    indentations_m : x, y and depth of each indentation
+    slid : factor by which the rigid motion of the skin is multiplied for each indentation; 1 by default
+
+    Yields
+    ------
+    The index of the indentation, the moved dipoles before the indentation, and the same dipoles during the indentation.
+    The caller may displace these dipoles further before it calls `change_of_field`.
     """
     true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _check_on_skin(true_m, skin)
@@ -160,9 +177,11 @@ def moved_dipoles(
 
 
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
-    """Return the rigid motion of the skin due to presses (x, y, true depth), limited by friction with the tip.
+    """Return the rigid motion of the skin on its base due to each press, which is given by x, y and the true depth.
 
-    Without this limit, the displacement depends on the depth but not on the modulus. The limit depends on the force.
+    The motion is first computed as if the tip did not slip on the skin. This motion depends on the depth, but not on
+    Young's modulus. It is then limited to the motion that the friction between tip and skin can cause. This limit
+    depends on the force.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
@@ -175,12 +194,15 @@ def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"])
 
 
 def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
-    """Count the commanded depths beyond the range in which the published solution was verified."""
+    """Count the commanded depths beyond the range in which the published solution was verified.
+
+    See `layer.VERIFIED_DEPTH`.
+    """
     return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
 
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the normal force on the tip in N at commanded depths, positive in compression."""
+    """Return the normal force in N between tip and skin at each commanded depth; a force is never negative."""
     layer_of_skin = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     true_m = depth_m + skin.depth_zero_m
     if skin.hold is not None:
@@ -189,14 +211,19 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the shear modulus in Pa under the tip at commanded depths: E / 3 (incompressible) times the stiffening."""
+    """Return the shear modulus in Pa of the layer under the tip at each commanded depth.
+
+    The shear modulus of an incompressible material is E / 3, where E is Young's modulus. If the skin can slide on its
+    base, the result also includes the stiffening of the layer (see `slide.stiffening`).
+    """
     if skin.hold is None:
         return np.full(len(depth_m), skin.modulus_Pa / 3)
     return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
 
 
 def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
-    # The modelled layer is infinite, so the result for a press beyond the skin's edge would be plausible but wrong.
+    # The model of the deformation assumes an infinite layer. For a press beyond the skin's edge, it would therefore
+    # return a result that is wrong but looks plausible.
     half_m = np.array(skin.sides_m) / 2
     outside = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if outside.any():
@@ -207,8 +234,9 @@ def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # Return the local variation of the magnetisation: a smooth random factor, which is the exponential of a sum of
-    # plane waves. The waves do not depend on the nodes, so that a finer quadrature samples the same skin.
+    # Return the local variation of the magnetisation: a random factor at each place, which varies smoothly. It is the
+    # exponential of a sum of random plane waves. The waves do not depend on the places, so that the factor at a place
+    # is the same for all quadrature rules.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

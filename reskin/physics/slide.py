@@ -1,14 +1,16 @@
-"""Rigid sliding of a finite skin on its base, and the normal force as a function of depth. SI units.
+"""Rigid sliding of a finite skin on its base, and the normal force as a function of depth.
 
-The base is modelled as evenly distributed, isotropic springs that hold the whole skin. Therefore, the rigid motion of
-the skin follows from the displacement of the material under the tip (for a press) or from the tangential force (for a
-drag). Friction between tip and skin limits the motion, so that there is no motion without normal force
-(`limit_by_friction`).
+All values are in SI units. When a tip presses or drags a skin that is not glued to its base, the whole skin slides a
+little. The base is modelled by springs that are distributed evenly under the skin and are equally stiff in all lateral
+directions. With this model, the rigid motion of the skin follows from the displacement of the material under the tip
+(for a press), or from the tangential force (for a drag). The friction between tip and skin limits the motion. Without
+normal force, there is therefore no motion (see `limit_by_friction`).
 
-The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), with depth d and thickness h,
-because the layer stiffens as it becomes thinner. For a skin of 2 mm, this factor is 1.2 at a depth of 0.2 mm and 4.0 at
-1.2 mm. The factor and the displacement due to a press are empirical. They were fitted to two recorded boards (scene
-lab), whose data the elastic layer alone does not describe.
+The normal force is the force of the slipping elastic layer of module `layer`, multiplied by (1 - d/h)^(-3/2), where d
+is the depth and h is the thickness. The factor accounts for the stiffening of the layer as it becomes thinner. For a
+skin with a thickness of 2 mm, it is 1.2 at a depth of 0.2 mm and 4.0 at 1.2 mm. Both this factor and the displacement
+due to a press are empirical: they were fitted to two recorded boards (scene lab), because the elastic layer alone does
+not describe the recordings.
 """
 
 from dataclasses import dataclass
@@ -26,20 +28,31 @@ from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.magnet import Dipoles
 
-STIFFENING = 1.5  # exponent, from the two recorded boards; values from 1.25 to 2 fit their data equally well
-DEEPEST = 0.72  # greatest depth of `depth_at`, as a fraction of the thickness
+# Exponent of the stiffening, from the two recorded boards. Values from 1.25 to 2 fit their recordings equally well.
+STIFFENING = 1.5
+DEEPEST = 0.72  # greatest depth that `depth_at` returns, as a fraction of the thickness
 CENTRE_M = np.zeros(2)
-CURVE_N = 2000  # number of points of the inverse force curve, which is linear in force^(2/3) between points (Hertz)
+# Number of points on the curve from which `depth_at` interpolates the depth. Between the points, the depth is linear in
+# force^(2/3), as in Hertz's theory.
+CURVE_N = 2000
 
 
 class HoldDesign(Strict):
-    """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces the skin."""
+    """Section `skin.hold` of the settings: how the base holds a skin, and how a press displaces the skin.
 
-    give_um: tuple[float, float]  # displacement of robot arm and skin along x and y due to a press
-    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the centre, per distance from the centre
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force / Young's modulus above which `away_um_mm` has no effect
-    springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
-    friction: Annotated[float, Field(gt=0, le=10)]  # coefficient between tip and skin
+    The settings describe a skin that can slide on its base. See `press_displacement_m` and `limit_by_friction` for the
+    formulas.
+    """
+
+    # displacement along x and y due to a press, which is the same at all places, because the robot's arm yields
+    give_um: tuple[float, float]
+    # displacement towards the skin's centre due to a light press, divided by the distance from the centre
+    away_um_mm: Annotated[float, Field(ge=0, le=100)]
+    # Force divided by Young's modulus at which the displacement towards the centre vanishes. At smaller forces, this
+    # displacement decreases linearly with the force.
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]
+    springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base, due to screws, clips, friction
+    friction: Annotated[float, Field(gt=0, le=10)]  # friction coefficient between tip and skin
 
     def in_si(self) -> "Hold":
         """Convert to SI units."""
@@ -54,7 +67,7 @@ class HoldDesign(Strict):
 
 @dataclass(frozen=True)
 class Hold:
-    """`HoldDesign` in SI units."""
+    """The settings of `HoldDesign`, converted to SI units."""
 
     give_m: tuple[float, float]
     away: float
@@ -64,45 +77,60 @@ class Hold:
 
     @property
     def grip_N_per_m(self) -> float:
-        """Normal force per displacement that is needed to move the skin by friction: k / mu; infinite if mu is 0."""
+        """Normal force that is needed to move the skin by friction, divided by the displacement.
+
+        The value is k / mu, where k is the lateral stiffness of the base and mu is the friction coefficient. It is
+        infinite if mu is 0.
+        """
         return self.springs_N_per_m / self.friction if self.friction > 0 else np.inf
 
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion of a skin for n indentations: a rotation about the skin's centre, then a translation."""
+    """The rigid motion of a skin in each of n indentations.
 
-    move_m: Float[np.ndarray, "n 2"]
-    spin_rad: Float[np.ndarray, " n"]
+    A motion is a rotation about the skin's centre, which is followed by a translation.
+    """
+
+    move_m: Float[np.ndarray, "n 2"]  # translation
+    spin_rad: Float[np.ndarray, " n"]  # angle of the rotation
 
     def scaled(self, share: Float[np.ndarray, " n"]) -> "RigidMotion":
-        """Return each motion multiplied by a factor."""
+        """Return the motions, with the translation and the angle of each motion multiplied by its own factor."""
         return RigidMotion(self.move_m * share[:, None], self.spin_rad * share)
 
 
 def press_displacement_m(
     places_m: Float[np.ndarray, "n 2"], load: Float[np.ndarray, " n"], *, give_m: tuple[float, float], away: float
 ) -> Float[np.ndarray, "n 2"]:
-    """Return the displacement of the material under a tip that does not slip: give - away (1 - load) p.
+    """Return the lateral displacement of the material under a tip that presses the skin and does not slip.
 
-    p is the place relative to the skin's centre. The term with `away` displaces the material towards the centre. `load`
-    is the force divided by the force at which this term vanishes. A light press causes only a fraction of this
-    displacement (see `limit_by_friction`).
+    The displacement is give - away (1 - load) p, where p is the place relative to the skin's centre. The second term
+    displaces the material towards the centre. In a light press, the tip slips, so that the displacement is smaller than
+    this result (see `limit_by_friction`).
+
+    Parameters
+    ----------
+    places_m : place of each press, relative to the skin's centre
+    load : force of each press, divided by the force at which the second term vanishes; at most 1
+    give_m : displacement that is the same at all places
+    away : displacement towards the centre in a light press, divided by the distance from the centre
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
 
 def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], grip_N_per_m: float) -> RigidMotion:
-    """Reduce rigid motions to those that Coulomb friction can cause at these normal forces F.
+    """Reduce rigid motions to the motions that Coulomb friction can cause at the normal forces F.
 
-    A displacement u of the skin needs the lateral force k |u|, where k is the stiffness of the base's springs, but
-    friction exerts at most mu F. The motion is therefore multiplied by 1 - exp(-mu F / (k |u|)). With this factor, the
-    lateral force is always below mu F, and the motion is complete for a strong press. `grip_N_per_m` is k / mu.
+    To displace the skin by u, the tip must exert the lateral force k |u|, where k is the stiffness of the base's
+    springs. The friction, however, exerts at most the force mu F, where mu is the friction coefficient. The motion is
+    therefore multiplied by the factor 1 - exp(-mu F / (k |u|)). With this factor, the lateral force is always below
+    mu F. For a strong press, the factor is close to 1, so that the motion is hardly reduced. `grip_N_per_m` is k / mu.
     """
-    with np.errstate(invalid="ignore"):  # inf * 0 is NaN, if both motion and friction are 0
+    with np.errstate(invalid="ignore"):  # if both the motion and the friction are 0, the product inf * 0 is NaN
         needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
     moves = needed_N > 0
-    with np.errstate(over="ignore"):  # the quotient is infinite if the motion is so small that any force suffices
+    with np.errstate(over="ignore"):  # the quotient overflows to infinity if the motion is extremely small
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
     return motion.scaled(share)
 
@@ -110,9 +138,10 @@ def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], gri
 def compliance_m_per_N(
     places_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float], springs_N_per_m: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """Return the displacement of the skin at each place per lateral force at the same place.
+    """Return the compliance of the base: the displacement of the skin at each place per lateral force at this place.
 
-    The compliance matrix is (I + q q^T / rho^2) / k, with q and rho as in `rigid_motion` and k = `springs_N_per_m`.
+    The compliance is the matrix (I + q q^T / rho^2) / k, where q and rho are defined in `rigid_motion` and k is
+    `springs_N_per_m`.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     rotational = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
@@ -122,12 +151,13 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """For each place, return the rigid motion with the least elastic energy of the base that displaces the place by D.
+    """Return the rigid motion of the skin that displaces a given place by a given vector, for each place.
 
-    D is `displacement_m`. A rigid motion displaces the point X by u(X) = f + theta z x X, where z is the unit vector
-    along z. The condition is u(p) = D at the place p. The solution is f = (I + q q^T / rho^2)^-1 D and theta = q.f /
-    rho^2, where q = z x p. The length rho is given by rho^2 = (a^2 + b^2) / 12, the mean of r^2 over a skin with sides
-    a and b.
+    Many rigid motions displace the place p by the vector D (`displacement_m`). The result is the motion for which the
+    elastic energy of the base is smallest. A rigid motion displaces the point X by u(X) = f + theta z x X, where f is a
+    translation, theta is the angle of a small rotation, and z is the unit vector along z. The condition u(p) = D
+    results in f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p. The length rho is given by
+    rho^2 = (a^2 + b^2) / 12, which is the mean of r^2 over a skin with the sides a and b.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
@@ -140,7 +170,10 @@ def apply(
     dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> Dipoles:
-    """Return dipoles after motion `i`: rotate positions (about `centre_m`) and moments, then translate positions."""
+    """Return dipoles after the rigid motion with the index `i`.
+
+    The positions are rotated about `centre_m` and then translated. The moments are rotated.
+    """
     positions_m, moments_A_m2 = (part.T.copy() for part in dipoles)
     apply_in_place(motion, i, (positions_m.T, moments_A_m2.T), centre_m)
     return positions_m.T, moments_A_m2.T
@@ -152,11 +185,12 @@ def apply_in_place(
     dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> None:
-    """Apply motion `i` as in `apply`, but overwrite the arrays, which is faster for thousands of dipoles."""
+    """Do the same as `apply`, but overwrite the arrays of the dipoles, which is faster for thousands of dipoles."""
     positions_m, moments_A_m2 = dipoles
     cos, sin = float(np.cos(motion.spin_rad[i])), float(np.sin(motion.spin_rad[i]))
     (x_m, y_m), (centre_x_m, centre_y_m) = motion.move_m[i], centre_m
-    # A point X moves to R (X - centre) + centre + move, with the rotation matrix R.
+    # A point X moves to R (X - centre) + centre + move, where R is the rotation matrix. The following vector is the
+    # part of this sum that does not depend on X.
     move_m = x_m + (1 - cos) * centre_x_m + sin * centre_y_m, y_m + (1 - cos) * centre_y_m - sin * centre_x_m
     _turn(positions_m.T, (cos, sin), move_m)
     _turn(moments_A_m2.T, (cos, sin), (0.0, 0.0))
@@ -183,14 +217,17 @@ def force_at(
 
 
 def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Return the factor (1 - d/h)^(-3/2) by which a layer stiffens at depth d, for normal forces and for shear."""
+    """Return the factor (1 - d/h)^(-3/2) by which a layer of the thickness h becomes stiffer at the depth d.
+
+    The same factor is used for the normal force and for the shear modulus.
+    """
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
 
 
 def count_clipped(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> int:
-    """Count the forces that are larger than the force at the greatest depth of `depth_at`."""
+    """Count the forces for which `depth_at` clips the depth, because they need a depth above its greatest depth."""
     deepest_m = np.array([_deepest_m(thickness_m, tip_radius_m)])
     deepest_N = force_at(deepest_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return int((force_N > deepest_N).sum())
@@ -199,7 +236,11 @@ def count_clipped(
 def depth_at(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the depth in m for each normal force, clipped to `DEEPEST` thicknesses (see `count_clipped`)."""
+    """Return the depth in m at which the normal force has the given value, for each force.
+
+    The result is at most `DEEPEST` thicknesses, and slightly less than the tip radius. Depths for larger forces are
+    clipped. `count_clipped` returns the number of clipped depths.
+    """
     if not modulus_Pa > 0:
         raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Check its unit.")
     curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
@@ -208,13 +249,16 @@ def depth_at(
 
 
 def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
-    """Return the greatest depth of `depth_at`: `DEEPEST` thicknesses, or slightly less than the tip radius."""
+    """Return the greatest depth of `depth_at`.
+
+    It is the smaller one of `DEEPEST` thicknesses and a value slightly below the tip radius.
+    """
     return min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
 
 
 @lru_cache(maxsize=64)
 def _curve(thickness_m: float, tip_radius_m: float) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    # Return depths in m, and (F / E)^(2/3) at these depths.
+    # Return equally spaced depths in m, and (F / E)^(2/3) at each depth, where F is the force and E is Young's modulus.
     curve_m = np.linspace(0, _deepest_m(thickness_m, tip_radius_m), CURVE_N)
     known_m2 = force_at(curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return curve_m, np.cbrt(known_m2**2)

@@ -1,6 +1,7 @@
-"""Simulate captures: the presses of a protocol on a skin, encoded in the file formats of recorded captures.
+"""Simulate captures: the readings of a board while its skin is pressed according to a protocol.
 
-The files of a simulated capture differ from those of a recorded one only by `source: simulated` in the header.
+The result is encoded in the file formats of recorded captures. A program can distinguish a simulated capture from a
+recorded one only by the entry `source: simulated` in its header.
 """
 
 from dataclasses import dataclass
@@ -37,14 +38,17 @@ from reskin.simulation.rig import (
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each part of a simulation has its own random generator, so that a change of one part does not change the random
-# numbers of the other parts.
+# The parts of a simulation. Each part has its own random generator. If a part needs more random numbers than before,
+# the random numbers of the other parts therefore stay the same.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
 @dataclass(frozen=True)
 class SimulatedCapture:
-    """A simulated capture before encoding: frames in order of time, arrival times, probe log and clock marks."""
+    """A simulated capture before it is encoded, with f frames in order of time and c chunks.
+
+    A frame contains one reading of each of the k chips. A chunk is a sequence of frames that arrive at the same time.
+    """
 
     name: str
     board: str
@@ -53,17 +57,19 @@ class SimulatedCapture:
     temperature_degC: Float32[np.ndarray, "f k"]
     arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames after each chunk; starts with 0
     arrived_s: Float64[np.ndarray, " c"]  # arrival time of each chunk, on the stream's clock
-    probe: ProbeLog
-    marks: tuple[tuple[float, float], ...]  # times of the same events on the clocks of stream and probe
+    probe: ProbeLog  # the log of the robot and the force sensor
+    # Times at which the clocks of stream and probe can be compared. Each pair has the time of one event on both clocks.
+    marks: tuple[tuple[float, float], ...]
     protocol: str  # description of the protocol, for the header
-    overruns: dict[str, int]  # kind of value out of range -> number of such values
-    card_rate_hz: float | None  # frame rate of a log on an SD card; None for frames from a port
+    overruns: dict[str, int]  # maps each kind of value out of range to the number of such values
+    # frame rate, if the board writes its frames to an SD card; None if it sends the frames to a port
+    card_rate_hz: float | None
 
 
 def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str, str]]:
-    """Return the names (board, skin) of all captures of a protocol.
+    """Return the names of the board and the skin of each capture of a protocol.
 
-    If boards or skins are added to the settings, existing names do not change.
+    If the number of boards or skins in the settings is increased, the existing names stay the same.
     """
     kind, skins_n = settings.boards[settings.protocols[protocol].boards], settings.protocols[protocol].skins_n
     boards = [f"{kind.letter}{board_i}" for board_i in range(kind.boards_n)]
@@ -74,7 +80,10 @@ def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str
 def simulate_capture(
     settings: SimulationSettings, protocol: str, *, board: str, skin: str, seed: int
 ) -> SimulatedCapture:
-    """Draw the board and the skin with these names, and simulate the capture of a protocol with them."""
+    """Simulate the capture of a protocol with the board and the skin that have the given names.
+
+    The board and the skin are drawn at random. Their random generators are seeded by `seed` and by their names.
+    """
     presses, chip, spreads = settings.protocols[protocol], settings.chip, settings.spreads
     rig, terms = rig_for(settings.rig, presses), settings.terms.only(presses.terms)
     kind = settings.boards[presses.boards]
@@ -116,9 +125,10 @@ def simulate_capture(
 
 
 def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[Header, dict[str, bytes]]:
-    """Return the header and the files (name -> content) of a native or SD-card capture.
+    """Encode a simulated capture; return the header, and a dict from the name of each file to its content.
 
-    The header does not contain the hashes of the files yet.
+    The layout of the capture is `sd-card` if the board writes its frames to an SD card, and `native` otherwise. The
+    hashes of the files are not yet in the header. The caller adds them when it writes the files.
     """
     on_card = capture.card_rate_hz is not None
     frames_n, chips_n = capture.temperature_degC.shape
@@ -147,7 +157,7 @@ def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[H
 
 
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the true positions of the tip in m in the board's frame.
+    """Return the true positions of the tip in m, in the coordinate system of the board.
 
     If the plan has loads instead of depths, the depths are computed from the loads and the skin's stiffness.
     """
@@ -160,7 +170,8 @@ def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[
 def _force_readings(response: Response, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:
     """Return force readings in N at each dwell, and the number of clipped values.
 
-    The first dwell of each indentation is without contact. The other dwells are at the stops of the indentation.
+    A dwell is a time in which the tip does not move. In the first dwell of each indentation, the tip is above the skin.
+    The other dwells are at the stops of the indentation.
     """
     force_N = np.concatenate([np.zeros((len(response.force_N), 1, 3)), response.force_N], axis=1)
     read_N, past_range_n = read_force(force_N.reshape(-1, 3), noise_N=rig.force_noise_N, rng=rng)

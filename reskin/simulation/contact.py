@@ -1,7 +1,8 @@
 """Simulate the response of a skin to a tip: the fields at the chips and the forces at every stop of a protocol.
 
-Optional effects (friction, ageing, ...) are simulated only if the protocol's settings list them under `terms`.
-The experiment `neglected_effects` reports the error that results if an effect is not simulated.
+A stop is a place and depth at which the tip rests while readings are taken. Friction, ageing and some other effects are
+optional: they are simulated only if the protocol's settings list them under `terms`. The experiment `neglected_effects`
+reports the error that results if such an effect is not simulated.
 """
 
 from collections.abc import Collection
@@ -41,7 +42,10 @@ from reskin.physics.skin import (
 
 
 class Terms(Strict):
-    """Section `terms` of the settings: parameters of physical effects that only some protocols simulate."""
+    """Section `terms` of the settings: the parameters of the optional physical effects.
+
+    An effect that is None is not simulated.
+    """
 
     ageing: Ageing | None = None
     friction: Friction | None = None
@@ -59,25 +63,22 @@ class Terms(Strict):
 
 
 class TangentialResponse(NamedTuple):
-    """Response to a dragged or tilted tip at each stop.
+    """The response of a skin to a dragged or tilted tip, for n indentations with p stops each, and k chips."""
 
-    force_N: tangential force on the skin. change_T: field change due to both pressing and dragging. slide_m:
-    translation of the skin on its base.
-    """
-
-    force_N: Float[np.ndarray, "n p 2"]
-    change_T: Float[np.ndarray, "n p k 3"]
-    slide_m: Float[np.ndarray, "n p 2"]
+    force_N: Float[np.ndarray, "n p 2"]  # tangential force on the skin
+    change_T: Float[np.ndarray, "n p k 3"]  # field change due to both pressing and dragging
+    slide_m: Float[np.ndarray, "n p 2"]  # translation of the skin on its base
 
 
 @dataclass(frozen=True)
 class Response:
-    """Fields at the chips, and forces on the skin, for n indentations with p stops each, and k chips."""
+    """The response of a skin to a tip, for n indentations with p stops each, and k chips."""
 
     rest_T: Float[np.ndarray, "n k 3"]  # no-load field before each indentation
-    change_T: Float[np.ndarray, "n p k 3"]
-    force_N: Float[np.ndarray, "n p 3"]
-    beyond_verified_n: int  # number of stops deeper than the range of the published solutions
+    change_T: Float[np.ndarray, "n p k 3"]  # field at each stop, minus the no-load field
+    force_N: Float[np.ndarray, "n p 3"]  # force on the skin; the last component is the normal force
+    # number of stops whose depth is beyond the range in which the published solution for the layer was verified
+    beyond_verified_n: int
 
 
 def simulate_response(
@@ -89,10 +90,16 @@ def simulate_response(
     terms: Terms,
     rng: np.random.Generator,
 ) -> Response:
-    """Simulate the response of a new skin at each stop of the tip (x, y, depth in the board's frame).
+    """Simulate the response of a new skin at each stop of the tip.
 
-    `tilt` is the slope of the stylus, dx/dz and dy/dz, for each indentation. If `terms.friction` is None, there is no
-    tangential force, and a dragged or tilted tip has the same effect as a press.
+    Parameters
+    ----------
+    board, skin : the board and the skin on it
+    tip_m : x, y and depth of the tip at each stop, in the coordinate system of the board
+    tilt : slope of the stylus, dx/dz and dy/dz, in each indentation
+    terms : the optional effects. If `terms.friction` is None, there is no tangential force, and a dragged or tilted tip
+        has the same effect as an upright tip that presses at the same place.
+    rng : random generator for the drift of the no-load field
     """
     n, stops_n, _ = tip_m.shape
     flat_m = tip_m.reshape(-1, 3)
@@ -127,11 +134,13 @@ def drag_tip(
 ) -> TangentialResponse:
     """Simulate a dragged or tilted tip at the stops of each indentation, with Coulomb friction.
 
-    The tangential force shears the layer under the tip. If springs hold the skin on its base (`Skin.hold`), the force
-    also moves the whole skin. Otherwise, the underside of the skin is assumed to be fixed sideways. Friction limits the
-    sum of the lateral forces due to pressing and dragging. The drag is assumed to exert its full force. The
-    displacement due to the press is multiplied by the remaining fraction of the friction limit, which is zero if the
-    tip slips.
+    The tangential force of the tip shears the layer under the tip. If springs hold the skin on its base (`Skin.hold`),
+    the force also moves the whole skin. Otherwise, the lower side of the skin is assumed to be fixed sideways.
+
+    Both pressing and dragging exert a lateral force, and friction limits the sum of the two forces. The drag is assumed
+    to exert its full force. The remaining fraction of the friction limit is available for the press. The displacement
+    due to the press is therefore multiplied by this fraction. If the tip slips, the drag uses the whole limit, so that
+    the fraction is zero.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=friction.coefficient))
@@ -152,7 +161,8 @@ def _drag_once(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
     force_N = _clip(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
-    # The deformations due to pressing and dragging are centred at the rest position of the material under the tip.
+    # The deformations due to pressing and dragging are centred at the place at which the material under the tip was
+    # before it was touched.
     drag_slide_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + drag_slide_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
@@ -182,7 +192,8 @@ def _base_compliance(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np
 def _in_series(
     layer_N_per_m: Float[np.ndarray, " p"], slides_m_per_N: Float[np.ndarray, "p 2 2"]
 ) -> Float[np.ndarray, "p 2 2"]:
-    # Return the stiffness of the layer in series with the springs of the base; 0 where the layer has no stiffness.
+    # Return the tangential stiffness of the layer in series with the springs of the base. It is 0 at stops without
+    # contact, where the stiffness of the layer is given as 0.
     stiff = layer_N_per_m > 0
     layers_m_per_N = np.eye(2) / np.where(stiff, layer_N_per_m, 1.0)[:, None, None]
     return np.where(stiff[:, None, None], np.linalg.inv(layers_m_per_N + slides_m_per_N), 0.0)
@@ -195,7 +206,7 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    with np.errstate(over="ignore"):  # the quotient is infinite if the force is far below the limit
+    with np.errstate(over="ignore"):  # the quotient overflows to infinity if the force is far below the limit
         return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 

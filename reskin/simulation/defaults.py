@@ -1,4 +1,4 @@
-"""Read the nominal settings of skin, rig, chips, boards and protocols from `nominal.yaml` in this folder."""
+"""Read the nominal settings of a simulation (skin, rig, chips, boards and protocols) from `nominal.yaml`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,5 +11,5 @@ SHARED = ("skin", "rig", "chip", "spreads", "terms")  # sections of `nominal.yam
 
 
 def nominal(section: str, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return a section of the nominal settings; `changes` replaces or adds settings."""
+    """Return a section of the nominal settings, in which `changes` replaces or adds settings."""
     return {**read_yaml(NOMINAL)[section], **(changes or {})}

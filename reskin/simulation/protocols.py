@@ -1,4 +1,8 @@
-"""Protocols of simulated captures. A protocol plans the places and depths of the tip in order of time."""
+"""Protocols of simulated captures.
+
+A protocol plans a sequence of indentations. An indentation has one or more stops, which are places and depths of the
+tip at which readings are taken. The plan contains the stops of all indentations in order of time.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -13,14 +17,16 @@ from reskin.data.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, points_mm, prot
 from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
-LIFTED_MM = -1.0  # depth of a tip above the skin, without contact; such stops are not in the robot's log
-DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; 1e-8 N for a skin with a stiffness of 10 N/mm
-DEEPEST_SHARE = 0.999  # largest depth under a load, relative to the smaller of thickness and tip radius
+# Depth at a stop at which the tip is above the skin and does not touch it. Such stops are not in the robot's log.
+LIFTED_MM = -1.0
+# Tolerance of the depth under a load. For a skin with a stiffness of 10 N/mm, this is a tolerance of 1e-8 N.
+DEPTH_STEP_M = 1e-12
+DEEPEST_SHARE = 0.999  # largest depth under a load, as a fraction of the thickness or the tip radius (the smaller one)
 
 
 @dataclass(frozen=True)
 class Stops:
-    """Positions of the tip in mm, for n indentations with p stops each."""
+    """The positions of the tip in mm, for n indentations with p stops each."""
 
     x_mm: Float64[np.ndarray, "n p"]
     y_mm: Float64[np.ndarray, "n p"]
@@ -37,36 +43,34 @@ Sides_mm = tuple[float, float]
 
 @dataclass(frozen=True)
 class Plan:
-    """The stops of the tip at which readings are taken, in order of time: n indentations with p stops each.
+    """A plan of n indentations with p stops each, in order of time."""
 
-    A negative depth is a stop above the skin. Depths are NaN if `weight_N` commands loads instead. `tilt` is the slope
-    of the stylus, dx/dz and dy/dz. `centre_mm` is the skin's centre in the coordinate system of the labels.
-    """
-
-    pass_i: Int32[np.ndarray, " n"]
+    pass_i: Int32[np.ndarray, " n"]  # index of the pass to which each indentation belongs
     x_mm: Float64[np.ndarray, "n p"]
     y_mm: Float64[np.ndarray, "n p"]
-    depth_mm: Float64[np.ndarray, "n p"]
-    tilt: Float64[np.ndarray, "n 2"]
+    depth_mm: Float64[np.ndarray, "n p"]  # negative at stops above the skin; NaN if `weight_N` commands loads instead
+    tilt: Float64[np.ndarray, "n 2"]  # slope of the stylus, dx/dz and dy/dz
     description: str
-    labelled: bool = True  # whether places, depths and forces are in the probe log
+    labelled: bool = True  # whether the probe log contains the places, depths and forces
     weight_N: Float64[np.ndarray, "n p"] | None = None  # commanded loads
-    centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)
+    centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)  # the skin's centre, in the coordinate system of the labels
 
     def __len__(self) -> int:
         return len(self.pass_i)
 
 
 class ProtocolSettings(Strict):
-    """Settings that all protocols have."""
+    """The settings that all protocols have."""
 
-    boards: str  # kind of board: a key of the scene's section `boards`
-    # number of skins; the first skin of each board is used first, then the second skin of each board, ...
+    boards: str  # the kind of the boards, which is a key of the scene's section `boards`
+    # Number of skins with which the protocol is executed. First, the first skin of each board is used, then the second
+    # skin of each board, and so on.
     skins_n: Count
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
-    ]  # physical effects to simulate
-    rate_hz: Rate_hz | None = None  # frame rate (lower for boards with more chips); default: the rate of the rig
+    ]  # optional physical effects to simulate
+    # Frame rate. By default, it is the rate of the rig. Boards with more chips need a lower rate.
+    rate_hz: Rate_hz | None = None
 
 
 class _RandomDepth(ProtocolSettings):
@@ -80,8 +84,9 @@ class _RandomDepth(ProtocolSettings):
 
 
 class _OnlyTemperature(ProtocolSettings):
-    # The other effects are not allowed. Ageing and relaxation would change the force between stops, which is not
-    # modelled. Friction has no effect, because the tip does not move sideways.
+    # Base class of protocols that can simulate only one optional effect, the temperature. Ageing and relaxation are not
+    # allowed, because they would change the force between the stops of an indentation, which is not modelled. Friction
+    # is not allowed, because it would have no effect: the tip does not move sideways.
     terms: tuple[Literal["temperature"], ...]
 
     @model_validator(mode="after")
@@ -100,7 +105,10 @@ class Grid(ProtocolSettings):
     depths_mm: Depths_mm
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Plan one indentation per place, depth and pass; all places are pressed at one depth before the next depth."""
+        """Plan one indentation per place, depth and pass.
+
+        In each pass, all places are pressed at the first depth, then all places at the second depth, and so on.
+        """
         pokes = protocol(self.depths_mm, self.passes_n)
         stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
         return _upright_plan(
@@ -109,7 +117,10 @@ class Grid(ProtocolSettings):
 
 
 class Drag(ProtocolSettings):
-    """A tip that is dragged along lines in x and in y, 2 mm apart, over the whole grid (paper section 4, shear)."""
+    """A tip that is dragged over the whole grid, along lines parallel to x and to y (paper section 4, shear).
+
+    The distance between adjacent lines is 2 mm.
+    """
 
     kind: Literal["drag"]
     passes_n: Count
@@ -117,7 +128,10 @@ class Drag(ProtocolSettings):
     step_mm: Annotated[float, Field(gt=0, le=4)]  # distance between stops
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Plan one indentation per line, depth and pass; the direction alternates from line to line."""
+        """Plan one indentation per line, depth and pass.
+
+        The direction in which the tip moves alternates from line to line.
+        """
         stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
         along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
         alternating_mm = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
@@ -125,8 +139,8 @@ class Drag(ProtocolSettings):
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
         x_mm = np.tile(np.concatenate([alternating_mm, across_mm]), (depths_n, 1))
         y_mm = np.tile(np.concatenate([across_mm, alternating_mm]), (depths_n, 1))
-        # In every second pass, all lines are reversed, so that the direction of the force cannot be inferred from the
-        # place.
+        # In every second pass, the direction of each line is reversed. Otherwise, a model could infer the direction of
+        # the tangential force from the place.
         directions = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
         stops = Stops(
@@ -141,16 +155,20 @@ class Drag(ProtocolSettings):
 
 
 class Hand(_RandomDepth):
-    """Manual indentations without labels: only their order along lines is known (paper section 5.2)."""
+    """Indentations by hand, whose places, depths and forces are not measured (paper section 5.2).
+
+    The user presses the skin along parallel lines. Only the order of the indentations along each line is known.
+    """
 
     kind: Literal["hand"]
     lines_n: Count
     pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
-    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # standard deviation of the place, across the line and along it
+    # standard deviation of the place from the intended place, across the line and along the line
+    place_sd_mm: Annotated[float, Field(ge=0, le=2)]
     tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # standard deviation of the stylus's tilt about x and about y
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Plan indentations along parallel lines over the grid; each line is one pass."""
+        """Plan indentations along parallel lines over the grid. Each line is one pass."""
         across_mm = np.linspace(0, 2 * CENTRE_MM, self.lines_n) if self.lines_n > 1 else np.array([CENTRE_MM])
         along_mm = np.linspace(0, 2 * CENTRE_MM, self.pokes_per_line_n)
         pokes_n = self.lines_n * self.pokes_per_line_n
@@ -168,9 +186,9 @@ class Hand(_RandomDepth):
 
 
 class Scatter(_RandomDepth):
-    """Indentations at random places, uniformly distributed over a skin (paper section 6, arm sleeve).
+    """Indentations at random places, which are uniformly distributed over a skin (paper section 6, arm sleeve).
 
-    The origin of the labels is a corner of the skin.
+    In the labels, x = 0 and y = 0 is a corner of the skin.
     """
 
     kind: Literal["scatter"]
@@ -192,13 +210,17 @@ class Scatter(_RandomDepth):
 
 
 class Load(_OnlyTemperature):
-    """A glass on the skin's centre that is filled in steps (paper section 6), modelled as a load on the rig's tip."""
+    """A glass that stands on the skin and is filled in steps (paper section 6).
+
+    The glass is modelled as the tip of the rig, which presses the centre of the skin with the weight of the glass.
+    """
 
     kind: Literal["load"]
-    # Number of fillings; at least 2, because an experiment fits to half of the fillings and tests on the other half.
+    # Number of times that the glass is filled. It must be at least 2, because an experiment fits a model to half of the
+    # fillings and tests the model on the other half.
     passes_n: Annotated[int, Field(ge=2, le=100_000)]
-    force_max_N: Annotated[float, Field(gt=0, le=100)]
-    step_N: Annotated[float, Field(gt=0, le=100)]
+    force_max_N: Annotated[float, Field(gt=0, le=100)]  # weight at the end of a filling
+    step_N: Annotated[float, Field(gt=0, le=100)]  # increase of the weight from stop to stop
 
     @model_validator(mode="after")
     def _check_steps(self) -> "Load":
@@ -208,7 +230,10 @@ class Load(_OnlyTemperature):
         return self
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Plan one filling per pass. The depths are NaN: they will be computed from the loads and the skin."""
+        """Plan one filling per pass, with one stop per load.
+
+        The depths in the plan are NaN, because they depend on the skin (see `depths_under_load`).
+        """
         weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
         centre_mm = np.full(weight_N.shape, CENTRE_MM)
         stops = Stops(centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
@@ -217,19 +242,24 @@ class Load(_OnlyTemperature):
 
 
 class Press(_OnlyTemperature):
-    """Presses at grid places, whose depth is half a sine over time; each frame is a stop.
+    """Presses at places of the grid, which are read throughout (dynamic data, section 7 of the paper).
 
-    These presses represent the dynamic data in section 7 of the paper.
+    The depth of a press over time is half a period of a sine. Each frame is one stop.
     """
 
     kind: Literal["press"]
     presses_n: Count
-    duration_s: tuple[Duration_s, Duration_s]  # durations are log-uniform between these limits
-    depth_mm: tuple[Depth_mm, Depth_mm]
+    # limits of the duration of a press; the logarithm of the duration is uniformly distributed between these limits
+    duration_s: tuple[Duration_s, Duration_s]
+    depth_mm: tuple[Depth_mm, Depth_mm]  # limits of the largest depth of a press, which is uniformly distributed
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw places, durations and depths. After a short press, the tip stays lifted until the longest would end."""
+        """Draw the place, the duration and the largest depth of each press.
+
+        All presses have the same number of stops, which is that of the longest press. After a shorter press, the tip
+        stays above the skin for the remaining stops.
+        """
         least_s, most_s = self.duration_s
         long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
         long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)
@@ -243,18 +273,21 @@ class Press(_OnlyTemperature):
 
 
 class Walk(_OnlyTemperature):
-    """Footfalls of a shoe, or touches of a glove, in one continuous recording (paper section 6: dog shoe, glove)."""
+    """Steps of a shoe, or touches of a glove, in one continuous recording (paper section 6: dog shoe, glove)."""
 
     kind: Literal["walk"]
     steps_n: Count
-    stance_s: tuple[Duration_s, Duration_s]
-    swing_s: tuple[Duration_s, Duration_s]
+    stance_s: tuple[Duration_s, Duration_s]  # limits of the time in which the skin is touched in one step
+    swing_s: tuple[Duration_s, Duration_s]  # limits of the time without contact after each step
     quiet_s: Duration_s  # time without contact before the first step
-    depth_mm: tuple[Depth_mm, Depth_mm]
+    depth_mm: tuple[Depth_mm, Depth_mm]  # limits of the largest depth in one step
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Plan a walk as one indentation with one stop per frame; footfalls alternate with swings above the skin."""
+        """Plan a walk as a single indentation, in which each frame is one stop.
+
+        After each step, the tip stays above the skin for some time.
+        """
         stance_n, swing_n = (
             np.maximum(np.round(rng.uniform(*range_s, size=self.steps_n) * self.rate_hz).astype(np.int64), 1)
             for range_s in (self.stance_s, self.swing_s)
@@ -281,7 +314,7 @@ def _upright_plan(
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Create a plan with an upright tip; without `pass_i`, all indentations are in one pass."""
+    """Create a plan with an upright tip. If `pass_i` is None, all indentations belong to one pass."""
     n = len(stops.depth_mm)
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
     return Plan(
@@ -291,12 +324,14 @@ def _upright_plan(
 
 
 def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:
-    """Return the loads of one filling, from 0 to the maximum in equal steps."""
+    """Return the loads of one filling, which increase from 0 to the maximum in equal steps."""
     return step_N * np.arange(round(force_max_N / step_N) + 1)
 
 
 def depths_under_load(skin: Skin, load_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
-    """Solve for the commanded depth in m at which the force equals each load; at load 0, the tip just touches the skin.
+    """Return the commanded depth in m at which the force on the skin equals each load.
+
+    At the load 0, the tip just touches the skin.
 
     Raises
     ------
@@ -322,7 +357,10 @@ def _depth_under_load(skin: Skin, load_N: float) -> float:
 
 
 def half_sine(frames_n: int, peak_mm: float) -> Float64[np.ndarray, " p"]:
-    """Return the depth in mm at the middle of each frame of a press whose depth is half a sine over time."""
+    """Return the depth in mm of a press at the middle of each frame.
+
+    The depth over time is half a period of a sine with the amplitude `peak_mm`.
+    """
     return peak_mm * np.sin(np.pi * (np.arange(frames_n) + 0.5) / frames_n)
 
 

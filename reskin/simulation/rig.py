@@ -1,4 +1,8 @@
-"""The simulated rig (robot, force sensor, chips, port and clocks), which produces frames and a probe log."""
+"""The simulated rig: a robot with a force sensor, and the readout of a board.
+
+The simulation of the rig produces the frames that the board sends, and the probe log, which is the log of the robot and
+the force sensor.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,45 +25,55 @@ Spread = Annotated[float, Field(ge=0, le=1)]
 
 
 class Rig(Strict):
-    """Section `rig` of the settings: frames per dwell, errors of robot and force sensor, timing of port and clocks."""
+    """Section `rig` of the settings.
 
-    noload_frames_n: FrameCount
-    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames while the tip moves down, and while it moves up
-    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames before each dwell while the tip is at rest
-    readings_n: FrameCount
+    The settings are the numbers of frames in the phases of an indentation, the errors of the robot and the force
+    sensor, and the timing of the port and the clocks. A dwell is a time in which the tip rests while readings are
+    taken.
+    """
+
+    noload_frames_n: FrameCount  # frames in the dwell above the skin, before each indentation
+    # frames while the tip moves down, and the same number of frames while it moves up
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames for which the tip already rests before a dwell
+    readings_n: FrameCount  # frames in the dwell at each stop
     rate_hz: Rate_hz
-    robot_place_sd_mm: Spread  # standard deviation of the robot's position along x and along y
-    robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
-    place_offset_sd_mm: Spread  # sd of (true place - label), a constant offset for all skins of a board
-    force_noise_N: Annotated[float, Field(ge=0, le=10)]
-    chunk_frames_max_n: FrameCount
+    robot_place_sd_mm: Spread  # standard deviation of the robot's error along x and along y, for each indentation
+    robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]  # standard deviation of the robot's error of the depth
+    # Standard deviation of the difference between true place and label along x and along y. The difference is the same
+    # for all indentations on a board.
+    place_offset_sd_mm: Spread
+    force_noise_N: Annotated[float, Field(ge=0, le=10)]  # standard deviation of the noise of the force sensor
+    chunk_frames_max_n: FrameCount  # largest number of frames that arrive together at the port, as one chunk
     arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean of the exponentially distributed delay of a chunk
-    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of (probe clock - stream clock)
-    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd of the relative rate error
+    # standard deviation of the difference between the clock of the probe log and the clock of the stream of frames
+    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]
+    # standard deviation of the relative difference between the rates of the two clocks
+    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """The frames of one indentation (t frames).
+    """The t frames of one indentation, which are the same for all indentations of a capture.
 
-    `stop_i` is the stop to which a frame belongs. `share` is the fraction of this stop's field change that is reached
-    at the frame.
+    The field in a frame is the no-load field plus a fraction of the field change at one stop.
     """
 
-    stop_i: Int64[np.ndarray, " t"]
-    share: Float64[np.ndarray, " t"]
-    noload_i: int  # first frame of the no-load dwell
-    contact_i: Int64[np.ndarray, " p"]  # first frame of each contact dwell
+    stop_i: Int64[np.ndarray, " t"]  # index of this stop, for each frame
+    share: Float64[np.ndarray, " t"]  # this fraction, for each frame: 0 above the skin, and 1 at the stop
+    noload_i: int  # index of the first frame of the no-load dwell
+    contact_i: Int64[np.ndarray, " p"]  # index of the first frame of the dwell at each stop
 
     def __len__(self) -> int:
         return len(self.stop_i)
 
 
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
-    """Return the rig's settings for a protocol.
+    """Return the settings of the rig with the changes that a protocol needs.
 
-    The frame rate is that of the protocol, if the protocol sets one. Protocols `press` and `walk` have one frame per
-    stop. Protocol `walk` has no robot, no force noise, and a single clock.
+    If the protocol sets a frame rate, it replaces the frame rate of the rig. The protocols `press` and `walk` have one
+    frame per stop. In the protocol `walk`, there is no robot, so the errors of the robot and the noise of the force are
+    set to zero, and the probe log has the same clock as the stream.
     """
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
@@ -80,7 +94,8 @@ def rig_for(rig: Rig, protocol: Protocol) -> Rig:
 def timeline(rig: Rig, stops_n: int) -> Timeline:
     """Create the timeline of an indentation.
 
-    The tip settles, dwells without contact, moves down, settles and dwells at each stop, and moves up.
+    First, the tip settles and dwells above the skin. Then it moves down, and settles and dwells at each stop. Finally,
+    it moves up.
     """
     ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
     lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
@@ -92,10 +107,10 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
 
 
 def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the true positions of the tip (x, y, depth in mm): planned positions plus the robot's error.
+    """Return the true positions (x, y and depth in mm) of the tip: the planned positions plus the robot's error.
 
-    The error is the same for all stops of an indentation. Plans without labels are not executed by a robot, so the
-    planned positions are the true positions.
+    The error is the same for all stops of an indentation. A plan without labels describes presses by hand, in which no
+    robot makes errors. Its planned positions are therefore the true positions.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -107,7 +122,13 @@ def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[
 def draw_arrivals(
     frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
-    """Draw chunks of frames; return the number of frames up to each chunk's end, and each chunk's arrival time in s."""
+    """Divide the frames at random into chunks, and draw the arrival time of each chunk.
+
+    Returns
+    -------
+    frames_n : number of frames up to the end of each chunk; starts with 0
+    arrived_s : arrival time in s of each chunk; starts with 0
+    """
     frames_n = len(frame_s)
     sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
     ends = np.cumsum(sizes)
@@ -117,16 +138,24 @@ def draw_arrivals(
 
 
 def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw the offset in s and the relative rate of the probe clock with respect to the stream clock."""
+    """Draw the offset in s and the rate of the clock of the probe log, relative to the clock of the stream."""
     offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
     return float(offset_s), float(1 + error)
 
 
 def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
-    """Create the log of robot and force sensor: for each indentation, one dwell without contact, then p stops.
+    """Create the probe log, which is the log of the robot and the force sensor.
 
-    Each indentation therefore has d = 1 + p dwells. A dwell lasts from half a frame before its first frame to half a
-    frame after its last frame. Stops above the skin are not logged.
+    For each indentation, the log has one dwell above the skin and one dwell for each of the p stops, so the number of
+    dwells is d = 1 + p. Stops above the skin are not logged. A dwell lasts from half a frame before its first frame to
+    half a frame after its last frame.
+
+    Parameters
+    ----------
+    plan : the planned positions, which are the labels
+    read_N : force reading in each dwell
+    rig : settings of the rig
+    clock : offset and rate of the clock of the probe log, from `draw_clock`
     """
     stops_n = plan.x_mm.shape[1]
     frames = timeline(rig, stops_n)
@@ -152,47 +181,58 @@ def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: t
     return ProbeLog(*(column[logged] for column in dwells))
 
 
-FORCE_RANGE_N = (25.0, 25.0, 35.0)  # +- on x, y and z: ATI Nano17, calibration SI-25-0.25 (data sheet)
+# Largest magnitude of each component of the force that the sensor can measure: x, y and z of the ATI Nano17 with the
+# calibration SI-25-0.25 (data sheet).
+FORCE_RANGE_N = (25.0, 25.0, 35.0)
 
 
 def read_force(
     force_N: Float[np.ndarray, "n 3"], *, noise_N: float, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "n 3"], int]:
-    """Return force readings with noise, and the number of values that were clipped to the sensor's range."""
+    """Simulate readings of the force sensor, which have noise and are clipped to the sensor's range.
+
+    Returns
+    -------
+    read_N : the readings
+    clipped_n : number of values that were clipped
+    """
     noisy_N = force_N + noise_N * rng.standard_normal(force_N.shape)
     read_N = noisy_N.clip(-np.array(FORCE_RANGE_N), FORCE_RANGE_N)
     return read_N.astype(np.float32), int(np.count_nonzero(read_N != noisy_N))
 
 
-BLOCK_INDENTATIONS_N = 1000  # indentations per block, to limit memory
+BLOCK_INDENTATIONS_N = 1000  # number of indentations that are computed at once; limits the use of memory
 
 
 @dataclass(frozen=True)
 class SimulatedFrames:
-    """Readings of all chips in order of time, and the numbers of values outside the chips' range (`chip.Overruns`)."""
+    """The readings of all chips in f frames, in order of time."""
 
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
-    clipped_n: int
-    wrapped_n: int
+    clipped_n: int  # number of clipped fields (see `chip.Overruns`)
+    wrapped_n: int  # number of readings that overflowed an int16
 
 
 @dataclass(frozen=True)
 class Readout:
-    """Properties of the readout of a board in one capture, such as the conversion phase of each chip."""
+    """The properties of the readout of a board with k chips, which stay the same during one capture."""
 
     board: Board
     design: ChipDesign
-    rate_hz: float
-    phase_s: Float64[np.ndarray, " k"]
-    temperature: Temperature | None
-    sensitivity_per_K: Float64[np.ndarray, " k"]
+    rate_hz: float  # frame rate
+    phase_s: Float64[np.ndarray, " k"]  # time of each chip's first conversion
+    temperature: Temperature | None  # None if the temperature is constant
+    sensitivity_per_K: Float64[np.ndarray, " k"]  # relative change of each chip's sensitivity per kelvin
 
 
 def start_readout(
     board: Board, design: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
 ) -> Readout:
-    """Draw the conversion phase and the temperature dependence of the sensitivity of each chip for one capture."""
+    """Draw the properties of the chips that differ from capture to capture.
+
+    These are the time of each chip's first conversion, and the change of its sensitivity with the temperature.
+    """
     chips_n = len(board.chips_m)
     phase_s = chip.CONVERSION_S * rng.random(chips_n)
     sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
@@ -207,9 +247,10 @@ def read_frames(
     noise: np.random.Generator,
     warmth_noise: np.random.Generator,
 ) -> SimulatedFrames:
-    """Simulate the chips' readings at all frames of all indentations.
+    """Simulate the chips' readings in all frames of all indentations.
 
-    Frames are computed in blocks of indentations; the result does not depend on the block size.
+    To limit the use of memory, the frames are computed in blocks of indentations. The size of the blocks does not
+    affect the result.
     """
     frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / readout.rate_hz
     age_s, source_i = chip.last_conversions(frame_s, readout.phase_s)
@@ -220,7 +261,7 @@ def read_frames(
         b_uT.append(block_uT)
         overruns.append(overrun)
         temperature_degC.append(read_temperature(chip_degC, readout.design, warmth_noise))
-    # Frames that contain the same conversion of a chip have the same reading, including the noise.
+    # If several frames contain the same conversion of a chip, they have exactly the same reading, including the noise.
     chip_i = np.arange(len(readout.phase_s))
     repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
     return SimulatedFrames(
@@ -234,9 +275,9 @@ def read_frames(
 def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
-    # Return the field in T and the temperature in degC at the conversion of each chip, for one block of indentations.
-    # The first frames of the block may contain conversions from the previous indentation. Therefore, the field of that
-    # indentation is computed too.
+    # Return the field in T and the temperature in degC at the conversion of each chip, for the block of indentations
+    # that starts with the index `first_i`. The first frames of the block may contain conversions that the chips made
+    # during the indentation before the block. Therefore, the field of this indentation is computed too.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]

@@ -16,20 +16,20 @@ from reskin.simulation.defaults import SHARED
 from reskin.simulation.protocols import Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
-MAIN = "grid"  # name of the main protocol; a capture of this protocol has the same name as its skin
+MAIN = "grid"  # name of the main protocol, whose captures have the same names as their skins
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """A kind of board, and the numbers of boards and skins; names of boards and skins start with `letter`."""
+    """Settings of one kind of board: how many boards and skins of this kind are simulated, and their design."""
 
-    letter: Annotated[str, Field(pattern="^[a-z]$")]
+    letter: Annotated[str, Field(pattern="^[a-z]$")]  # first letter of the names of all boards and skins of this kind
     boards_n: Count
     skins_per_board_n: Count
     design: BoardDesign
-    skin_mm: tuple[Side_mm, Side_mm]  # along x and y
-    quadrature: QuadratureSettings
+    skin_mm: tuple[Side_mm, Side_mm]  # sides of the skin along x and y
+    quadrature: QuadratureSettings  # how the skin is divided into cells to compute its field
 
     @property
     def skin_m(self) -> tuple[float, float]:
@@ -37,7 +37,11 @@ class BoardKind(Strict):
 
 
 class SimulationSettings(Strict):
-    """A scene's section `simulate`, together with the nominal sections that all simulations share."""
+    """All settings of a simulation.
+
+    The boards and protocols are from section `simulate` of a scene. The other settings are from `nominal.yaml` and are
+    the same for all simulations.
+    """
 
     boards: Annotated[dict[str, BoardKind], Field(min_length=1)]
     protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
@@ -80,7 +84,7 @@ class SimulationSettings(Strict):
 
     @property
     def main(self) -> Grid:
-        """The main protocol, whose captures are split into folds for training and testing."""
+        """The settings of the main protocol, whose captures are used for training and testing."""
         main = self.protocols[MAIN]
         assert isinstance(main, Grid), "checked above"
         return main
@@ -91,7 +95,14 @@ class SimulationSettings(Strict):
 
 
 def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> SimulationSettings:
-    """Parse a scene's section `simulate` together with the shared sections; drop `terms` that no protocol lists."""
+    """Parse the settings of a simulation.
+
+    Parameters
+    ----------
+    section : section `simulate` of a scene
+    shared : the sections of `nominal.yaml` that all simulations use; `terms` that no protocol lists are ignored
+    where : name of the section for error messages
+    """
     protocols = section.get("protocols")
     named = {
         term
