@@ -1,9 +1,16 @@
-"""Predict places from inputs without the contact's signal, on the folds within one skin, and score the predictions.
+"""Control experiments: predict the place of a contact from inputs that do not contain the signal of the contact.
 
-The method is k nearest neighbours (k = 2). The input is either the no-load field, or the number of the indentation in
-its pass. If such predictions are accurate, networks may have learnt places from the order of the scan rather than from
-contacts. The hover control uses models that were trained on contacts to predict the place of a hovering tip. The
-accuracy of the hover control is at chance level, unless the chips sense the tip itself.
+A robot presses the places of a skin in a certain order, and repeats this in several passes. A network could therefore
+learn to predict the place from the progress of the scan, and not from the contact. The first control predicts places
+from one of two inputs: the no-load field before the indentation, or the number of the indentation in its pass. It uses
+nearest neighbours (k = 2). If its predictions are accurate, the scores of networks on the same folds do not prove that
+the networks recognise contacts.
+
+The second control, the hover control, takes models that were trained on contacts and applies them to readings that were
+taken while the tip hovers over the skin. The accuracy of these predictions is at chance level, unless the chips sense
+the tip itself.
+
+Both controls use only folds in which training rows and test rows are from the same skin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,21 +34,29 @@ from reskin.seeds import rng_for
 
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
-MAGNITUDES = ("hover_uT", "touch_uT")  # names of the median |dB| of hovering rows, and of contacts at about 1 N
-TOUCH_N = (0.8, 1.2)  # range of forces of the contacts at about 1 N
+# Names of two columns: the median |dB| of the rows in which the tip hovers, and of contacts with a force of about 1 N.
+MAGNITUDES = ("hover_uT", "touch_uT")
+TOUCH_N = (0.8, 1.2)  # smallest and largest force that count as "about 1 N"
 BY_TIME = "single_temporal"  # experiment that trains on some passes and tests on others
 
 
 @dataclass(frozen=True)
 class Scan:
-    """For each row of the scene, the no-load field and the number of the row's indentation in its pass."""
+    """The inputs of the first control, for each row of the scene.
+
+    noload_uT: the no-load field before the row's indentation.
+    scan_i: the number of the row's indentation in its pass, counted from 0.
+    """
 
     noload_uT: Float32[np.ndarray, "f ch"]
     scan_i: Int64[np.ndarray, " f"]
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack the no-load field and the indentation's number in its pass, in the order of the scene's rows."""
+    """Gather the inputs of the first control from all captures, in the order of the scene's rows.
+
+    `selection` must be the one with which the rows were loaded, because it determines which readings are rows.
+    """
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -50,7 +65,10 @@ def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
 
 
 def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
-    """For each reading, count the earlier indentations in its pass, including those without a contact."""
+    """Return, for each reading, the number of earlier indentations in its pass.
+
+    Indentations without a contact are counted too.
+    """
     passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
     indentation = readings.indentation.astype(np.int64)
     first = np.full(len(passes), indentation.max())
@@ -60,7 +78,10 @@ def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
 
 @dataclass(frozen=True)
 class Hover:
-    """Readings while a tip hovers over a known place without contact; `pass_i` is numbered as in `Rows`."""
+    """Readings that were taken while the tip hovered over a known place without contact.
+
+    The passes of each skin are numbered as in `Rows`, so that a row can be assigned to a training or a test pass.
+    """
 
     db_uT: Float32[np.ndarray, "f ch"]
     place_mm: Float32[np.ndarray, "f 2"]
@@ -72,11 +93,11 @@ class Hover:
 
 
 def gather_hover(captures: Sequence[Readings]) -> Hover:
-    """Stack the rows without force between the contacts of a pass, each with the place of the next contact.
+    """Gather all rows in which the tip hovers: rows without force and between two contacts of the same pass.
 
-    A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass are
-    omitted, because they are the pass's no-load reading. Rows after the last contact are omitted, because no contact
-    follows.
+    The place of such a row is that of the next contact, because a tip that descends in steps first hovers over the
+    place that it then presses. Rows before the first contact of a pass are omitted, because they are the pass's no-load
+    reading. Rows after the last contact are omitted, because no contact follows.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
@@ -100,10 +121,11 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
 def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
 ) -> pa.Table:
-    """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
+    """Run both controls, and return a table of their scores.
 
-    networks: trained networks by fold, which the hover control uses in addition to nearest neighbours. The table has
-    one row for each fold and input, and one row for each fold and model of the hover control.
+    For the first control, the table has one row for each fold and each of the two inputs. For the hover control, it has
+    one row for each fold and each kind of model: nearest neighbours, and the trained networks that `networks` contains
+    for the fold. The scores of the networks are averaged.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
@@ -123,7 +145,10 @@ def score_before_contact(
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
-    """Apply models that were trained on contacts to the hovering rows in a fold's test passes, and score them."""
+    """Run the hover control on one fold: predict the places of the hovering rows in the fold's test passes.
+
+    The models are nearest neighbours, fitted to the contacts of the training rows, and the given networks.
+    """
     rows = data.rows
     test_passes = set(zip(rows.skin[fold.test], rows.pass_i[fold.test].tolist(), strict=True))
     in_test_passes = np.array(
@@ -151,8 +176,8 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> Mapping[str, float]:
-    """Train nearest neighbours on inputs without the contact's signal, and score the places predicted for test rows."""
-    rng = rng_for(data.settings.seed, "before-touch")  # `fit` needs it; nearest neighbours do not use it
+    """Run the first control on one fold: fit nearest neighbours to the training rows, and score the test rows."""
+    rng = rng_for(data.settings.seed, "before-touch")  # `fit` requires a generator, although this method is not random
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
     scores = score(data.rows.target[test], fitted.predict(inputs[test]))
     return {name: scores[name] for name in PLACE}

@@ -1,7 +1,8 @@
-"""Experiment calibrated: a finished universal model, calibrated to each held-out board, scored on the test rows.
+"""Experiment calibrated: calibrate a finished universal model to each held-out board, and score it on the test rows.
 
-The model is the one that comes with the project, or one that `reskin model make` made for the layout of the scene's
-boards. No recording is used to train it.
+The model is either the one that comes with the project, or one that `reskin model make` made for the layout of the
+scene's boards. In both cases, it was trained on simulated skins only. The recordings of the scene are used for nothing
+but calibration and tests.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,10 +27,12 @@ from reskin.universal.model import FILE, Universal, load_universal
 
 
 class Calibrated(Strict):
-    """Section calibrated: the model, and numbers of labelled presses of the held-out board.
+    """Settings of the experiment: section `calibrated` of a scene's file.
 
-    model: path of the model's .safetensors file in the checkout; its card is beside it. even: whether the presses are
-    at the places of a grid around the board's centre, with equally many presses at each place.
+    model: the path of the model's .safetensors file in the checkout. The model's JSON card must be beside the file.
+    labels_n: numbers of labelled presses. The model is calibrated and scored once for each of these numbers.
+    even: whether the presses are at the places of a grid around the board's centre, with equally many presses at each
+    place.
     """
 
     model: str
@@ -39,7 +42,10 @@ class Calibrated(Strict):
 
 @dataclass(frozen=True)
 class Frame:
-    """Conversion of a scene's labels to the coordinates of the model, and back; both are the same operation."""
+    """Conversion between the coordinates of a scene's labels and the coordinates of the model.
+
+    The two differ only in the direction of the y axis. Therefore, `convert` converts in both directions.
+    """
 
     centre_mm: tuple[float, float]
     mirrored: bool  # whether y of the labels points opposite to y of the board
@@ -49,7 +55,7 @@ class Frame:
 
 
 def read_model(file: Path, layout: BoardLayout | None, settings: Settings) -> Universal:
-    """Read the model; raise `ParamsError` if it was made for a layout other than the scene's."""
+    """Read a universal model; raise `ParamsError` if it was made for another layout of chips than that of the scene."""
     if layout is None:
         raise ParamsError(f"{settings.where}: experiment calibrated needs key layout in section compare. Add it there.")
     model = load_universal(file=file)
@@ -70,7 +76,7 @@ def replace_name(layout: BoardLayout, name: str) -> BoardLayout:
 
 
 def rest_by_skin(captures: Iterable[Readings]) -> dict[str, Float[np.ndarray, " ch"]]:
-    """Return the mean no-load field of each skin."""
+    """Return the no-load field of each skin, averaged over all its captures."""
     fields: dict[str, list[np.ndarray]] = {}
     for readings in captures:
         fields.setdefault(readings.skin, []).append(readings.noload_uT)
@@ -80,10 +86,11 @@ def rest_by_skin(captures: Iterable[Readings]) -> dict[str, Float[np.ndarray, " 
 def score_fold(
     data: SceneData, fold: Fold, model: Universal, frame: Frame, rest_uT: Mapping[str, np.ndarray], section: Calibrated
 ) -> list[dict[str, Any]]:
-    """Calibrate the model to each skin of the held-out board; score it for every number of labels.
+    """Calibrate the model to each skin of a fold's held-out board, and score it; repeat this for each number of labels.
 
-    The calibration to a skin uses its no-load field, all presses in the fold's pool without their labels, and the
-    labels of the given number of these presses.
+    The pool of a fold is the set of presses that are reserved for calibration and not tested. With n labels, the model
+    is calibrated to the no-load field of a skin, to all presses on this skin in the pool (without their labels), and to
+    the labels of those that are among the first n presses of the pool.
     """
     points = []
     presses, tested = pool_rows(data, fold), data.rows.skin[fold.test]
@@ -108,7 +115,7 @@ def score_fold(
 
 
 def method_of(section: Calibrated, model: Universal) -> str:
-    """Describe the model in tables."""
+    """Return the name that tables and figures use for the model."""
     shipped = Path(section.model).name == FILE.name
     return "shipped model" if shipped else f"made for layout {model.layout.name}"
 

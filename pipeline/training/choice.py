@@ -1,13 +1,19 @@
-"""Choose settings from the model cards of a scene in which each board was held out in turn.
+"""Choose the settings of training and adaptation from the results of a scene that tried several candidates.
 
-The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
-budget, which is the number of training steps, is not chosen, because each scene sets it. Every candidate is tried with
-the same budgets, and its errors are averaged over the budgets, so that no candidate wins by training longer. Settings
-with a collapsed training run are not chosen. Settings of adaptation are chosen together with the triplet weight of the
-network that is adapted, because without adaptation the triplet term only increases the error.
+In this scene, each board is held out in turn. The results are read from model cards, the JSON files that describe
+trained networks and their scores. The criterion is the mean squared error of places on the held-out boards. Only
+networks with the paper's inputs are candidates.
 
-The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
-fingerprint that the current code computes.
+The number of training steps, called the budget, is not chosen here, because every scene sets its own budget. So that no
+candidate wins by training longer, every candidate is tried with the same budgets, and its errors are averaged over the
+budgets. A candidate is excluded if one of its training runs collapsed, which means that the network predicts nearly the
+same for all inputs.
+
+The settings of adaptation and the weight of the triplet loss are chosen together. Without adaptation, the triplet loss
+only increases the error, so that its weight cannot be chosen from the networks before adaptation.
+
+The record of a choice contains a fingerprint of the simulated skin. An audit later compares it with the fingerprint
+that the current code computes, to detect that the simulation has changed since the choice.
 """
 
 import hashlib
@@ -27,12 +33,14 @@ from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
-# Settings that the description of a candidate lists.
+# The settings that are listed when a candidate is described.
 VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
 )  # fmt: skip
-BUDGET = ("steps_n", "base")  # a scene's number of steps and the name of a base recipe are not settings of the method
+# Keys that are ignored when settings are compared, because they are not settings of the method: the number of steps,
+# which the scene sets, and the name of the recipe with which the adapted network was pretrained.
+BUDGET = ("steps_n", "base")
 WHERE = "choice of settings"
 
 Card = Mapping[str, Any]
@@ -40,10 +48,14 @@ Cards = Sequence[Card]
 
 
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
-    """Choose settings for every stage; return `recipe_name`, `settings`, `by` (the criterion) and scored `candidates`.
+    """Choose settings for the stages `train_multi`, `train_triplet` and `adapt`.
 
-    The choice for `adapt` also has the error of the control, the same network fine-tuned for equally long without
-    pokes.
+    Returns
+    -------
+    For each stage, a dictionary with these keys: `recipe_name` and `settings` of the best candidate, `by` (the
+    criterion), and `candidates` (all candidates with their scores). For stage `adapt`, there are also the keys `error`
+    and `control`. The latter is the error of the control experiment, in which the same network is trained for equally
+    many further steps, but without pokes of the new skin.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
@@ -68,9 +80,10 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
 def to_record(
     chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
 ) -> dict[str, Any]:
-    """Record the choice with its boards and skins, for the audit of the scenes that use the chosen settings.
+    """Return the record of a choice, as it is written to a JSON file.
 
-    `physics` is the fingerprint of the simulated skin's settings.
+    The record names the boards and skins on which the settings were chosen. Audits need it to check the scenes that use
+    the chosen settings. `physics` is the fingerprint of the simulated skin (see `fingerprint`).
     """
     return {
         "scene": cards[0]["scene"], "source": source, "seed": seed, "physics": physics,
@@ -81,7 +94,7 @@ def to_record(
 
 
 def settings_of(card: Card) -> dict[str, Any]:
-    """Return the settings of a training run: its recipe, or the settings of its adaptation if it has one."""
+    """Return the settings of a training run: those of the adaptation if it is one, otherwise those of the recipe."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
@@ -92,7 +105,10 @@ def without_budget(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, Any], dict[str, float]]:
-    """Find the eligible card with the smallest error; return it, the choice, and the errors by recipe."""
+    """Choose the settings of one stage among the eligible cards.
+
+    Returns the card with the smallest error, the choice as a dictionary, and the errors of all cards by recipe.
+    """
     what = f"candidates of {stage}"
     if not eligible:
         raise ParamsError(f"{WHERE}: no {what}. Run experiments lobo, triplet and adapt.")
@@ -113,19 +129,23 @@ def _has_collapsed(card: Card) -> bool:
 
 
 def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Average the error over budgets, by recipe; recipes that differ only in their budget get the same value."""
+    """Return the error of each recipe, averaged over budgets.
+
+    Recipes that differ only in their budget are the same candidate, so they have the same average.
+    """
     settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
     errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
 
     def over_budgets(key: Mapping[str, Any]) -> float:
         by_budget = {budget: errors[name] for name, (other, budget) in settings.items() if other == key}
-        return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
+        # If two recipes have equal settings and budgets under different names, only one of them is counted.
+        return float(np.mean(list(by_budget.values())))
 
     return {name: over_budgets(key) for name, (key, _) in settings.items()}
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:
-    """Raise `ParamsError` unless every candidate was tried with the same numbers of steps."""
+    """Raise `ParamsError` unless all candidates were tried with the same set of budgets."""
     budgets_by_name = {
         card["recipe_name"]: {_budget(other) for other in cards if _key(other) == _key(card)} for card in cards
     }
@@ -138,17 +158,21 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without budget; for an adaptation, also those of the pretrained network."""
+    """Return the settings by which candidates are distinguished: all settings except the budget.
+
+    For an adaptation, these are the settings of the adaptation and those of the network that is adapted.
+    """
     return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
 def _budget(card: Card) -> tuple[int, int]:
-    """Return the numbers of steps of training and of adaptation (0 without adaptation)."""
+    """Return the number of training steps, and the number of adaptation steps, which is 0 without adaptation."""
     return (card["recipe"]["steps_n"], card["tuning"]["settings"]["steps_n"] if "tuning" in card else 0)
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # the first card of each recipe
+    # The order is reversed, so that the settings of the first card of each recipe are kept.
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}
     return [
         {
             "recipe_name": name,
@@ -159,9 +183,9 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     ]
 
 
-# --- Fingerprint of the simulation: unchanged as long as equal indentations give equal fields and forces ---
+# --- Fingerprint of the simulation. It does not change as long as equal indentations give equal fields and forces. ---
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # same as in scene quick
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # the same quadrature as in scene quick
 BOARD = BoardDesign(
     chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
     chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),
@@ -169,13 +193,17 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant digits, which changes of the physics change, but rounding errors do not
+# Simulated values are rounded to this number of significant digits. Changes of the physics alter these digits, but
+# rounding errors do not.
+DIGITS = 4
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:
-    """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
+    """Return a digest that identifies the simulated skin.
 
-    A refactoring does not change the digest; a change of the physics or of a setting does.
+    The digest is computed from the fields and forces of two simulated skins under fixed indentations, and from the
+    settings of the rig and of the chips. It changes if the physics or one of these settings changes. It does not change
+    if the code is only restructured.
     """
     design = parse(SkinDesign, sections["skin"], "skin")
     spreads = parse(Spreads, sections["spreads"], "spreads")

@@ -1,8 +1,11 @@
-"""Experiment labels: methods on a held-out board, with different numbers of labelled indentations of that board.
+"""Experiment labels: how well do networks and classical methods work on a new board, if a few labels are available?
 
-Networks are trained, adapted with unlabelled indentations, and fine-tuned on labelled ones. Classical methods are
-fitted to the training rows and the labelled indentations. This module lists the training jobs;
-`pipeline.stages.universal` runs and scores them.
+One board is held out as the new board. A label is an indentation of this board whose place and force are known. The
+methods use different numbers of labels. Networks are trained on the other boards. Some of them are adapted with
+unlabelled indentations of the held-out board. All of them are fine-tuned on the labels. Classical methods are fitted to
+the training rows and the labels together.
+
+This module lists the training jobs. `pipeline.stages.universal` runs and scores them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,11 +30,15 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
 class FewLabels(SectionWithRows):
-    """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
+    """Settings of the experiment: section `few_labels` of a scene's file.
 
-    adapted: recipes whose networks are also adapted with unlabelled indentations. adapting: settings of these
-    adaptations. labelling: settings of fine-tuning on labelled indentations. rows_max_n: maximum number of training
-    rows of a classical method.
+    labels_n: numbers of labelled indentations of the held-out board. Each method is scored for each of these numbers.
+    recipes: settings of the training of networks, by name.
+    adapted: names of the recipes whose networks are also adapted with unlabelled indentations.
+    adapting: settings of these adaptations.
+    labelling: settings of the fine-tuning on labelled indentations.
+    rows_max_n: largest number of training rows of the other boards to which a classical method is fitted.
+    methods: settings of the classical methods, by name.
     """
 
     labels_n: Labels
@@ -62,7 +69,7 @@ class FewLabels(SectionWithRows):
 
 @dataclass(frozen=True)
 class Study:
-    """Inputs of the experiment: the scene's rows, the experiment's folds, the seed and the settings."""
+    """The inputs of the experiment: the rows of the scene, the folds of the experiment, the seed and the settings."""
 
     rows: Rows
     folds: Sequence[Fold]
@@ -72,7 +79,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Entry:
-    """Identifies one result of the experiment by the method, the method's inputs, the number of labels and the fold."""
+    """The identity of one result: which method was scored, with which inputs, with how many labels, on which fold."""
 
     method: str
     inputs: str
@@ -84,7 +91,7 @@ TrainedEntry = tuple[Entry, TrainingJob, TrainingResult]
 
 
 def network_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that train every recipe on every fold."""
+    """List the jobs that train a network with every recipe on every fold."""
     return [
         (
             Entry(name, recipe.inputs, 0, fold),
@@ -96,9 +103,10 @@ def network_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[
 
 
 def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that adapt networks of recipes `adapted` with all indentations of the fold's pool, without labels.
+    """List the jobs that adapt the networks of the recipes in `adapted` to the held-out board.
 
-    The pool is the set of indentations of the held-out board that are reserved for calibration and not tested.
+    The pool of a fold is the set of indentations of the held-out board that are reserved for calibration and not
+    tested. The adaptation uses all indentations of the pool, but not their labels.
     """
     pairs = []
     for entry, job, trained in trained_entries:
@@ -111,7 +119,7 @@ def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> li
 
 
 def fine_tuning_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that fine-tune every trained or adapted network on each number of labelled indentations."""
+    """List the jobs that fine-tune every trained or adapted network, one job for each number of labels above 0."""
     pairs = []
     for entry, job, trained in trained_entries:
         for labels_n, row in _labelled_rows(study, entry.fold).items():
@@ -124,7 +132,7 @@ def fine_tuning_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> l
 
 
 def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
-    """List the jobs that fit every classical method with each number of labelled indentations."""
+    """List the jobs that fit every classical method on every fold, one job for each number of labels."""
     rows_max_n = study.settings.rows_max_n
     return [
         (
@@ -138,9 +146,10 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw labelled indentations from the fold's pool (see `adaptation_jobs`); return their rows by number of labels.
+    """Choose which indentations of the fold's pool are labelled, and return their row numbers by number of labels.
 
-    A larger number of labels includes all indentations of every smaller number.
+    The pool is described in `adaptation_jobs`. A larger number of labels includes all indentations of every smaller
+    number.
     """
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)

@@ -1,4 +1,8 @@
-"""Training for one scene: read rows and folds, make and run training jobs, write models with JSON cards."""
+"""Train the networks of one scene: read its data, make training jobs, run them, and write the trained models.
+
+A training job trains one network with one recipe (named settings of the training) on one fold with one seed. Each model
+is written with a JSON card, a file that describes the training and the scores of the model.
+"""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,14 +34,15 @@ from reskin.models.trained import FORMAT
 from reskin.seeds import rng_for
 
 TRAINING_MODULE = "reskin.models.train"
-CACHE = ".reskin/cells"  # completed training runs; a cache, not an output
+CACHE = ".reskin/cells"  # folder with the results of completed training runs; it is not an output of a DVC stage
 
-PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe name, fold name and index of the seed
+# Pretrained networks. The keys consist of the name of the recipe, the name of the fold and the index of the seed.
+PretrainedNetworks = dict[tuple[str, str, int], Pretrained]
 
 
 @dataclass(frozen=True)
 class SceneData:
-    """Inputs of a stage that trains: the scene's settings, its rows and its folds."""
+    """The inputs of a stage that trains networks: the settings of a scene, its rows of readings, and its folds."""
 
     scene: str
     settings: Settings
@@ -51,7 +56,11 @@ class SceneData:
 
 @dataclass(frozen=True)
 class AdaptationPokes:
-    """Unlabelled pokes in lines of places that adapt a network to a skin; `experiment` and `what` name the job."""
+    """Unlabelled pokes of a new skin to which a network is adapted. Only the order of the pokes along lines is known.
+
+    `experiment` and `what` are parts of the name of the training job. `seed_i` is the index of the seed of the network
+    that is adapted.
+    """
 
     experiment: str
     skin: str
@@ -61,7 +70,7 @@ class AdaptationPokes:
 
 
 class ModelCard(TypedDict):
-    """The JSON card of a model, which describes training, inputs, outputs and scores."""
+    """The content of a model's JSON card, which describes the model's training, inputs, outputs and scores."""
 
     format: str
     scene: str
@@ -107,12 +116,15 @@ class _HasTimes(Protocol):
 
 
 def preload_training() -> None:
-    """Start the workers' fork server, which imports the training module while the stage reads its data."""
+    """Prepare the worker processes: import the training module in the background while the stage reads its data.
+
+    The module is imported by the fork server, the process from which the workers are started.
+    """
     prepare_workers(TRAINING_MODULE)
 
 
 def read_data(settings: Settings, indentations: Path, folds: Path) -> SceneData:
-    """Read the rows and folds of a scene."""
+    """Read the rows of a scene from its ingested captures, and its folds from `folds.json`."""
     content = io.read_json(folds)
     files = [indentations / f"{name}.parquet" for name in content["captures"]]
     rows = load_rows(files, settings.section(Selection, "selection"))
@@ -129,7 +141,11 @@ def training_data(data: SceneData) -> TrainingData:
 def make_jobs(
     data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
 ) -> list[TrainingJob]:
-    """Make a job for every fold, recipe and seed; without `experiment`, a job belongs to the experiment of its fold."""
+    """Make a training job for every fold, recipe and seed.
+
+    `experiment` is the name of the experiment to which the jobs belong. By default, each job belongs to the experiment
+    of its fold.
+    """
     return [
         TrainingJob(
             experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test
@@ -149,7 +165,11 @@ def adaptation_jobs(
     experiment: str,
     pokes_n: int,
 ) -> Iterator[TrainingJob]:
-    """Make the jobs that adapt a fold's networks to each held-out skin, with `pokes_n` unlabelled indentations."""
+    """Make the jobs that adapt the networks of a fold to each of its held-out skins.
+
+    Each adaptation uses `pokes_n` unlabelled indentations of the skin. There is one job for each skin and each
+    pretrained network of the fold.
+    """
     for skin in np.unique(data.rows.skin[fold.test]):
         for seed_i in select_pretrained(pretrained, named_recipe[1].base, fold):
             lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
@@ -164,7 +184,10 @@ def adaptation_job(
     pretrained: PretrainedNetworks,
     pokes: AdaptationPokes,
 ) -> TrainingJob:
-    """Make the job that adapts the fold's network of one seed to one skin and tests it on that skin's test rows."""
+    """Make the job that adapts one network to one skin, and tests the adapted network on the test rows of this skin.
+
+    The network is the one that was trained on the training rows of the fold with seed `pokes.seed_i`.
+    """
     name, settings = named_recipe
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = select_pretrained(pretrained, settings.base, fold)[pokes.seed_i]
@@ -176,7 +199,11 @@ def adaptation_job(
 
 
 def pool_lines(data: SceneData, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
-    """Draw `pokes_n` of the skin's indentations in the fold's adaptation pool; order them along the robot's grid."""
+    """Draw `pokes_n` indentations of a skin, and order them along the lines of the robot's grid.
+
+    The indentations are drawn from the fold's pool, which contains the indentations that are reserved for adaptation
+    and not tested.
+    """
     pool = fold.pool[data.rows.skin[fold.pool] == skin]
     rng = rng_for(data.settings.seed, "pokes", skin, seed_i)
     return grid_lines(data.rows, take_pokes(data.rows, pool, pokes_n, rng))
@@ -195,7 +222,7 @@ def read_pretrained(models: Path) -> PretrainedNetworks:
 
 
 def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> dict[int, Pretrained]:
-    """Return the networks of recipe `base` and one fold, by the index of their seed."""
+    """Select the networks that were trained with recipe `base` on one fold; return them by the index of their seed."""
     selected = {
         seed_i: network for (recipe, name, seed_i), network in pretrained.items() if (recipe, name) == (base, fold.name)
     }
@@ -208,7 +235,11 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 
 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
-    """Train the jobs whose results are not cached; return all results, record costs, and warn of diverged runs."""
+    """Run the training jobs of a stage, and return their results.
+
+    Jobs whose results are in the cache are not trained again. The computing times are recorded, and a warning is
+    printed for each training run that diverged.
+    """
     start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
@@ -232,9 +263,10 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> list[ModelCard]:
-    """Write models, cards and predictions to folder `models`; return the cards.
+    """Write the trained models, their cards and their predictions to the folder `models`; return the cards.
 
-    Times are written to a file that is not an output of the stage.
+    The times of the training runs are written to another file, which is not an output of the DVC stage, because times
+    differ between equal runs.
     """
     code = code_of(stage)
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
@@ -250,12 +282,12 @@ def write_models(
 
 
 def code_of(stage: str) -> str:
-    """Return the last commit that changed the code of a stage."""
+    """Return the version of a stage's code: the last commit that changed the code."""
     return code_version_of(imported(module_name(stage)))
 
 
 def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> ModelCard:
-    """Describe a trained network, without its scores."""
+    """Return the card of a trained network, without its scores."""
     card = ModelCard(
         format=FORMAT,
         scene=scene,
@@ -306,31 +338,41 @@ def _tuning_record(tuning: Adaptation | FineTuning, rows: Rows) -> dict[str, Any
 
 
 def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> ModelCard:
-    """Describe a trained network with its scores on the test rows."""
+    """Return the card of a trained network, with its scores on the test rows of its job."""
     card = model_card(job, result, data.rows, data.scene)
     card["scores"] = score_test(data, job.test, result.predicted)
     return card
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions over all test rows and per skin, as they are and after subtracting an offset per board."""
+    """Score predictions on test rows: over all rows, over the rows of each skin, and after removing an offset.
+
+    The offset is a constant shift of the places on each board (see `reskin.metrics.score_groups`).
+    """
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 
 def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, method: str) -> dict[str, Any]:
-    """Return the scores of a training run as a point of a sweep's curve."""
+    """Return the scores of a training run in the form in which sweeps store them, as one point of a curve."""
     card: dict[str, Any] = {**scored_card(data, job, result)}
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
     return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
 def collapse_record(result: TrainingResult) -> dict[str, Any]:
-    """Return whether the training run collapsed, and how many earlier attempts with other random draws collapsed."""
+    """Return whether a training run collapsed, and how many earlier runs of the same job collapsed.
+
+    A run has collapsed if the network predicts nearly the same value for all inputs. A job that collapses is run again
+    with other random draws.
+    """
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
-    """Write start, duration and prediction time of each training run to a file that is not an output of the stage."""
+    """Write the times of each training run: its start, its duration, and the time of a prediction for one reading.
+
+    The file is not an output of the DVC stage, because times differ between equal runs.
+    """
     seconds = [
         {
             "name": job.name,
@@ -344,7 +386,7 @@ def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Seq
 
 
 def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:
-    """Tabulate true and predicted values, with one row per job and test row."""
+    """Return a table of the true and predicted values of all jobs, with one row for each test row of each job."""
     tables = []
     for job, result in zip(jobs, results, strict=True):
         names = {"question": job.experiment, "recipe": job.recipe_name, "fold": job.fold, "seed_i": job.seed_i}

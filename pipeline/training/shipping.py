@@ -1,8 +1,15 @@
-"""Make universal models for boards: `reskin model make`, and the shipped one: `python -m pipeline.training.shipping`.
+"""Make universal models for given boards, and the model that is shipped with the library.
 
-The second command takes a few minutes, and writes reskin/universal/universal.safetensors and its card. The networks
-have the training settings and the seed of scene lab, which tests the shipped model under the name
-`universal, simulated alone`. Likelihood powers are calibrated on simulated skins.
+`reskin model make` calls `make`, which makes a model for the layout of chips in a file.
+
+`python -m pipeline.training.shipping` makes the shipped model, which is for the paper's board. The command takes a few
+minutes. It writes reskin/universal/universal.safetensors, and a JSON card (a description of the model) beside it. The
+networks are trained with the settings and the seed of scene lab. Scene lab also tests the shipped model, under the name
+`universal, simulated alone`.
+
+A universal model consists of a map (a probabilistic model of one skin, `reskin.universal.map`), of networks, and of
+likelihood powers. A likelihood power is an exponent of the likelihood, and a smaller power gives larger standard
+deviations. This module chooses the powers such that the intervals of the model are correct on simulated skins.
 """
 
 import time
@@ -34,9 +41,12 @@ from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
 
-PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
-PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not
-NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
+# Numbers of unlabelled presses for which likelihood powers are chosen. One of them is 12, because `reskin live` asks
+# its users for 12 presses.
+PRESSES_N = (0, 12, FULL_SET_N)
+# Sets of unlabelled presses for which powers are chosen: the number of presses, and whether they are evenly spread.
+PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))
+NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})  # placeholder until the powers are chosen
 CARD = {
     "source": "simulated",
     "map": "fields of simulated presses on a lattice of places and forces, and their derivatives by the parameters of "
@@ -70,7 +80,12 @@ MADE = {
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Choose likelihood powers for a misfit of 1, by number of presses and labels, from coverage on simulated skins."""
+    """Choose the likelihood powers of a model, for each set of unlabelled presses and each number of labels.
+
+    The model is calibrated to simulated skins from the prior. The chosen powers are those for which the 90 % intervals
+    of places contain about 90 % of the true coordinates on these skins. They are valid for a misfit of 1. In use, a
+    power is divided by the misfit of the skin's presses and by the variance inflation of the skin's labels.
+    """
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in CALIBRATION_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
@@ -87,10 +102,21 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
 def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Calibrate a model, in place, to presses and labels from the pool of a simulated skin.
+    """Calibrate `model` to presses of simulated skin `i`; the model is modified.
 
-    counts: the numbers of presses and of labels. Returns the readings of the skin's test presses, in the chips' axes,
-    and the places of these presses in the coordinates of labels.
+    The presses of the skin are split at random into a pool for calibration, and presses for testing.
+
+    Parameters
+    ----------
+    counts
+        The number of unlabelled presses and the number of labelled presses. Both are taken from the start of the pool.
+    even
+        Whether the model is told that the unlabelled presses are evenly spread over the skin.
+
+    Returns
+    -------
+    The readings of the test presses, along the axes of the chips, and the places of these presses in the coordinates of
+    labels.
     """
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
     fields_uT, centre_mm = (skins.rest_uT[i][None], pool.db_uT, tested.db_uT), np.array(model.layout.centre_mm)
@@ -108,7 +134,11 @@ def calibrate(
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` needs two."""
+    """Return the coverage of 90 % intervals, with one row for each candidate power.
+
+    Both columns are equal. They are needed because `best_powers` also chooses powers for a second method, which is not
+    used here.
+    """
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
     covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
@@ -117,7 +147,13 @@ def _coverages(
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs for training the model: prior of the skins, training settings, numbers of labels, and seed."""
+    """The inputs from which a model is made.
+
+    prior: the distribution from which simulated skins are drawn.
+    training: the settings of the training of the networks.
+    labels_n: the numbers of labels for which likelihood powers are chosen.
+    seed: the seed of all random numbers.
+    """
 
     prior: SkinPrior
     training: TrainingSettings
@@ -126,7 +162,10 @@ class Inputs:
 
 
 def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml"), layout: BoardLayout | None = None) -> Inputs:
-    """Read a scene's training settings, for skins on the board of a layout (by default, the paper's)."""
+    """Read training settings and seed from a scene's file, and combine them with the prior of a layout.
+
+    The prior is the distribution of skins on the layout's board. By default, this is the paper's board.
+    """
     board = layout or paper_layout()
     settings = read_yaml(scene)
     training = {name: settings["universal"][name] for name in TrainingSettings.model_fields}
@@ -139,7 +178,11 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml"), layout: BoardLay
 
 
 def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] = print) -> Universal:
-    """Simulate the map, train the networks and calibrate the likelihood powers for the board of a layout."""
+    """Make a universal model for the board of a layout.
+
+    The steps are: simulate the map, train the networks, and choose the likelihood powers. Progress is reported by
+    calling `say`.
+    """
     from reskin.universal.training import train_networks  # imported here, because it imports torch
 
     times_s = [time.process_time()]
@@ -167,7 +210,11 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
 
 
 def read_layout_of(file: Path) -> BoardLayout:
-    """Read a layout from a file or name that `read_layout` accepts, or from section `compare` of a scene's file."""
+    """Read a layout of chips from a file.
+
+    `file` can be the file of a layout, the name of a layout (see `read_layout`), or the file of a scene. In a scene's
+    file, the layout is in section `compare`.
+    """
     content = read_yaml(file) if file.suffix in (".yaml", ".yml") else {}
     if not (isinstance(content, dict) and "source" in content):
         return read_layout(file)
@@ -180,7 +227,9 @@ def read_layout_of(file: Path) -> BoardLayout:
 
 
 def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> None:
-    """Make the model for the layout in a file, and write it and its card (same name with suffix .json).
+    """Make a model for the layout in a file, and write it to the file `out`.
+
+    The model's card is written beside it, with the same name and suffix .json.
 
     Raises
     ------
@@ -199,7 +248,7 @@ def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> No
 
 
 def write_model(model: Universal, about: Mapping[str, Any], out: Path) -> None:
-    """Write a model that `make_model` made; `about` is added to its card."""
+    """Write a model that `make_model` made, with its card. The entries of `about` are added to the card."""
     write(model.tables, model.networks, model.powers, model.layout, {**about, **model.card}, out)
 
 

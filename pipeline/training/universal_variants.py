@@ -2,6 +2,12 @@
 
 There are two variants of the model. Variant `rig` is made from simulated skins and from the recorded boards that are
 not held out. Variant `nominal` is made from simulated skins alone.
+
+Each variant is made in three steps. First, a prior distribution of the parameters of skins is chosen. The parameters
+are those of the law, a simulation that gives the field change of a press (`reskin.universal.law`). For variant `rig`,
+the law is fitted to the recorded boards. Second, the field changes according to the law are tabulated as a map, a
+probabilistic model of one skin (`reskin.universal.map`). Third, networks are trained on skins that are drawn from the
+prior.
 """
 
 from collections.abc import Mapping
@@ -32,16 +38,20 @@ from reskin.universal.map import (
 from reskin.universal.model import PriorModel
 from reskin.universal.network import Weights, from_tensors, to_tensors
 
-READINGS_N = 100  # readings that training uses per press of a recorded board
+READINGS_N = 100  # number of readings that training uses for each press of a recorded board
 FORMAT = "reskin-universal-1"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Conversions from chip axes to board axes, and between label coordinates and the board's frame.
+    """Conversions between the coordinates of a scene's recordings and the coordinates of its boards.
 
-    turn: for each chip, the rotation from the chip's axes to the board's axes. middle_mm: the board's centre in label
-    coordinates. mirrored: whether y of the labels points opposite to y of the board.
+    Recorded fields are along the axes of the chips, which are converted to the axes of the board. The labels of a scene
+    have their own origin, and are converted to places relative to the board's centre.
+
+    turn: the rotation from a chip's axes to the board's axes, for each chip.
+    middle_mm: the board's centre, in the coordinates of the labels.
+    mirrored: whether the y axis of the labels points opposite to the y axis of the board.
     """
 
     turn: Float[np.ndarray, "k 3 3"]
@@ -64,9 +74,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class KnownBoards:
-    """All recorded boards of a scene, including each board that is later held out.
+    """All recorded boards of a scene. They include the boards that are held out, one at a time, when models are made.
 
-    presses: the presses on each board, in the board's frame.
+    data: the rows and folds of the scene.
+    frame: the conversion of the recordings to the boards' coordinates.
+    setup: the layout and the settings with which skins are simulated.
+    presses: the presses on each board, with places and fields in the board's coordinates.
     """
 
     data: SceneData
@@ -77,21 +90,27 @@ class KnownBoards:
 
 @dataclass(frozen=True)
 class Variant:
-    """A model before calibration to a board, and the prior distribution from which its simulated skins were drawn."""
+    """One variant of the universal model, which is not yet calibrated to a board.
+
+    `prior` is the distribution from which the skins were drawn on which the networks of `model` were trained.
+    """
 
     prior: SkinPrior
     model: PriorModel
 
 
 class Variants(NamedTuple):
-    """Variant `nominal`, and for each held-out board the variant `rig` that was made from the other boards."""
+    """Both variants of the model. For variant `rig`, there is one model for each held-out board.
+
+    The model `rig[board]` was made without data of this board.
+    """
 
     nominal: Variant
     rig: Mapping[str, Variant]
 
 
 def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
-    """Fit a physical model (law) to each known board; then tabulate a map and train networks for each variant."""
+    """Make all models: choose their priors, tabulate their maps, and train their networks."""
     from reskin.universal.training import train_networks  # imported late, because it imports PyTorch
 
     with make_executor(imports="reskin.universal.training") as executor:
@@ -106,7 +125,10 @@ def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
 
 
 def read_variants(known: KnownBoards, models: Path) -> Variants:
-    """Read the networks that `write_networks` wrote; compute laws and maps again, because they are not stored."""
+    """Read the networks of all models, which `write_networks` wrote.
+
+    The priors and maps are computed again, because they are not stored in the files.
+    """
     with make_executor(imports="reskin.universal.map") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
@@ -118,7 +140,10 @@ def read_variants(known: KnownBoards, models: Path) -> Variants:
 
 
 def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
-    """Return the nominal prior first, and then, for each board, the prior made from all other boards."""
+    """Fit the law to each board, and return the priors of all models.
+
+    The first one is the nominal prior. It is followed, for each board, by the prior that is made from all other boards.
+    """
     boards, setup = known.presses, known.setup
     laws = dict(
         zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
@@ -128,7 +153,11 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior made from the laws, the errors of the laws, and the readings of all boards except `board`."""
+    """Return the prior that is made from all boards except `board`.
+
+    The centre of the prior is the mean of the laws that were fitted to these boards (see `mean_law`). The prior also
+    contains the readings of these boards, and a model of the errors that the fitted laws have on them.
+    """
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
@@ -137,7 +166,11 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit a residual to the relative errors that each law has on the board to which the law was fitted."""
+    """Fit a model of the errors of the law (`Residual`).
+
+    On each board, the errors are the differences between the measured field changes and those of the law that was
+    fitted to this board. Each error is divided by the size of the simulated field change.
+    """
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -149,12 +182,15 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select `READINGS_N` training readings of each press with a force; a press with fewer readings repeats them."""
+    """Select `READINGS_N` readings of each press of a board, for training; rows without a force are left out.
+
+    If a press has fewer readings, they are repeated. If it has more, the first ones are used.
+    """
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     rows_by_press = own[
         first[:, None] + np.arange(READINGS_N) % counts[:, None]
-    ]  # the readings of a press are adjacent
+    ]  # this is possible because the readings of a press are adjacent rows
     db_uT = frame.field(rows.db_uT[rows_by_press.ravel()]).reshape(*rows_by_press.shape, -1)
     place_mm = frame.place(rows.target[rows_by_press[:, 0], :2].astype(float))
     parts = db_uT, rest_uT, place_mm, rows.target[rows_by_press, 2]
@@ -162,7 +198,7 @@ def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarr
 
 
 def write_networks(models: Path, variants: Variants, settings: TrainingSettings, seed: int) -> None:
-    """Write the networks of each variant to a file, with a JSON card beside it."""
+    """Write the networks of each model to a file of its own, with a JSON card (its description) beside the file."""
     with io.replacing(models) as folder:
         folder.mkdir()
         for variant in (variants.nominal, *variants.rig.values()):
@@ -172,7 +208,7 @@ def write_networks(models: Path, variants: Variants, settings: TrainingSettings,
 
 
 def read_networks(models: Path, name: str) -> list[Weights]:
-    """Read the networks that were trained for the prior of this name."""
+    """Read the networks that were trained on skins from the prior with this name."""
     return from_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
 
 
@@ -181,7 +217,11 @@ def _file_name(name: str) -> str:
 
 
 def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str, object]:
-    """Return the card of a variant's networks: how they were trained, and what they must not be used for."""
+    """Return the content of the JSON card of a model's networks.
+
+    The card states how the networks were trained, what their inputs and outputs are, and what they must not be used
+    for.
+    """
     prior = variant.prior
     return {
         "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,
