@@ -60,7 +60,11 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write our table 2 and its figure as soon as the networks are trained; stage report writes both again."""
+    """Write our version of the paper's table 2, and its figure.
+
+    This stage runs as soon as the networks are trained, so that these results can be seen early. Stage report, which
+    runs last, writes both again.
+    """
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -71,7 +75,7 @@ def table2(settings: Settings, models: Path, tables: Path) -> None:
 
 
 def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
-    """Write the numbers, tables, figures and the page of a scene."""
+    """Write the report of a scene: numbers.json, tables, figures, and the page that shows them."""
     name, scene = settings.scene, planned_scene(settings)
     source, inputs = scene.source, read_inputs(name, scene, indentations, folds, models, results)
     scores = tidy(inputs.cards, inputs.points)
@@ -98,7 +102,8 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         figures |= figures_future.result()
         costs = costs_future.result()
     io.write_texts(reports / "figures", figures)
-    # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
+    # This folder is not an output of the DVC stage, because computing times, commit and machine differ between runs
+    # whose results are equal.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     write_index(reports.parent)
@@ -111,7 +116,18 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
 
 @dataclass(frozen=True)
 class Inputs:
-    """Inputs of stage report: results of training runs and experiments by name, and counts of captures."""
+    """The inputs of stage report: the results of training runs and of experiments, and counts of captured data.
+
+    cards: the JSON cards of all trained networks.
+    points: the scores of sweeps, which are shown as curves, by experiment.
+    analyses: the results of the experiments of kind `analysis`, by experiment.
+    studies: the results of the experiments of kind `study`, by experiment.
+    described: the description of the recordings, by its key in section `described` of numbers.json.
+    final_model: the entry of the final model in numbers.json; empty if the scene has none.
+    before_touch: the scores of places that are predicted from data before the contact.
+    ingest_counts: for each capture, counts of the data that were read and dropped.
+    dropped: for each reason, the number of rows that were not used for training and tests.
+    """
 
     cards: list[dict[str, Any]]
     points: dict[str, Any]
@@ -125,7 +141,7 @@ class Inputs:
 
 
 def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, models: Path, results: Path) -> Inputs:
-    """Read the results of all stages that the scene runs."""
+    """Read the results of all stages that a scene runs."""
 
     def read(names: Iterable[str]) -> dict[str, Any]:
         return {name: io.read_json(results / f"{name}.json") for name in names}
@@ -149,7 +165,7 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
 
 
 def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd.DataFrame) -> dict[str, Any]:
-    """Compute the content of numbers.json and provenance.json."""
+    """Compute the numbers of a run. They are written to numbers.json and provenance.json."""
     analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
     studies = {EXPERIMENTS[name].key: result for name, result in inputs.studies.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
@@ -181,7 +197,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
 
 
 def write_index(reports: Path) -> None:
-    """Write the page that lists all scenes with reports."""
+    """Write the page that lists the reports of all scenes."""
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
     files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
     headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
@@ -200,11 +216,14 @@ def write_index(reports: Path) -> None:
 
 
 def publish(settings: Settings, indentations: Path, models: Path, results: Path, reports: Path) -> None:
-    """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
+    """Write the training runs and the report of a scene to MLflow.
+
+    Only runs that MLflow does not have yet are written. If MLflow cannot be reached, a warning is printed.
+    """
     if not publishing():
         return
     scene, name = planned_scene(settings), settings.scene
-    # Results of `dvc exp` and results of the checkout are in different MLflow experiments.
+    # Results of `dvc exp` are written to another MLflow experiment than the results of the checkout.
     experiment = f"{name} (dvc exp)" if is_experiment() else name
     try:
         found = published_results(scene, name, indentations, models, results, reports)
@@ -216,7 +235,7 @@ def publish(settings: Settings, indentations: Path, models: Path, results: Path,
 def published_results(
     scene: Scene, name: str, indentations: Path, models: Path, results: Path, reports: Path
 ) -> Results:
-    """Collect what the stages of a scene wrote, for MLflow."""
+    """Collect the results of all stages of a scene in the form in which they are written to MLflow."""
     scores_file = reports / "scores.json"
     table_2 = io.read_json(scores_file).get("table2", {}) if scores_file.exists() else {}
     return Results(
@@ -231,15 +250,20 @@ def published_results(
 
 
 def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
-    """Write the runs of a scene that MLflow lacks; return a sentence with their number and their address."""
+    """Write to MLflow those runs of a scene that it does not have yet.
+
+    Returns a sentence for the user that states how many runs MLflow has, and the address at which they can be seen.
+    """
     counts = write_runs(results, scene=experiment, root=root, register=register)
     return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
 
 
 def read_curves(scene: Scene, results: Path) -> Curves:
-    """Read the results that MLflow shows as curves: the points of every sweep, and the numbers of every analysis.
+    """Read the results that MLflow shows as curves, and return them by the name of the stage that computed them.
 
-    The curves are returned by the name of the stage that computed them.
+    The results are of two kinds. A sweep is an experiment that repeats a training with different values of a setting,
+    and gives one point of a curve for each value. An analysis is an experiment whose file of results contains numbers,
+    which may be single values or curves.
     """
     points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
@@ -252,7 +276,11 @@ def read_curves(scene: Scene, results: Path) -> Curves:
 
 
 def planned_scene(settings: Settings) -> Scene:
-    """Parse the scene; raise `ParamsError` if its experiments differ from those in the plan."""
+    """Parse the scene of a stage, and compare its experiments with the plan.
+
+    The plan (pipeline/plan.yaml) lists the experiments that the DVC stages run. If the scene's file was edited after
+    the plan was written, their experiments may differ. In this case, a `ParamsError` is raised.
+    """
     scene = parse_scene(settings.of_scene, settings.where)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
     if list(scene.experiments) != list(planned):
@@ -264,5 +292,5 @@ def planned_scene(settings: Settings) -> Scene:
 
 
 def read_cards(models: Path, stages: Iterable[str]) -> list[dict[str, Any]]:
-    """Read the model cards of these stages."""
+    """Read the cards of all models that these stages trained."""
     return [io.read_json(file) for stage in stages for file in sorted((models / stage).glob("*.json"))]

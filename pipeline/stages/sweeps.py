@@ -1,4 +1,8 @@
-"""Stages of paper figure 6: adaptation with different numbers of pokes, and training on different numbers of skins."""
+"""Stages that reproduce figure 6 of the paper.
+
+Stage `sweep_pokes` adapts networks with different numbers of pokes (figure 6a). Stage `sweep_sensors` trains networks
+on different numbers of skins (figure 6b).
+"""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,9 +28,10 @@ from reskin.models.recipe import HEADLINE
 
 
 class PokesSweep(Strict):
-    """Section sweep_pokes: numbers of unlabelled indentations; 0 means no adaptation.
+    """Settings of stage sweep_pokes: section `sweep_pokes` of a scene's file.
 
-    boards_n: number of held-out boards, which are the last boards of the scene.
+    pokes_n: numbers of unlabelled indentations with which networks are adapted; 0 means no adaptation.
+    boards_n: the number of boards that are held out in turn. They are the last boards of the scene.
     """
 
     pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
@@ -36,7 +41,10 @@ class PokesSweep(Strict):
 def sweep_pokes(
     settings: Settings, section: PokesSweep, indentations: Path, folds: Path, pretrained: Path, scores: Path
 ) -> None:
-    """Adapt networks with each number of unlabelled indentations, and score them (paper figure 6a)."""
+    """Adapt pretrained networks with each number of unlabelled indentations, and score them (figure 6a of the paper).
+
+    The networks are adapted to each skin of the held-out boards, and scored on the test rows of this skin.
+    """
     preload_training()
     data, networks = read_data(settings, indentations, folds), read_pretrained(pretrained)
     recipe = settings.section(Adaptations, "adapt").recipes[HEADLINE]
@@ -64,7 +72,7 @@ def sweep_pokes(
 
 
 def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
-    """Return the scores of the networks before adaptation, as points with 0 pokes."""
+    """Return the scores of the pretrained networks, which are not adapted, as the points of the curve with 0 pokes."""
     cards = [io.read_json(file) for file in sorted(pretrained.glob("*.json"))]
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
@@ -75,7 +83,11 @@ def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -
 
 
 def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
-    """Train networks on every draw of skins, adapt them to each held-out skin, and score them (paper figure 6b)."""
+    """Train networks on different numbers of skins, adapt them to each held-out skin, and score them (figure 6b).
+
+    For each number of skins, the skins are drawn at random several times. Each draw is a fold, on which networks are
+    trained with and without the triplet loss. The networks with the triplet loss are also adapted.
+    """
     preload_training()
     data, section = read_data(settings, indentations, folds), settings.section(Adaptations, "adapt")
     adaptation = section.recipes[HEADLINE]
@@ -83,12 +95,12 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Networks are trained in stacks (several networks in one computation), and the cache reuses only whole stacks.
-    # Folds with most training skins come first, so that the folds with all training skins form the same stacks as in
-    # stage train_multi.
+    # Several networks are trained in one computation, as a stack. A cached result is reused only if the whole stack is
+    # the same. Therefore, the folds with the most training skins come first: those with all training skins then form
+    # the same stacks as in stage train_multi, whose results are reused.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # One seed per draw of skins is enough, because the random numbers of a network depend on the fold's name, which
-    # contains the draw.
+    # One seed for all draws of skins is enough. The random numbers of a network also depend on the name of the fold,
+    # which contains the number of the draw, so they differ between draws.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()
