@@ -252,7 +252,8 @@ def published_results(
 def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
     """Write to MLflow those runs of a scene that it does not have yet.
 
-    Returns a sentence for the user that states how many runs MLflow has, and the address at which they can be seen.
+    Returns a sentence for the user. It states how many runs were written, how many MLflow already had, and the address
+    at which the runs can be seen.
     """
     counts = write_runs(results, scene=experiment, root=root, register=register)
     return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
