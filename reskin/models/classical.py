@@ -186,8 +186,8 @@ def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
 def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
     """Group the targets that are known in the same rows.
 
-    Returns a list of the groups. Each group is a pair of the columns of its targets and the numbers of the rows in which
-    they are known.
+    Returns a list of the groups. A group is a pair: the columns of its targets, and the numbers of the rows in which
+    these targets are known.
     """
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
