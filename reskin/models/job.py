@@ -23,8 +23,8 @@ from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Sch
 from reskin.numerics import device, signature
 
 # A network has collapsed if it predicts nearly the same value of a target for all inputs. This is detected by the
-# explained variance (R2) of each target on training rows, which is usually above 0.9. The network has collapsed if it
-# is below this limit for any target.
+# explained variance (R2) of each target on training rows, which is usually above 0.9. The network has collapsed if the
+# R2 of any target is below this limit.
 COLLAPSED = 0.05
 # The modules on whose code the result of a training run depends. A test (tests/models/test_job.py) compares this list
 # with the modules that are imported.
@@ -189,8 +189,9 @@ class TrainingJob:
 class JobKeys:
     """Computes the cache keys of jobs on the same data.
 
-    A key is a digest of the rows, the recipe, the seed and, if it does not start from random weights, the starting
-    network of a job. The code of the training and the versions of libraries are also part of the digest.
+    A key is a digest of the rows, the recipe and the seed of a job. For adaptation and fine-tuning, the digest also
+    includes the network from which the job starts. The code of the training and the versions of libraries are included,
+    too.
     """
 
     def __init__(self, data: TrainingData) -> None:
