@@ -36,8 +36,8 @@ def squared_error(
     Unknown targets (NaN) contribute neither to the loss nor to the gradient.
     """
     known = ~torch.isnan(truth)
-    # Differences from unknown targets are replaced by 0 before squaring. If their squares were removed afterwards, their
-    # gradient would be 0 * NaN = NaN.
+    # Differences from unknown targets are replaced by 0 before they are squared. If their squares were replaced
+    # instead, the gradient would be 0 * NaN = NaN.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
