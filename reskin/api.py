@@ -1,8 +1,13 @@
 """The public functions and classes of `reskin`, for notebooks and robot programs.
 
-The functions take names and plain values and return NumPy arrays. The names of arguments and results end in their
-units: mm, N, s, uT. The channels of a field are Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports
-its dependencies only when it is called, so that `import reskin` is quick.
+Most functions take names and plain values, and return NumPy arrays. The names of arguments and results end in their
+units: mm, N, s, uT. In docstrings, [n 3] is the shape of an array with n rows and 3 columns. The channels of a field
+are Bx, By, Bz of chip 0, then of chip 1, and so on; ch is the number of channels.
+
+The no-load reading is the mean field while nothing touches the skin. The field change is a reading minus the no-load
+reading.
+
+Each function imports its dependencies only when it is called, so that `import reskin` is quick.
 """
 
 from __future__ import annotations
@@ -34,25 +39,29 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 AnyModel = Union[Path, str, "Model", "Universal", Sequence[Union[Path, str, "Model", "Universal"]]]
-Changes = Mapping[str, Any]  # name of a setting -> value, for settings that differ from the nominal settings
-NOMINAL_BOARD = "rigid"
+Changes = Mapping[str, Any]  # values of the settings that differ from the nominal settings, by the setting's name
+NOMINAL_BOARD = "rigid"  # name of the nominal board among the nominal settings
 
 
 def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
-    """Load ingested contact readings, as training data for networks.
+    """Load readings in contact, in the form in which networks are trained on them.
+
+    The readings must have been ingested, which means that a recording was converted to a table with one row per reading
+    (`dvc repro` does this for the recordings of a scene).
 
     Parameters
     ----------
     folder : path
-        A folder of ingested readings (Parquet), such as `data/indentations/quick` after `dvc repro`.
+        A folder with tables of ingested readings (Parquet), such as `data/indentations/quick` after `dvc repro`.
     force_min_N : float
-        Minimum normal force; readings with a smaller force are left out.
+        Smallest normal force. Readings with a smaller force are left out.
 
     Returns
     -------
     Rows
-        For f readings with ch channels: `db_uT` [f ch] is the field change from the no-load reading; `target` [f 3] is
-        x_mm, y_mm and Fz_N; `board` and `skin` [f] are the names of each reading's board and skin.
+        An object with these attributes, for f readings with ch channels: `db_uT` [f ch] contains the field changes.
+        `target` [f 3] contains x_mm, y_mm and Fz_N. `board` [f] and `skin` [f] contain the names of each reading's
+        board and skin.
 
     Raises
     ------
@@ -76,14 +85,16 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
 
 
 def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Board:
-    """Draw a simulated circuit board, with tolerances like those of real boards.
+    """Draw a simulated circuit board at random.
+
+    The board deviates from the nominal board by random tolerances, as real boards do.
 
     Parameters
     ----------
     name, seed : str, int
-        The same name and seed give the same board.
+        Name of the board, and seed of the random numbers. The same name and seed give the same board.
     spreads : mapping, optional
-        Board-to-board standard deviations that replace the nominal ones, such as `{"chip_offset_uT": 0.0}`.
+        Standard deviations of the tolerances, which replace the nominal ones, such as `{"chip_offset_uT": 0.0}`.
     **design
         Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] (positions relative to the skin's
         centre), `chips_turn_deg` [angle, ...] (rotations in the plane of the board), `gap_mm` (between chips and skin).
@@ -112,22 +123,24 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
 
 
 def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Skin:
-    """Draw a simulated skin, with tolerances like those of real skins.
+    """Draw a simulated skin at random.
+
+    The skin deviates from the nominal skin by random tolerances, as real skins do.
 
     Parameters
     ----------
     name, seed : str, int
-        The same name and seed give the same skin.
+        Name of the skin, and seed of the random numbers. The same name and seed give the same skin.
     spreads : mapping, optional
-        Skin-to-skin standard deviations that replace the nominal ones, such as `{"skin_modulus": 0.0}`.
+        Standard deviations of the tolerances, which replace the nominal ones, such as `{"skin_modulus": 0.0}`.
     **design
         Settings that replace those of the nominal skin: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
 
     Returns
     -------
     Skin
-        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the positions and moments of the dipoles that represent the
-        skin's magnetisation.
+        The magnetisation of the skin is represented by s dipoles. `nodes_m` [s 3] contains their positions, and
+        `moments_A_m2` [s 3] contains their magnetic moments.
 
     Raises
     ------
@@ -156,7 +169,7 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
 
 
 class Pokes(NamedTuple):
-    """Simulated indentations, as `simulate_pokes` returns them."""
+    """The fields and forces of simulated indentations, as `simulate_pokes` returns them."""
 
     noload_uT: np.ndarray  # [n ch] field before each indentation
     b_uT: np.ndarray  # [n ch] field during each indentation
@@ -166,20 +179,20 @@ class Pokes(NamedTuple):
 def simulate_pokes(
     skin: Skin, pokes: ArrayLike, *, board: Board | None = None, seed: int = 0, chip: Changes | None = None
 ) -> Pokes:
-    """Simulate the chip readings and the normal force for indentations of a skin without wear.
+    """Simulate indentations of a skin: the readings of the chips, and the normal force.
 
-    Ageing of the skin and friction are not simulated.
+    The skin is new. Its wear and ageing, and friction at the tip, are not simulated.
 
     Parameters
     ----------
     skin : Skin
         A skin from `draw_skin`.
     pokes : array [n 3]
-        x_mm, y_mm and depth_mm of n indentations; n may be 0. The centre of the skin is at (8, 8) mm.
+        x_mm, y_mm and depth_mm of n indentations; n may be 0. The centre of the skin is at x = y = 8 mm.
     board : Board, optional
-        The board under the skin, from `draw_board`; the nominal board if not given.
+        The board under the skin, from `draw_board`. Default: a board that is drawn with `seed`.
     seed : int
-        Seed of the noise, and of the board if no board is given.
+        Seed of the noise of the chips, and of the board if no board is given.
     chip : mapping, optional
         Settings that replace those of the nominal magnetometer, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
 
@@ -235,27 +248,28 @@ def simulate_recording(
     passes_n: int = 1,
     seed: int = 0,
 ) -> Path:
-    """Simulate a labelled recording of a board, and write the same files as `reskin record` to a new folder.
+    """Simulate a recording of a board with labels, and write it to a new folder as a capture.
 
-    A simulated robot presses the skin at the 65 places of the paper's grid. The capture's header has source
-    "simulated".
+    A simulated robot presses the skin at the 65 places of the paper's grid. The capture has the same files as a capture
+    that `reskin record` writes for a real board. Its header states that the source is "simulated".
 
     Parameters
     ----------
     folder : path
         Folder to create for the capture.
     skin, board, seed : str, str, int
-        The same names and seed give the same skin (`draw_skin`), board (`draw_board`) and noise.
+        Names of the skin and of the board, and seed of the random numbers. The same names and seed give the same skin
+        (as `draw_skin` draws it), the same board (`draw_board`) and the same noise.
     depths_mm : sequence of float
-        Depths of the indentations. All places are pressed at the first depth, then all places at the second depth, and
+        Depths of the indentations. All places are pressed to the first depth, then all places to the second depth, and
         so on.
     passes_n : int
-        How often the sequence of all places and depths is repeated.
+        Number of passes. In each pass, all places are pressed to all depths.
 
     Returns
     -------
     Path
-        The folder.
+        The folder of the capture.
 
     Raises
     ------
@@ -288,12 +302,13 @@ def simulate_recording(
 class Model:
     """A trained network, as `load_model` returns it.
 
-    Call `zero` with readings that were taken without contact before you call `predict`.
+    Before you call `predict`, call `zero` with readings that were taken while nothing touched the skin.
 
     Attributes
     ----------
     card : mapping
-        The model's JSON card: training data, recipe, inputs and outputs.
+        The content of the model's JSON card, which describes the training data, the settings of the training, the
+        inputs and the outputs.
     """
 
     def __init__(self, network: Network) -> None:
@@ -305,12 +320,12 @@ class Model:
         return self._network.card
 
     def zero(self, b_uT: ArrayLike) -> Model:
-        """Set the no-load reading.
+        """Set the no-load reading, which `predict` subtracts from its inputs.
 
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields measured without contact; `predict` subtracts their mean.
+            One or several readings that were taken without contact. The no-load reading is their mean.
 
         Returns
         -------
@@ -331,17 +346,18 @@ class Model:
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields measured in contact. Predictions for fields without contact are meaningless.
+            One or several readings that were taken in contact. Predictions for readings without contact are
+            meaningless.
 
         Returns
         -------
         array [f 3] or [3]
-            x_mm, y_mm and the normal force in N.
+            x_mm, y_mm and the normal force in N, for each reading.
 
         Raises
         ------
         ParamsError
-            If `zero` has not been called.
+            If `zero` was not called before.
         SchemaError
             If the number of channels differs from the model's.
         """
@@ -352,9 +368,10 @@ class Model:
         return predicted if np.ndim(b_uT) == 2 else predicted[0]
 
     def export_onnx(self, file: Path | str) -> None:
-        """Write the network as an ONNX file. Its inputs are field changes in uT; its outputs are x_mm, y_mm and F_N.
+        """Write the network as an ONNX file.
 
-        Requires the package onnx (`pip install '.[onnx]'`).
+        The inputs of the ONNX model are field changes in uT, and its outputs are x_mm, y_mm and F_N. This method
+        requires the package onnx (`pip install '.[onnx]'`).
         """
         from reskin.models import trained
 
@@ -376,7 +393,8 @@ def load_model(file: Path | str) -> Model:
     Parameters
     ----------
     file : path
-        The weights (.safetensors). The model's JSON card must be beside it, with the same name and suffix .json.
+        The file of the weights (.safetensors). The model's JSON card must be in the same folder, with the same name and
+        suffix .json.
 
     Returns
     -------
@@ -385,7 +403,7 @@ def load_model(file: Path | str) -> Model:
     Raises
     ------
     ReskinError
-        If a file is missing, or the card does not fit the weights.
+        If one of the two files is missing, or if the card does not fit the weights.
 
     Examples
     --------
@@ -405,27 +423,27 @@ def load_universal(
     external_uT: float = 0.0,
     new_day: bool = False,
 ) -> Universal:
-    """Load the universal model for the paper's board or for another board. The model works without data from your skin.
+    """Load the universal model, which estimates contacts on skins that it was not trained on.
 
-    Three methods calibrate the model to a skin: `zero` with readings without contact, `see` with presses at unknown
-    places, and `label` with presses at known places. `next_place` proposes where to press next, and `save` writes the
-    calibration to a file.
+    The model needs at least the no-load reading of your skin (method `zero`). Further data of the skin make its
+    estimates more accurate: presses at unknown places (method `see`) and presses at known places (method `label`). The
+    method `next_place` proposes where to press next, and `save` writes the calibration to a file.
 
     Parameters
     ----------
     calibration : path, optional
-        A calibration file that `save` wrote; the returned model continues from this calibration.
+        A calibration file that `save` wrote. The returned model has this calibration, which can be continued.
     file : path, optional
-        A model (.safetensors, with its JSON card) that `reskin model make` made for a board. Default: the model for
-        the paper's board, which comes with the library.
+        A model (.safetensors, with its JSON card) that `reskin model make` made for the layout of a board. Default: the
+        model for the paper's board, which comes with the library.
     external_uT : float
-        Size of external fields, for a board that a robot moves. When the board turns, the external field at its chips
-        changes. This value is the standard deviation in uT of each component of this change, relative to the no-load
-        reading; it is about 30 for the earth's field. Default: 0, no external field.
+        Size of the external fields, for a board that a robot moves. When the board turns, the external field at its
+        chips changes, for example the earth's field. `external_uT` is the standard deviation of each component of this
+        change since the no-load reading. It is about 30 for the earth's field. Default: 0, for a board at rest.
     new_day : bool
-        Whether the skin may now slide under presses differently than when the calibration was saved, for example on the
-        day before. A few further presses then show how it slides (see `Universal.slide`). Default: False, which assumes
-        that it still slides in the same way.
+        Whether the calibration was saved on an earlier day. A skin on its board slides a little under presses, and may
+        do so in another way on another day. With True, the model uses a few further presses to find out how the skin
+        slides now (see `Universal.slide`). Default: False, which assumes that it slides as before.
 
     Returns
     -------
@@ -434,8 +452,8 @@ def load_universal(
     Raises
     ------
     ReskinError
-        If a file is missing or is neither a calibration nor a model, if the calibration is for another board, if
-        `external_uT` is out of range, or if `new_day` is set without a calibration.
+        If a file is missing or of a wrong kind, if the calibration was made with a model for another board, if
+        `external_uT` is out of range, or if `new_day` is True without a calibration.
 
     Examples
     --------
@@ -451,44 +469,46 @@ def load_universal(
 
 
 def load_recording(path: Path | str, *, frames: bool = False, rate_hz: float = 400.0) -> pd.DataFrame:
-    """Load a recording as a pandas DataFrame. Requires the package pandas (`pip install '.[learn]'`).
+    """Load a recording as a pandas DataFrame.
+
+    This function requires the package pandas (`pip install '.[learn]'`).
 
     Parameters
     ----------
     path : path
-        A recording of one of these kinds, which the function detects:
+        A recording. The function detects which of these kinds it is:
 
-        - a capture's folder, as `reskin record` and `reskin add` write it
-        - the log of an SD card
+        - the folder of a capture, as `reskin record` and `reskin add` write it
+        - a log that a board wrote to an SD card
         - a file that `reskin decode` wrote
         - a table with labels (CSV or Parquet, layout `table` in data/README.md)
         - an ingested capture, `data/indentations/SCENE/CAPTURE.parquet`
     frames : bool
-        Whether to load all frames of a labelled capture instead of only its labelled readings.
+        Whether to load all frames of a capture with labels. By default, only the readings that have a label are loaded.
     rate_hz : float
-        Frames per second. Used only for a decoded file without times of the board's clock.
+        Number of frames per second. It is used only for a file from `reskin decode` that contains no times.
 
     Returns
     -------
     DataFrame
-        Column names end in units; `frame.attrs["units"]` maps each column to its unit ("1" for counts, "" for text).
-        `frame.attrs["counts"]` contains the numbers of frames and rows that were read, and the numbers of those that
-        were dropped, one number for each reason.
+        If the recording has labels, there is one row for each reading in contact, as in an ingested capture. The
+        columns are those of data/README.md (`board`, `x_mm`, `Fz_N`, ...). For each channel, there are three columns:
+        the field (`bx0_uT`), the no-load reading (`noload_bx0_uT`) and their difference (`dbx0_uT`).
 
-        If the recording has labels, there is one row per reading in contact, as in an ingested capture. The columns are
-        those of data/README.md (`board`, `x_mm`, `Fz_N`, ...). Each channel has three columns: the field (`bx0_uT`),
-        the no-load reading (`noload_bx0_uT`) and their difference (`dbx0_uT`).
+        If the recording has no labels, or if `frames` is True, there is one row for each frame. The columns are the
+        time (`t_s`), the field (`bx0_uT`, `by0_uT` and so on) and the temperature of each chip (`temperature0_degC` and
+        so on). For the folder of a capture, there are also the columns `capture`, `board`, `skin` and `source`.
 
-        Without labels, or if `frames` is True, there is one row per frame: the time (`t_s`), the field (`bx0_uT`,
-        `by0_uT` and so on) and the temperature of each chip (`temperature0_degC` and so on). For a capture's folder,
-        there are also the columns `capture`, `board`, `skin` and `source`.
+        The names of the columns end in their units. In addition, the dictionary `frame.attrs["units"]` contains the
+        unit of each column ("1" for counts, "" for text). The dictionary `frame.attrs["counts"]` contains the numbers
+        of frames and rows that were read, and for each reason, the number of those that were dropped.
 
         Faulty readings are dropped according to section `faults` of `params.yaml`.
 
     Raises
     ------
     ReskinError
-        If the path does not exist, the recording is damaged or of none of these kinds, or pandas is missing.
+        If the path does not exist, if the recording is damaged or of none of these kinds, or if pandas is missing.
 
     Examples
     --------
@@ -507,37 +527,41 @@ def open(port: str, *, model: AnyModel = (), baud: int = 115200) -> LiveSkin: ..
 @overload
 def open(port: list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkins: ...
 def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkin | LiveSkins:
-    """Read contacts live from one or more boards; use the result in a `with` statement.
+    """Read contacts from one or several boards as they happen. Use the result in a `with` statement.
 
-    The `with` statement opens the port, detects the wire format and the number of chips, and measures the no-load
-    reading. Therefore, nothing may touch the skin in the first second. A background thread reads the port, so that no
-    bytes are lost when your loop is slow.
+    The `with` statement opens the port, detects the wire format (how a board encodes its readings) and the number of
+    chips, and measures the no-load reading. Therefore, nothing may touch the skin in the first second. A background
+    thread reads the port, so that no bytes are lost if your loop is slow.
 
     Parameters
     ----------
     port : str or list of str
-        A serial port or `socket://host:port`, or a list of these for several boards.
+        A serial port, or the address of a TCP server (`socket://host:port`). For several boards, a list of these.
     model : optional
-        One or more trained networks, or one universal model. Networks are files or `Model` objects. A universal model
-        is a `Universal` object, which is not modified, or the file of a model, of a calibration, or both files.
-        Default: the universal model that comes with the library. For a board that a robot moves, pass
-        `load_universal(external_uT=...)`.
+        The model that estimates contacts. Default: the universal model that comes with the library. Other values are:
+
+        - one or several trained networks, as files or `Model` objects
+        - a universal model, as a `Universal` object (which is not modified) or as a file
+        - the file of a calibration of the universal model, or a list of the files of a model and of its calibration
+
+        For a board that a robot moves, pass `load_universal(external_uT=...)`.
     baud : int
-        Baud rate; USB ports ignore it.
+        Baud rate of the serial port. Ports of boards that are connected by USB ignore it.
 
     Returns
     -------
     LiveSkin or LiveSkins
-        Iteration yields the latest `Contact`: time, place, force, their standard deviations, field, alarms. If your
-        loop is slow, older contacts are skipped. To get a contact for each reading, iterate over `every()` instead.
-        With a list of ports, iteration yields tuples of contacts, in the order of the ports. An unplugged board does
-        not delay the other boards.
+        An object over which you can iterate. Each iteration yields the latest `Contact`, which contains the time, the
+        place and the force with their standard deviations, the field, and alarms. If your loop is slow, older contacts
+        are skipped. To get a contact for each reading, iterate over `every()` instead. With a list of ports, each
+        iteration yields a tuple of contacts, in the order of the ports. A board that is unplugged does not delay the
+        other boards.
 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is listed twice. The `with` statement raises this error if a port cannot be
-        opened or sends no frames, or if the board's number of chips does not match the model.
+        If a model cannot be read or a port is listed twice. The `with` statement also raises this error, if a port
+        cannot be opened or sends no readings, or if the number of the board's chips is not that of the model.
 
     Examples
     --------
@@ -555,7 +579,10 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
 
 
 def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
-    """Load models that are given as files, and return the networks in the given order or the universal model."""
+    """Load the models that are given as files.
+
+    Returns all networks in the given order, or the universal model.
+    """
     from reskin.predicting import read_models
     from reskin.universal.model import Universal
 
@@ -577,7 +604,10 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
 
 
 def lifted() -> Label:
-    """Return the label "nothing touches the skin" for `record`. One such label must come before each touch."""
+    """Return a label for `record` that means: nothing touches the skin.
+
+    There must be such a label before each touch, because the no-load reading is measured then.
+    """
     from reskin.recordings.labels import Label
 
     return Label(False)
@@ -593,16 +623,17 @@ def touch(
     Fz_N: float = math.nan,
     pass_i: int = 0,
 ) -> Label:
-    """Return the label "the robot touches the skin at this place and does not move" for `record`.
+    """Return a label for `record` that means: the robot touches the skin at this place and does not move.
 
     Parameters
     ----------
     x_mm, y_mm : float
         Place of the touch.
     depth_mm, Fx_N, Fy_N, Fz_N : float, optional
-        Indentation depth, and force on the skin (Fz positive in compression). Default: NaN, for unknown values.
+        Depth of the indentation, and components of the force on the skin (Fz is positive in compression). Default: NaN,
+        which means that the value is unknown.
     pass_i : int
-        Number of the current pass, from 0, if the program visits all places several times.
+        Number of the current pass, counted from 0, if the program visits all places several times.
 
     Examples
     --------
@@ -625,15 +656,16 @@ def record(
     skin: str | None = None,
     scan: str | None = None,
 ) -> Path:
-    """Record a board while a program moves a robot and labels the contacts.
+    """Record a board while your program moves a robot and labels the contacts.
 
-    Prints a summary to stderr: how much data was recorded, lost and left out.
+    A label states where and how hard the robot touches the skin (see `touch`), or that nothing touches it (see
+    `lifted`). At the end, a summary is printed to stderr: how much data was recorded, lost and left out.
 
     Parameters
     ----------
     labels : iterable or callable
-        An iterable yields `lifted()` or `touch(...)` each time the robot has stopped. A callable returns one of them at
-        each call, and None at the end.
+        An iterable that moves the robot and then yields a label, `lifted()` or `touch(...)`, each time the robot has
+        stopped. Or a function that returns such a label at each call, and None at the end.
     port : str, optional
         The board's port. Default: the port of the only connected board.
     out : path, optional
@@ -641,10 +673,11 @@ def record(
     seconds : float
         Maximum duration of the recording.
     dwell_s : float
-        Time in s for which each label is valid. The next label is requested after this time.
+        Time in s for which each label is valid. The robot must not move during this time. The next label is requested
+        after it.
     board, skin, scan : str, optional
-        Names of the board and of the skin, and the order in which places are touched (random, snake or a description).
-        They are written to the capture's header.
+        Names of the board and of the skin, and the order in which places are touched ("random", "snake" or a
+        description). They are written to the header of the capture.
 
     Returns
     -------
@@ -654,9 +687,9 @@ def record(
     Raises
     ------
     ReskinError
-        If no board is detected, or it sends no frames.
+        If no board is detected, or if the board sends no readings.
     Exception
-        Any exception that `labels` raises. The data that were recorded before are kept.
+        Any exception that `labels` raises. The data that were recorded until then are kept.
 
     Examples
     --------

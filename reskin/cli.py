@@ -1,7 +1,7 @@
 """The `reskin` command, with the subcommands ports, template, record, emulate, live, decode, predict and export.
 
-In a checkout of the project, the subcommands of `pipeline.cli` are added. Each command imports its dependencies when it
-runs, so that `reskin --help` is quick.
+If the command is run in a checkout of the project, the subcommands of `pipeline.cli` are available too. Each subcommand
+imports its dependencies only when it runs, so that `reskin --help` is quick.
 """
 
 import importlib
@@ -20,7 +20,7 @@ from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
 
-CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`, which help and error texts name outside a checkout
+CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; outside a checkout, the help and the error messages name them
     "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes", "score",
     "summary", "verify-reports",
 )  # fmt: skip
@@ -30,7 +30,7 @@ BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
     "Recordings",
     "Pipeline",
     "Maintenance",
-)  # titles of command groups in `reskin --help`
+)  # titles of the groups of commands in `reskin --help`
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -42,47 +42,65 @@ app = typer.Typer(
 
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Chips = Annotated[int, Option("--chips", help="Number of chips in a frame.", min=1, max=64)]
-SOURCE = "A capture folder, `nominal` (a simulated skin), or the YAML file of a simulated scene."
+SOURCE = "The folder of a capture, `nominal` (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = (
-    "NAME=flag keeps the estimates of readings with that fault, such as stuck=flag; NAME=drop hides them. May be "
-    "repeated. The names are listed in params.yaml, section faults."
+    "What is shown for readings with a fault. NAME=flag shows their estimates, for example stuck=flag. NAME=drop hides "
+    "them. The names of the faults are in section faults of params.yaml. The option can be repeated."
 )
-LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM: prompts for each place. Or a CSV to which a robot's program appends."
+LABELS = (
+    "How the places of the presses are known. grid:NXxNY:STEP_MM or line:N:STEP_MM: you are asked to press the places "
+    "of a grid or a line. Otherwise, the CSV file to which the program of a robot appends the places."
+)
 SCAN = (
-    "Order in which places are pressed. With prompts (--labels grid, line): random (default) or snake; otherwise any "
-    "note, which is written to the header."
+    "Order in which the places are pressed. If you are asked to press places (--labels grid or line): random (default) "
+    "or snake. Otherwise: a description, which is written to the header of the capture."
 )
-GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
-BOARD_NAME = "With nominal: name of the simulated board. Each name gives another board, with another skin."
+GAUGE = (
+    "Port of a force gauge that sends lines with Fz, or with Fx Fy Fz, in N. If its baud rate is not 9600, use "
+    "PORT@BAUD."
+)
+BOARD_NAME = "Only with source nominal: name of the simulated board. Each name gives another board with another skin."
 ROBOT = (
-    "With nominal: a robot presses the skin at the paper's 65 places, twice, and appends times, places and forces to "
-    "this CSV file, for `reskin record --labels`."
+    "Only with source nominal: a simulated robot presses the skin at the paper's 65 places, twice. It appends the "
+    "times, places and forces to this CSV file, which `reskin record --labels` can read."
 )
 SIMULATED = (
-    "Mark the capture as simulated. Use it for a port of `reskin emulate`, which looks like that of a real board."
+    "State in the header of the capture that it is simulated. Use this option for a port of `reskin emulate`, because "
+    "it cannot be distinguished from the port of a real board."
 )
 FAULT = (
-    "NAME[@START_S[+SECONDS]], such as stuck@8+2. Default: begins after 3 s, lasts 1 s. May be repeated. Names: "
-    "failed-read, zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, "
-    "repeated, dropped, torn, wrong-baud, stall, unplug."
+    "A fault to simulate: NAME[@START_S[+SECONDS]], such as stuck@8+2. By default, a fault begins after 3 s and lasts "
+    "1 s. The option can be repeated. Names: failed-read, zeros, chip-reset, stuck, slow-chips, saturated, int16-wrap, "
+    "magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = (
-    "A trained network, a model from `model make` (.safetensors with its JSON card), a saved calibration, or, if the "
-    "option is given twice, a model and its calibration. Default: the universal model for the paper's board."
+    "A trained network, a universal model from `reskin model make` (.safetensors, with its JSON card), or a saved "
+    "calibration. Give the option twice for a universal model and its calibration. Default: the universal model for "
+    "the paper's board."
 )
-EXTERNAL = "For a moving board: size of the external field's changes in uT (docs/live.md). Universal model only."
-NEW_DAY = "The calibration was made on an earlier day, so the skin may now slide differently (docs/live.md)."
-USUAL_COUNTS = {  # counts of `predict` that are not faults
+EXTERNAL = (
+    "Only for the universal model on a board that moves: by how many uT the external field at the board changes "
+    "(docs/live.md)."
+)
+NEW_DAY = (
+    "State that the calibration was saved on an earlier day. The skin may now slide in another way under presses, so "
+    "the model determines this again (docs/live.md)."
+)
+USUAL_COUNTS = {  # counts in the result of `predict` that do not indicate a fault
     "rate_hz", "duration_s", "readings_n", "quiet_start_s", "noise_uT", "contact_readings_n", "contacts_n",
     "force_max_N", "bytes_n", "frames_n", "frame_bytes_n", "rows_read_n", "rows_n",
 }  # fmt: skip
-LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
+LOG = (
+    "A log from an SD card (columns t_s,T0,Bx0,By0,Bz0,T1,... in s, degC and uT), a folder that `reskin record` wrote, "
+    "or a file that `reskin decode` wrote."
+)
 
 
 def main() -> None:
-    """Run the `reskin` command; print a `ReskinError` without a traceback."""
+    """Run the `reskin` command. If it raises a `ReskinError`, only the message is printed, without a traceback."""
     try:
-        # Exit with status 128 + SIGTERM. `sys.exit` raises SystemExit, so that `finally` and `with` blocks clean up.
+        # If the process is terminated (SIGTERM), exit with status 128 + SIGTERM. `sys.exit` raises SystemExit, so that
+        # `finally` and `with` blocks clean up.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         with explaining("reskin"):
             add_checkout_commands()
@@ -92,7 +110,9 @@ def main() -> None:
 
 
 def with_default_simulation(arguments: Sequence[str]) -> list[str]:
-    """Insert `nominal` after an option --emulate that has no value, because Typer has no options with optional values.
+    """Insert the value `nominal` after an option --emulate that has no value.
+
+    This is needed because Typer does not support options whose value can be omitted.
 
     >>> with_default_simulation(["live", "--emulate", "--http-port", "8000"])
     ['live', '--emulate', 'nominal', '--http-port', '8000']
@@ -136,21 +156,24 @@ def common_options(
         bool, Option("--version", help="Show the version.", callback=_show_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Declare the options that come before a command."""
+    """Declare the options that are given before the name of a subcommand."""
 
 
 @app.command("ports", rich_help_panel=BOARD)
 def find_ports(
     names: Annotated[list[str] | None, Argument(help="Ports to search. Default: all ports of this machine.")] = None,
-    hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
-    rate: Annotated[bool, Option("--rate", help="Measure frame rates, and explain what limits them.")] = False,
-    seconds: Annotated[float, Option(help="With --rate: duration of the measurement.", min=0.5)] = 5.0,
-    osr: Annotated[int, Option(help="With --rate: setting OSR of the chips.", min=0, max=3)] = 0,
+    hunt: Annotated[
+        bool, Option("--hunt", help="Find the port of a board: you are asked to unplug it and to plug it in again.")
+    ] = False,
+    rate: Annotated[bool, Option("--rate", help="Measure the frame rates, and explain what limits them.")] = False,
+    seconds: Annotated[float, Option(help="With --rate: duration of the measurement in s.", min=0.5)] = 5.0,
+    osr: Annotated[int, Option(help="With --rate: value of the chips' setting OSR (oversampling).", min=0, max=3)] = 0,
     dig_filt: Annotated[
-        int, Option("--dig-filt", help="With --rate: setting DIG_FILT of the chips.", min=0, max=7)
+        int,
+        Option("--dig-filt", help="With --rate: value of the chips' setting DIG_FILT (digital filter).", min=0, max=7),
     ] = 2,
 ) -> None:
-    """Find connected boards, and print the port, wire format, number of chips, frame rate and scale of each."""
+    """Find connected boards. For each board, print its port, wire format, number of chips, frame rate and scale."""
     from reskin.board import find
     from reskin.physics.chip import conversion_s
 
@@ -165,7 +188,10 @@ def template(
     out: Annotated[Path, Argument(help="The CSV file to write; it must not exist.")],
     chips_n: Chips = 5,
 ) -> None:
-    """Write a CSV with a header line only, to fill with your own recording: one row per reading; see data/README.md."""
+    """Write a CSV file that contains only a header line. Fill it with your own recording, one row for each reading.
+
+    The columns are described in data/README.md.
+    """
     from reskin import io
     from reskin.recordings.readers.table import NEEDED, columns_of
 
@@ -180,24 +206,34 @@ def record(
     port: Annotated[
         str | None, Option(help="/dev/ttyACM0, COM3 or socket://host:port. Default: the only connected board.")
     ] = None,
-    board: Annotated[str | None, Option(help="Name of the circuit board; can be given later, to `reskin add`.")] = None,
-    skin: Annotated[str | None, Option(help="Name of the skin; can be given later, to `reskin add`.")] = None,
-    out: Annotated[Path | None, Option(help="New folder for the capture. Default: captures/DATE-TIME.")] = None,
-    wire: Annotated[Wire | None, Option(help="With --port: wire format. Default: binary.")] = None,
-    chips_n: Annotated[
-        int | None, Option("--chips", help="With --port: number of chips. Default: 5.", min=1, max=64)
+    board: Annotated[
+        str | None, Option(help="Name of the circuit board. You can also give it later, to `reskin add`.")
     ] = None,
-    baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
-    seconds: Annotated[float, Option(help="Duration. Default: until Ctrl-C.", min=0.0)] = math.inf,
+    skin: Annotated[str | None, Option(help="Name of the skin. You can also give it later, to `reskin add`.")] = None,
+    out: Annotated[Path | None, Option(help="Folder to create for the capture. Default: captures/DATE-TIME.")] = None,
+    wire: Annotated[
+        Wire | None, Option(help="With --port: the format in which the board sends readings. Default: binary.")
+    ] = None,
+    chips_n: Annotated[
+        int | None, Option("--chips", help="With --port: number of chips of the board. Default: 5.", min=1, max=64)
+    ] = None,
+    baud: Annotated[int, Option(help="Baud rate of the port. USB ports ignore it.", min=1)] = 115200,
+    seconds: Annotated[
+        float, Option(help="Duration of the recording in s. Default: until Ctrl-C.", min=0.0)
+    ] = math.inf,
     scan: Annotated[str | None, Option(help=SCAN)] = None,
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
     dwell_s: Annotated[
-        float, Option("--dwell", help="Seconds for which a label is valid after you press Enter.", min=0.1)
+        float, Option("--dwell", help="Time in s for which a label is valid after you press Enter.", min=0.1)
     ] = 1.0,
     simulated: Annotated[bool, Option("--simulated", help=SIMULATED)] = False,
 ) -> None:
-    """Record a board, with labels if requested. `reskin add` can add labels from a robot's log later."""
+    """Record the readings of a board in a new folder.
+
+    With --labels, the places and forces of presses are recorded too. Labels from the log of a robot can also be added
+    later, with `reskin add`.
+    """
     from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
@@ -205,7 +241,8 @@ def record(
     if port is None:
         if wire is not None or chips_n is not None:
             raise ParamsError(
-                "--wire and --chips need --port. Add --port, or omit --wire and --chips to detect the board."
+                "--wire and --chips can only be used with --port. Add --port. Or omit --wire and --chips: the board is "
+                "then detected."
             )
         detected = find_board()
         typer.echo(str(detected))
@@ -223,7 +260,10 @@ def record(
 
 
 def _announce_simulation(source: str) -> None:
-    """Print on stderr that the program is simulating a board, because there is no other output for some seconds."""
+    """Print on stderr that the program is simulating a board.
+
+    The simulation takes some seconds. Without this message, the user would see no output during this time.
+    """
     if source == "nominal" or Path(source).is_file():
         typer.echo("simulating the board; the first time, the simulation is also compiled: please wait", err=True)
 
@@ -231,17 +271,29 @@ def _announce_simulation(source: str) -> None:
 @app.command(rich_help_panel=BOARD)
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
-    port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME (creates a link to a pseudo-terminal).")] = "pty",
-    speed: Annotated[float, Option(help="Speed relative to the source; inf: as fast as possible.", min=0.01)] = 1.0,
+    port: Annotated[
+        str,
+        Option(
+            help="Kind of port to create: pty (a pseudo-terminal), ./NAME (a pseudo-terminal with a link of this "
+            "name), tcp or tcp:PORT (a TCP server)."
+        ),
+    ] = "pty",
+    speed: Annotated[
+        float, Option(help="Speed relative to that of the source; inf sends as fast as possible.", min=0.01)
+    ] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
-    loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
+    loop: Annotated[bool, Option("--loop", help="Start again after the last frame.")] = False,
     true_places: Annotated[
-        bool, Option("--true-places", help="Print the true place and force of each simulated touch.")
+        bool, Option("--true-places", help="Print the true place and the true force of each simulated touch.")
     ] = False,
     board: Annotated[str | None, Option(help=BOARD_NAME)] = None,
     robot: Annotated[Path | None, Option(help=ROBOT)] = None,
 ) -> None:
-    """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""
+    """Emulate a board: create a port, and send the frames of a capture or of a simulation through it.
+
+    Programs can read the port like that of a real board. With --fault, faults of the board or of the port are simulated
+    too.
+    """
     from reskin.live.emulator import RobotLog, TouchPrinter, inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
@@ -273,23 +325,34 @@ def emulate(
 
 @app.command(rich_help_panel=BOARD)
 def live(
-    port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
-    model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several networks are averaged.")] = None,
-    replay: Annotated[str | None, Option(help="Folder of a capture to play, instead of a board.")] = None,
+    port: Annotated[
+        list[str] | None, Option(help="Port of a board. The option can be repeated. Default: all connected boards.")
+    ] = None,
+    model: Annotated[
+        list[Path] | None, Option(help=f"{MODEL} If several networks are given, their estimates are averaged.")
+    ] = None,
+    replay: Annotated[str | None, Option(help="Show a recording instead of a board: the folder of a capture.")] = None,
     emulate: Annotated[
         str | None,
-        Option(help="Simulation to play, instead of a board: nominal (default), or the YAML of a simulated scene."),
+        Option(help="Show a simulation instead of a board: nominal (default), or the YAML file of a simulated scene."),
     ] = None,
     host: Annotated[
-        str, Option(help="Address to listen on. 0.0.0.0: other machines can connect; the printed URL then has a token.")
+        str,
+        Option(
+            help="Address at which the page is served. With 0.0.0.0, other machines can connect. The printed URL then "
+            "contains a token, without which the page cannot be opened."
+        ),
     ] = "127.0.0.1",
-    http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
+    http_port: Annotated[int, Option(help="TCP port at which the page is served.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
     new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
-    skins: Annotated[Path, Option(help="Folder in which the page saves calibrations of skins.")] = Path("skins"),
+    skins: Annotated[Path, Option(help="Folder in which the page saves the calibrations of skins.")] = Path("skins"),
 ) -> None:
-    """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
+    """Show boards live on a page in the browser: readings of the chips, contacts, forces, traces over time and alarms.
+
+    On this page, you can also calibrate, record and save skins.
+    """
     from contextlib import ExitStack
 
     from reskin.board.find import find_boards
@@ -324,12 +387,12 @@ def live(
 
 @app.command(rich_help_panel=RECORDINGS)
 def decode(
-    stream: Annotated[Path, Argument(help="A file with the raw bytes from a port.")],
+    stream: Annotated[Path, Argument(help="A file with the raw bytes that were read from a port.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
-    wire: Annotated[Wire, Option(help="Wire format.")] = "binary",
+    wire: Annotated[Wire, Option(help="The format in which the board sent its readings.")] = "binary",
     chips_n: Chips = 5,
 ) -> None:
-    """Decode the raw bytes of a serial port to a table of frames, and count lost bytes."""
+    """Decode raw bytes that were read from a port; write a table with one row per frame, and count the lost bytes."""
     from reskin import io
     from reskin.recordings.decode import decode_dump
 
@@ -341,15 +404,19 @@ def decode(
 @app.command(rich_help_panel=RECORDINGS)
 def predict(
     log: Annotated[Path, Argument(help=LOG)],
-    out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
+    out: Annotated[Path, Option(help="The CSV file to write, with columns t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[list[Path] | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
-        float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
+        float,
+        Option("--rate-hz", help="Frames per second. Used only for a file from `reskin decode` without times."),
     ] = 400.0,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
     new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,
 ) -> None:
-    """Estimate contacts, places and forces from a log that begins with at least 0.5 s without contact."""
+    """Estimate contacts, places and forces from a log, and write them to a CSV file.
+
+    The log must begin with at least 0.5 s without contact, from which the no-load reading is taken.
+    """
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
@@ -360,7 +427,10 @@ def predict(
 
 
 def _describe_log(counts: Mapping[str, Any]) -> str:
-    """Describe the log that `predict` read: its contacts, then all faults and doubts that occurred."""
+    """Describe the log that `predict` read: first its contacts, then the counts of faults and of doubtful estimates.
+
+    Counts that are 0 are omitted.
+    """
     described = (
         f"{counts['readings_n']} readings in {counts['duration_s']:.1f} s ({counts['rate_hz']:.1f} Hz), "
         f"{counts['contacts_n']} contacts in {counts['contact_readings_n']} of them"
@@ -373,16 +443,23 @@ def _describe_log(counts: Mapping[str, Any]) -> str:
 
 @app.command(rich_help_panel=RECORDINGS)
 def export(
-    files: Annotated[list[Path], Argument(help=f"Recordings. {LOG[:-1]}, or a table in data/indentations.")],
-    out: Annotated[Path, Option(help="The folder to create.")],
-    to: Annotated[Literal["lerobot"], Option(help="Format: lerobot, a LeRobot dataset v3.0.")] = "lerobot",
-    task: Annotated[str, Option(help="What the robot does, in natural language.")] = "press the skin",
-    fps: Annotated[int | None, Option(help="Frames per second. Default: each reading is a frame.")] = None,
+    files: Annotated[
+        list[Path],
+        Argument(help=f"The recordings to export. Each is one of these: {LOG[:-1]}, or a table in data/indentations."),
+    ],
+    out: Annotated[Path, Option(help="The folder to create for the dataset.")],
+    to: Annotated[Literal["lerobot"], Option(help="Format of the dataset; lerobot is LeRobot v3.0.")] = "lerobot",
+    task: Annotated[
+        str, Option(help="Description of what the robot does, which is written to the dataset.")
+    ] = "press the skin",
+    fps: Annotated[
+        int | None, Option(help="Frames per second of the dataset. Default: each reading becomes a frame.")
+    ] = None,
     rate_hz: Annotated[
-        float | None, Option("--rate-hz", help="Readings per second, for files without times.", min=1.0)
+        float | None, Option("--rate-hz", help="Readings per second of recordings that contain no times.", min=1.0)
     ] = None,
 ) -> None:
-    """Export recordings as a dataset for robot learning (docs/robots.md)."""
+    """Export recordings as a dataset with which robot policies can be trained (docs/robots.md)."""
     from reskin.robots.dataset import export_lerobot
 
     counts = export_lerobot(files, out, task=task, fps=fps, rate_hz=rate_hz)

@@ -1,7 +1,8 @@
-"""The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
+"""The stages of the pipeline. Each stage is a function that reads inputs, calls the library, and writes outputs.
 
-dvc.yaml runs a stage by `python -m pipeline STAGE --scene SCENE ...`. The stage of an experiment is a function with the
-name of the experiment, in the module of the same name in `pipeline.experiments`.
+The file dvc.yaml runs a stage with the command `python -m pipeline STAGE --scene SCENE ...`. `STAGES` lists the stages
+in this package by module. In addition, each experiment is a stage of its own: a function with the name of the
+experiment, in the module of the same name in `pipeline.experiments`.
 """
 
 from importlib import import_module

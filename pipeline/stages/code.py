@@ -1,7 +1,10 @@
-"""Stage code: write the digests of all modules that each stage imports to data/code/<stage>.
+"""Stage code: for each other stage, write the digests of all modules that this stage imports.
 
-Every other stage depends on its own file in that folder, so that DVC reruns the stages that import an edited module.
-Comments and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments contain captions;
+The digests of a stage are written to the file data/code/<stage>, on which the stage depends in dvc.yaml. If a module is
+edited, the files of the stages that import this module change, and DVC runs these stages again. Comments and docstrings
+are not part of a digest, so edits of them cause no runs.
+
+`pipeline.report` and the YAML files of experiments contain captions, which do not affect computed results. Therefore,
 they are included only in the files of stages that show results.
 """
 
@@ -14,7 +17,9 @@ from reskin import io
 from reskin.code import digest, imported
 
 REPORT = "pipeline.report"
-PRESENTATION = f"{REPORT}.experiments"  # imports the modules of experiments by name
+# A stage that imports this module shows results. The module imports the modules of experiments by their names, so these
+# imports cannot be found in its code.
+PRESENTATION = f"{REPORT}.experiments"
 
 
 def all_stages() -> list[str]:
@@ -23,7 +28,7 @@ def all_stages() -> list[str]:
 
 
 def digests_of(stage: str) -> dict[str, str]:
-    """Return the digests of all modules that affect a stage's outputs, by module name."""
+    """Return the digests of all modules that affect the outputs of a stage, by the name of the module."""
     names = imported(module_name(stage))
     if PRESENTATION in names:
         return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_files()))}
@@ -32,8 +37,8 @@ def digests_of(stage: str) -> dict[str, str]:
 
 
 def write_digests(digests: Path) -> None:
-    """Write a file for each stage, with one line per module: its digest and its name."""
-    gc.disable()  # garbage collection would take a third of the time
+    """Write a file for each stage, with one line per module: the digest of the module, and its name."""
+    gc.disable()  # otherwise, garbage collection would take a third of the time
     try:
         by_stage = {stage: digests_of(stage) for stage in all_stages()}
     finally:

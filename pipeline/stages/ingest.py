@@ -1,4 +1,7 @@
-"""Stages from captures to a dataset: ingest, ingest_many, ingest_simulated, describe, split."""
+"""Stages that turn captures (raw recordings) into a dataset: ingest, ingest_many, ingest_simulated, describe, split.
+
+To ingest a capture means to decode its bytes, drop faulty readings, and write a table with one row per reading.
+"""
 
 import hashlib
 import shutil
@@ -15,12 +18,14 @@ from reskin.data.splits import Split, draw_folds, render_folds
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 
-CACHE = ".reskin/readings"  # cache of ingest_many, because DVC deletes a stage's outputs before the stage runs
+# Folder of the cache of stage ingest_many. The outputs of the stage cannot serve as a cache, because DVC deletes them
+# before the stage runs.
+CACHE = ".reskin/readings"
 NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
 def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read one recorded capture, check its losses, and write its readings, one row per reading."""
+    """Ingest one recorded capture; raise an error if too large a part of its data was lost."""
     policy = settings.shared_section(FaultPolicy, "faults")
     header, blocks, counts = open_capture(raw, policy)
     io.write_readings(indentations, blocks, counts)
@@ -34,7 +39,7 @@ def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read every capture of one simulated protocol in the same way as recorded captures."""
+    """Ingest all captures of one simulated protocol, in the same way as recorded captures."""
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
@@ -42,10 +47,11 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
-    """Read all captures of a recorded scene in one stage.
+    """Ingest all captures of a recorded scene in one stage.
 
-    In scenes with many captures, the overhead of one DVC stage per capture would take longer than reading the captures.
-    Readings of a capture are taken from a cache if its bytes, the code and the settings are unchanged (docs/growth.md).
+    This stage is for scenes with many captures. With one DVC stage for each capture, the overhead of DVC would take
+    longer than the ingestion itself. A capture is not ingested again if its bytes, the code and the settings are
+    unchanged. Its readings are then copied from a cache (docs/growth.md).
     """
     cache = home() / CACHE / settings.scene
     policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]
@@ -70,7 +76,10 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
 
 
 def _is_whole(cached: Path) -> bool:
-    """Compare the digest of a cached file with the digest in its name; remove a damaged file and warn."""
+    """Return whether a cached file is undamaged, which means that its content has the digest in its name.
+
+    A damaged file is deleted, with a warning.
+    """
     if io.sha256(cached) == cached.stem.partition("-")[2]:
         return True
     say(f"warning: cached readings are damaged and are read again ({cached}: content has changed since it was written)")
@@ -79,7 +88,10 @@ def _is_whole(cached: Path) -> bool:
 
 
 def _cache_key(capture: Path, common_inputs: bytes) -> str:
-    """Return a digest of everything that a capture's readings depend on: its name and bytes, the code, the settings."""
+    """Return a digest of everything on which the readings of a capture depend.
+
+    These are the name and the bytes of the capture, and the code and the settings (`common_inputs`).
+    """
     digest = hashlib.sha256(common_inputs + capture.name.encode())
     for file in sorted(file for file in capture.rglob("*") if file.is_file()):
         digest.update(f"{file.relative_to(capture)} {io.sha256(file)}\n".encode())
@@ -87,7 +99,7 @@ def _cache_key(capture: Path, common_inputs: bytes) -> str:
 
 
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
-    """Describe the recordings of a scene: fields, noise, resolution and forces, summarised over its skins."""
+    """Write a description of a scene's recordings: fields, noise, resolution and forces, summarised over all skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
     ingest_counts = {
         readings.capture: io.read_ingest_counts(indentations / f"{readings.capture}.parquet") for readings in captures
@@ -107,7 +119,7 @@ def describe(settings: Settings, indentations: Path, description: Path) -> None:
 
 
 def split(settings: Settings, section: Split, indentations: Path, folds: Path) -> None:
-    """Draw the folds of all experiments of the scene that hold out rows for testing."""
+    """Draw the folds of all experiments of a scene that hold out rows for testing, and write them to a file."""
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))

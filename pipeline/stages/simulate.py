@@ -1,4 +1,7 @@
-"""Stage simulate: write raw captures of simulated skins, in the same wire format as recorded captures."""
+"""Stage simulate: simulate recordings of skins, and write them as captures (raw files, as a board would send them).
+
+The captures have the same wire format as those of recorded boards, so that all further stages treat both alike.
+"""
 
 from pathlib import Path
 
@@ -14,7 +17,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def simulate(settings: Settings, protocol: str, raw: Path) -> None:
-    """Simulate the captures of one protocol, one capture per skin."""
+    """Simulate all captures of one protocol (a sequence of indentations that a robot makes), one capture per skin."""
     simulation, seed = simulation_settings(settings), settings.seed
     pairs, skins_n = list_captures(simulation, protocol), simulation.protocols[protocol].skins_n
     if len(pairs) < skins_n:

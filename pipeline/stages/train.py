@@ -1,4 +1,7 @@
-"""Stages that train on a scene's folds: networks for one skin or for many, adapted networks, classical methods."""
+"""Stages that train models on the folds of a scene.
+
+They train networks on one skin or on many skins, adapt networks to new skins, and fit classical methods.
+"""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,9 +38,10 @@ NO_LABELS = np.zeros(0, np.int64)
 
 
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
+    """Train networks on one skin each, and test them on the same skin or on other skins (paper sections 4 and 5.1).
 
-    On folds within one skin, places that are predicted from readings before the contact are scored too.
+    If training rows and test rows are from the same skin, the stage also runs the control experiments of
+    `pipeline.training.before_contact`. They predict places from readings before the contact.
     """
     preload_training()
     data = read_data(settings, indentations, folds)
@@ -51,7 +55,10 @@ def train_single(settings: Settings, section: Training, indentations: Path, fold
 def train_multi(
     settings: Settings, section: Training, indentations: Path, folds: Path, models: Path, final: Path
 ) -> None:
-    """Train on the skins of all boards except one (paper section 5.1); then train the final model on all boards."""
+    """Train networks on the skins of all boards except one, and test them on this board (paper section 5.1).
+
+    Each board is held out in turn. After that, the final model is trained on all boards.
+    """
     preload_training()
     data = read_data(settings, indentations, folds)
     jobs = make_jobs(data, section, data.folds_of("lobo"))
@@ -60,7 +67,7 @@ def train_multi(
 
 
 def train_triplet(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on the skins of all boards except one, with the triplet loss (paper section 5)."""
+    """Train networks as in `train_multi`, but with the triplet loss (paper section 5); there is no final model."""
     preload_training()
     data = read_data(settings, indentations, folds)
     jobs = make_jobs(data, section, data.folds_of("lobo"), experiment="triplet")
@@ -70,7 +77,10 @@ def train_triplet(settings: Settings, section: Training, indentations: Path, fol
 def adapt(
     settings: Settings, section: Adaptations, indentations: Path, folds: Path, pretrained: Path, models: Path
 ) -> None:
-    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (section 5)."""
+    """Adapt the networks of stage train_triplet to each held-out skin (paper section 5).
+
+    The adaptation to a skin uses unlabelled indentations of this skin.
+    """
     preload_training()
     data = read_data(settings, indentations, folds)
     networks = read_pretrained(pretrained)
@@ -84,7 +94,11 @@ def adapt(
 
 
 class ClassicalMethods(SectionWithRows):
-    """Section train_classical: classical methods, each fitted to at most `rows_max_n` training rows."""
+    """Settings of stage train_classical: section `train_classical` of a scene's file.
+
+    rows_max_n: largest number of training rows to which a method is fitted.
+    methods: settings of the classical methods, by name.
+    """
 
     rows_max_n: Annotated[int, Field(ge=1)]
     methods: dict[Name, Classical]
@@ -97,7 +111,7 @@ class ClassicalMethods(SectionWithRows):
 def train_classical(
     settings: Settings, section: ClassicalMethods, indentations: Path, folds: Path, scores: Path
 ) -> None:
-    """Fit classical methods on the folds of train_multi."""
+    """Fit classical methods on the same folds on which stage train_multi trains networks, and score them."""
     data = read_data(settings, indentations, folds)
     pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in section.methods.items()]
     jobs = [

@@ -1,4 +1,8 @@
-"""Stages few_labels, universal and calibrated: score methods on held-out boards, by number of labelled presses."""
+"""Stages few_labels, universal and calibrated: score methods on held-out boards, for different numbers of labels.
+
+A label is a press of the held-out board whose place and force are known. All three stages use the same folds and test
+rows, so that their scores can be compared.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -32,11 +36,15 @@ from reskin.universal.batches import TrainingSettings
 
 
 def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
-    """Score networks, adapted networks and classical methods on the same test rows, for every number of labels."""
+    """Score networks, adapted networks and classical methods, for every number of labels.
+
+    All methods are scored on the same test rows.
+    """
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
     trained_entries: list[few.TrainedEntry] = []
-    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each needs networks of earlier steps
+    # Each of these steps uses the networks of the steps before it.
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
         pairs = step(study, trained_entries)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
         trained_entries = [
@@ -66,7 +74,7 @@ def _point(data: SceneData, entry: few.Entry, predicted: np.ndarray) -> dict[str
 def calibrated(
     settings: Settings, section: Calibrated, indentations: Path, folds: Path, model: Path, scores: Path
 ) -> None:
-    """Score a finished universal model, calibrated to every held-out board, on the test rows of `few_labels`."""
+    """Calibrate a finished universal model to every held-out board, and score it on the test rows of `few_labels`."""
     data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     universal_model = read_model(model, compare.layout, settings)
     frame = Frame(compare.labels_middle_mm, compare.labels_mirrored)
@@ -79,7 +87,11 @@ def calibrated(
 
 
 class UniversalSection(TrainingSettings):
-    """Section universal: training settings, and numbers of labelled presses of the held-out board."""
+    """Settings of stage universal: section `universal` of a scene's file.
+
+    The section consists of training settings and of `labels_n`, the numbers of labelled presses of the held-out board
+    for which the model is scored.
+    """
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
@@ -87,10 +99,11 @@ class UniversalSection(TrainingSettings):
 def universal(
     settings: Settings, section: UniversalSection, indentations: Path, folds: Path, models: Path, scores: Path
 ) -> None:
-    """Score the universal model on every held-out board for every number of labels, on the test rows of `few_labels`.
+    """Train the universal model, and score it on every held-out board, for every number of labels.
 
-    The map alone and the map with networks are scored in two variants. One is made with the other boards of the rig,
-    and one is made from simulated skins alone.
+    The test rows are those of `few_labels`. Four methods are scored. The universal model can estimate with its map (a
+    probabilistic model of one skin) alone, or with map and networks together. Both are scored in two variants: variant
+    `rig` is made with the other boards of the rig, and variant `nominal` is made from simulated skins alone.
     """
     known = read_known_boards(settings, indentations, folds)
     variants = make_variants(known, section)

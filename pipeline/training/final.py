@@ -1,7 +1,8 @@
-"""The final model of a scene: one network that is trained on the skins of all boards, for use on further boards.
+"""Train the final model of a scene: one network that is trained on all boards of the scene, for use on other boards.
 
-No readings are left to test this network. Its card and the report therefore give the scores of networks that were
-trained in the same way on all boards except one, and tested on that board.
+Because all readings are used for training, none are left to test this network. Its card (the JSON file that describes
+the model) and the report therefore state the scores of other networks. These were trained in the same way on all boards
+except one, and tested on the board that was left out.
 """
 
 from collections.abc import Sequence
@@ -25,14 +26,14 @@ NOT_TESTED = (
     "no: all boards were in training. held_out: networks of the same recipe, by the board that each was tested on"
 )
 NO_ROWS = np.zeros(0, np.int64)
-F = 2  # index of the force among the targets
+F = 2  # index of the force in the array of targets
 
 
 def train_final(folder: Path, data: SceneData, training: Training, held_out: Sequence[Any], code: str) -> None:
-    """Train a network of the headline recipe on all rows of the scene; write it with its card to `folder`.
+    """Train a network on all rows of the scene with the headline recipe, and write it with its card to `folder`.
 
-    held_out: cards of the networks of the same recipe that were tested on held-out boards. If the forces of all
-    readings are unknown, the network predicts NaN as the force.
+    `held_out` contains the cards of the networks that were trained with the same recipe and tested on held-out boards.
+    If the force is unknown in all rows, the network predicts NaN as the force.
     """
     rows = np.arange(len(data.rows))
     job = TrainingJob(
@@ -55,7 +56,7 @@ def train_final(folder: Path, data: SceneData, training: Training, held_out: Seq
 
 
 def final_numbers(models: Path, scene: str) -> dict[str, Any]:
-    """Return the entry `final_model` of numbers.json; empty if the scene has no final model."""
+    """Return a dictionary with the entry `final_model` of numbers.json; it is empty if the scene has no final model."""
     card_file = (models / EXPERIMENT / FILE).with_suffix(".json")
     if not card_file.is_file():
         return {}

@@ -1,4 +1,9 @@
-"""Predictions and scores of networks on a new skin, by variant, such as before adaptation, adapted, or control."""
+"""Predict with networks on a new skin before and after they are adapted to it, and compare the scores.
+
+There are three variants of a network: before adaptation, after adaptation, and the control. The control is trained for
+as many further steps as the adapted network, but without pokes of the new skin. A difference between the control and
+the adapted network is therefore due to the pokes, and not to longer training.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,13 +35,17 @@ BEFORE, AFTER, CONTROL = (
     "before",
     "after",
     "control",
-)  # control: fine-tuned for the same number of steps as adapted networks, without pokes of the skin
-Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
+)  # names of the variants
+# A function that takes true and predicted values (columns x_mm, y_mm, F_N) and returns scores by name.
+Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]
 
 
 @dataclass(frozen=True)
 class VariantPrediction:
-    """Predictions of one network on the test rows of one skin; columns x_mm, y_mm, F_N."""
+    """The true values and the predictions of one network on the test rows of one skin.
+
+    The columns of `true` and `predicted` are x_mm, y_mm and F_N.
+    """
 
     variant: str
     board: str
@@ -49,8 +58,10 @@ class VariantPrediction:
 def predict_before(
     data: SceneData, fold: Fold, settings: AdaptationWithBase, starts: PretrainedNetworks, skin: str
 ) -> Iterator[VariantPrediction]:
-    """Predict a skin's test rows with each pretrained network, before adaptation."""
-    from reskin.models.network import Predictor  # imports torch: only a stage that predicts needs it
+    """Predict the test rows of a skin with each pretrained network of a fold, before the network is adapted."""
+    # This import is here, and not at the top of the file, because it imports torch, which only a stage that predicts
+    # needs.
+    from reskin.models.network import Predictor
 
     recipe = data.settings.section(Training, "train_triplet").recipes[settings.base]
     test = fold.test[data.rows.skin[fold.test] == skin]
@@ -64,7 +75,11 @@ def predict_before(
 def adapt_and_predict(
     data: SceneData, jobs: Sequence[tuple[str, TrainingJob]], stage: str
 ) -> tuple[list[VariantPrediction], dict[str, int]]:
-    """Run the jobs of (variant, job) pairs; return predictions for test rows, and counts of collapsed training runs."""
+    """Train networks, and return their predictions for the test rows of their jobs.
+
+    `jobs` contains pairs of the name of a variant and a job. The second result counts all training runs, and those that
+    collapsed, which means that a network predicts nearly the same value for all inputs.
+    """
     adapted = [job for _, job in jobs]
     trained = train_jobs(data, adapted, stage)
     write_timings(data.scene, stage, adapted, trained)
@@ -76,14 +91,14 @@ def adapt_and_predict(
 
 
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
-    """Compute the mean of predicted minus true force, in newtons and in percent of the mean true force."""
+    """Return the force bias: the mean of (predicted force - true force), in N and in percent of the mean true force."""
     true_N = true[:, FORCE].astype(float)
     bias_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
     return {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}
 
 
 def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric = score) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over boards, for each variant.
+    """Summarise the values of every metric over boards, separately for each variant.
 
     The value of a board is the mean over its skins, and the value of a skin is the mean over its seeds. `sd_seeds` is
     the standard deviation over the networks of one skin, averaged over skins.
@@ -98,7 +113,7 @@ def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric 
 
 
 def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str, Any]]:
-    """Summarise the force bias of each variant over boards, in N and in percent."""
+    """Summarise the force bias (see `bias`) over boards, for each variant, in N and in percent of the mean force."""
     by_variant = summarise_variants(predictions, bias)
     return {
         name: {variant: summary[name] for variant, summary in by_variant.items()} for name in ("bias_f_N", "bias_f_pct")
@@ -106,9 +121,10 @@ def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str
 
 
 def compare_variants(predictions: Sequence[VariantPrediction], variant: str, reference: str) -> dict[str, Any]:
-    """Summarise over boards the scores of `variant` minus those of `reference` on the same skins.
+    """Compare two variants: summarise over boards the differences between their scores on the same skins.
 
-    `by_board` has each board's value. `sd_seeds` is computed from the differences between networks with equal seeds,
+    The differences are the scores of `variant` minus the scores of `reference`. The entry `by_board` contains the
+    difference on each board. The entry `sd_seeds` is computed from the differences between networks with equal seeds,
     because these networks start from the same weights.
     """
     rows = _tidy(predictions, score)

@@ -1,1 +1,4 @@
-"""Networks and classical methods that estimate place and force from a single reading, and their training."""
+"""Networks and classical methods that estimate the place and the force of a contact, and the training of these methods.
+
+Each estimate is made from a single reading of the field.
+"""

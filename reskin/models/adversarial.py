@@ -1,10 +1,13 @@
-"""Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
+"""Domain-adversarial training (Ganin et al., JMLR 2016), with which the paper's adaptation to new skins is compared.
 
-The first network estimates place and force. A second network, the discriminator, predicts from the features of the
-first network whether a reading is from a known skin or from the new skin. The first network is trained so that the
-discriminator fails. In the control experiment, the discriminator's gradient has weight 0, so that it does not affect
-the features. This module has its own training loop, because `reskin.models.train` supports neither batches from two
-sets of skins nor a second network.
+Two networks are trained together. The first network estimates place and force. The second network, the discriminator,
+predicts from the features of the first network (the output of its bottleneck layer) whether a reading is from a known
+skin or from the new skin. The first network is trained so that the discriminator fails, because its features are then
+alike on all skins. In a control experiment, the gradient of the discriminator has weight 0, so that it does not affect
+the features.
+
+This module has its own training loop, because `reskin.models.train` supports neither batches from two sets of skins nor
+a second network.
 """
 
 from dataclasses import dataclass
@@ -24,14 +27,19 @@ from reskin.models.train import AdamW, clip_gradients, one_cycle
 DISCRIMINATOR_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
 RAMP_RATE = 10.0  # the factor 10 in the formula of `ramp` (Ganin et al.)
-# The third layer has `FEATURES_N` outputs, because `Stack` requires it.
+# Widths of the discriminator's layers. The third layer has `FEATURES_N` outputs, because the class `Stack` requires it.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
 
 
 @dataclass(frozen=True)
 class Domains:
-    """Training data: scaled inputs and targets of the known skins, and scaled inputs of the new skin."""
+    """The training data of both networks, in scaled units.
+
+    known: the inputs of readings of the known skins.
+    target: the targets of these readings.
+    new: the inputs of unlabelled readings of the new skin.
+    """
 
     known: Float32[np.ndarray, "n c"]
     target: Float32[np.ndarray, "n t"]
@@ -39,10 +47,11 @@ class Domains:
 
 
 def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: np.random.Generator) -> Weights:
-    """Train one network from random initial weights, and return its weights.
+    """Train a network together with its discriminator, from random initial weights; return the network's weights.
 
-    Each batch has equal numbers of readings from the known skins and from the new skin. The discriminator's gradient is
-    reversed before it reaches the features, and is multiplied by a factor that rises to `weight` during training.
+    Each batch has equal numbers of readings from the known skins and from the new skin. The gradient of the
+    discriminator's loss is reversed before it reaches the features, so that the features change in the direction that
+    makes the discriminator worse. This gradient is also multiplied by a factor that rises to `weight` during training.
     """
     # Use one thread, so that the order of summation does not depend on the number of other processes.
     torch.set_num_threads(1)
@@ -75,9 +84,10 @@ def reverse_gradient(values: Float[torch.Tensor, "m b d"], weight: float) -> Flo
 
 
 def ramp(fraction: float) -> float:
-    """Return the factor of the discriminator's weight, 2 / (1 + exp(-10 p)) - 1, after a fraction p of the training.
+    """Return the factor by which the weight of the discriminator's gradient is multiplied.
 
-    The factor starts at 0, so that the network first learns features that predict the targets.
+    After a fraction p of the training, the factor is 2 / (1 + exp(-10 p)) - 1. It starts at 0, so that the network
+    first learns features that predict the targets.
 
     >>> [round(ramp(fraction), 2) for fraction in (0.0, 0.1, 1.0)]
     [0.0, 0.46, 1.0]

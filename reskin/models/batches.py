@@ -1,4 +1,11 @@
-"""Prepare the data of networks that are trained together: scaled rows, initial weights, and batches."""
+"""Prepare the data of networks that are trained together: scaled rows, initial weights, and batches.
+
+Networks are trained together as a stack (several networks in one computation, see `reskin.models.network`). Each
+network of a stack has its own training job, rows and random generator.
+
+A triplet consists of three rows: an anchor, a positive and a negative. The triplet loss (`reskin.models.losses`)
+compares the distances between their features.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +26,10 @@ AXES_N = 3
 
 @dataclass(frozen=True)
 class LabelledRows:
-    """Scaled inputs and targets, and the `points` from which triplets are drawn (None without a triplet loss)."""
+    """The scaled inputs and targets of labelled rows.
+
+    `points` contains the places of the rows, from which triplets are drawn. It is None if there is no triplet loss.
+    """
 
     inputs: Float32[np.ndarray, "n c"]
     targets: Float32[np.ndarray, "n t"]
@@ -28,10 +38,10 @@ class LabelledRows:
 
 @dataclass(frozen=True)
 class UnlabelledRows:
-    """Scaled inputs of unlabelled pokes; only the order of the pokes along lines is known.
+    """The scaled inputs of unlabelled pokes. Only the order of the pokes along straight lines is known.
 
-    `points` are the points of all lines, from which triplets are drawn. `row` contains for each point the number of its
-    row in `inputs`; a row may be a point of two lines.
+    `points` contains the points of all lines, from which triplets are drawn. `row` contains, for each point, the number
+    of its row in `inputs`. A row can belong to two points, because a poke may be part of two lines.
     """
 
     inputs: Float32[np.ndarray, "p c"]
@@ -41,9 +51,10 @@ class UnlabelledRows:
 
 @dataclass(frozen=True)
 class PreparedJob:
-    """Initial weights, random generator and scaled training rows of one network of a stack.
+    """The data of one network of a stack, ready for training: initial weights, random generator, and scaled rows.
 
-    `unlabelled` (for adaptation) and `few_labels` (for fine-tuning) are rows of a new skin, or None.
+    `labelled` contains the rows of the skins in the training set. The other rows are from a new skin: `unlabelled` is
+    used for adaptation, and `few_labels` for fine-tuning. They are None if they are not needed.
     """
 
     initial_weights: Weights
@@ -54,23 +65,25 @@ class PreparedJob:
 
 
 def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
-    """Scale the training rows of a job and draw initial weights; return both as a `PreparedJob`, and the scaler.
+    """Prepare a job for training: fit a scaler, scale the rows, and draw the initial weights.
 
-    The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network, and use its
-    scaler and its weights.
+    The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network. In this case,
+    the scaler and the initial weights are those of the trained network.
+
+    Returns the prepared job and the scaler.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The names from which the random generator is made do not include the recipe, so that all recipes have the same
-    # initial weights and the same batches.
+    # The random generator is made from these names. They do not include the name of the recipe, so that all recipes
+    # start from the same initial weights and draw the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:
         view = VIEW[recipe.inputs](data.db_uT[job.train])
         scaler = FIT[recipe.scaling](view, target)
         layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
-        # The initial bias of an output is the mean of the scaled target. The released architecture has a ReLU on the
-        # outputs. With random biases, about one in three of its networks would have an output that is always 0 and
-        # never learns.
+        # The initial bias of an output is the mean of the scaled target, because the released architecture has a ReLU
+        # on its outputs. If the biases were random, about one in three of these networks would have an output that is
+        # always 0. The gradient of such an output is 0 too, so it would never learn.
         known = ~np.isnan(target).all(axis=0)
         mean = np.zeros(target.shape[1], np.float32)
         mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
@@ -81,7 +94,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        # From the new skin, only the field changes and the order of the pokes along lines are used.
+        # Of the data of the new skin, only the field changes and the order of the pokes along lines are used.
         lines = job.tuning.lines
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
@@ -113,17 +126,17 @@ def virtual_boards(
     settings: Augmentation,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
-    """Copy all rows `copies_n` times, and modify the copied field changes as if other boards had measured them.
+    """Copy all rows `copies_n` times, and modify the field changes of each copy as if another board had measured them.
 
-    Each copy of a skin has its own random gains of the channels and tilts of the chips. Noise is drawn for each
-    reading.
+    A virtual board differs from the real one by random gains of its channels and random tilts of its chips. They are
+    drawn once for each copy of each skin. In addition, noise is drawn for each reading.
 
     Returns
     -------
     db_uT : field changes [v ch] with v = copies_n * f; row c * f + i is copy c of row i
     skin : number of the virtual skin of each row; each copy of a skin has its own number
     """
-    from scipy.spatial.transform import Rotation  # imported late, because few recipes have virtual boards
+    from scipy.spatial.transform import Rotation  # imported here, because only few recipes use virtual boards
 
     codes = np.unique(skin, return_inverse=True)[1]
     skins_n, chips_n = codes.max() + 1, db_uT.shape[1] // AXES_N
@@ -142,20 +155,21 @@ def virtual_boards(
 
 
 Batch = dict[str, torch.Tensor]
-# Maps the name of each tensor of a batch to the name of the array in `BatchSampler.rows` from which it is gathered.
+# For each tensor of a batch: the name of the array in `BatchSampler.rows` from which the tensor's rows are taken.
 _SOURCE = {
     "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
     "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
     "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
 }  # fmt: skip
-# Each loss term has its own random generator, so that adding a loss term does not change the draws of other terms.
+# Names of the random generators. Each loss term has a generator of its own, so that an additional loss term does not
+# change the rows that are drawn for the other terms.
 _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """Draws batches for all networks of a stack, which are trained together.
+    """Draws random batches of rows for all networks of a stack.
 
-    The rows of all networks are concatenated and stored on the device that trains the networks.
+    The rows of all networks are concatenated in one array, which is stored on the device that trains the networks.
     """
 
     def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:
@@ -174,7 +188,7 @@ class BatchSampler:
         self.first_row = {name: np.cumsum([0, *map(len, values)])[:-1] for name, values in rows.items()}
 
     def sample(self, steps_n: int) -> Iterator[Batch]:
-        """Draw the batches of `steps_n` steps; each tensor has dimensions [networks, rows of a batch, ...].
+        """Draw the batches of `steps_n` steps. A batch is a dictionary of tensors [networks, rows of a batch, ...].
 
         A batch contains `inputs` and `targets` of labelled rows. If the recipe has a triplet loss, `positive` and
         `negative` form triplets with `inputs` as the anchors. For adaptation, `unlabelled` (the anchors),

@@ -1,4 +1,8 @@
-"""Classical regression methods: reference methods that are trained on the same folds as the networks."""
+"""Classical regression methods, with which the networks are compared.
+
+These reference methods are fitted on the same folds as the networks. All of them estimate the targets x_mm, y_mm and
+F_N of a reading from its field change.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,13 +24,21 @@ from reskin.seeds import rng_for
 
 
 class _Method(Strict):
-    """Base class of a method's settings. `inputs` names a view of the field change (`reskin.models.inputs.VIEW`)."""
+    """Base class of the settings of a method.
+
+    `inputs` is the name of a view, a function of the field change that gives the inputs of the method (see
+    `reskin.models.inputs.VIEW`).
+    """
 
     inputs: Literal["raw", "shape"]
 
 
 class Ridge(_Method):
-    """Linear ridge regression. `alpha` is the weight of the penalty; the sum of scaled squared errors has weight 1."""
+    """Settings of linear ridge regression.
+
+    The loss is the sum of the squared errors of the scaled targets, plus `alpha` times the sum of the squared
+    coefficients.
+    """
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -34,7 +46,11 @@ class Ridge(_Method):
 
 
 class CubicRidge(_Method):
-    """Ridge regression on all products of up to three inputs: 815 products for 15 inputs, 968 products for 16."""
+    """Settings of ridge regression on products of up to three inputs.
+
+    There are 815 such products for 15 inputs, and 968 for 16 inputs. `alpha` is the weight of the penalty, as in
+    `Ridge`.
+    """
 
     title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
@@ -42,7 +58,11 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """Mean of the targets of the nearest training rows; each row is weighted by its row weight / its distance."""
+    """Settings of regression by nearest neighbours.
+
+    The prediction is a weighted mean of the targets of the `neighbours_n` nearest training rows. In this mean, a row
+    counts in proportion to its row weight (see `fit`), divided by its distance.
+    """
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -50,9 +70,10 @@ class Neighbours(_Method):
 
 
 class RbfRidge(_Method):
-    """Kernel ridge regression with kernel exp(-gamma d^2) and at most `rows_max_n` rows.
+    """Settings of kernel ridge regression with a Gaussian kernel (radial basis function).
 
-    d is the distance of two rows. Inputs are standardised, so d^2 is on average 2 times the number of inputs.
+    The kernel of two rows at distance d is exp(-gamma d^2). The inputs are standardised, so d^2 is on average twice the
+    number of inputs. If there are more than `rows_max_n` training rows, a random selection of them is used.
     """
 
     title: ClassVar[str] = "RBF kernel ridge"
@@ -63,10 +84,10 @@ class RbfRidge(_Method):
 
 
 class Boosting(_Method):
-    """Gradient-boosted trees, one model per target.
+    """Settings of gradient-boosted trees, with one model for each target.
 
-    Early stopping is disabled, because it would use some readings of an indentation for training and others for
-    validation.
+    Early stopping is disabled. It would split the readings at random, so that some readings of an indentation would be
+    used for training and others of the same indentation for validation.
     """
 
     title: ClassVar[str] = "gradient boosting"
@@ -81,7 +102,7 @@ Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Fie
 
 @dataclass(frozen=True)
 class _Part:
-    """A fitted regressor for one group of targets, which are known in the same training rows."""
+    """A fitted regressor that predicts one group of targets. The targets of a group are known in the same rows."""
 
     targets: list[int]  # columns of the targets: 0 is x, 1 is y, 2 is the force
     regressor: Any  # has methods fit(inputs, target, weight) and predict(inputs)
@@ -90,14 +111,18 @@ class _Part:
 
 @dataclass(frozen=True)
 class FittedRegressor:
-    """A fitted method: one regressor per group of targets, and a scaler that was fitted to the same training rows."""
+    """A classical method after it was fitted to training rows.
+
+    It consists of one regressor for each group of targets (see `_Part`), and of a scaler for inputs and targets that
+    was fitted to the same training rows.
+    """
 
     scaler: Scaler
     parts: tuple[_Part, ...]
 
     @property
     def rows_n(self) -> int:
-        """Number of training rows for the target that has the most known values."""
+        """Number of training rows of the regressor that has the most training rows."""
         return max(part.rows_n for part in self.parts)
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
@@ -120,10 +145,13 @@ def fit(
     *,
     weight: Float32[np.ndarray, " n"] | None,
 ) -> FittedRegressor:
-    """Fit a method to rows; the targets are x in mm, y in mm and the force in N, and unknown targets are NaN.
+    """Fit a method to training rows.
 
-    Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss, or
-    in the mean over nearest neighbours. The scaler is fitted without these weights.
+    The columns of `target` are x in mm, y in mm and the force in N. Unknown targets are NaN. If some targets are known
+    in different rows than others, they are fitted separately.
+
+    `weight` contains the weight of each row in the loss or, for nearest neighbours, in the mean over the neighbours.
+    With None, all rows have equal weights. The scaler ignores the weights.
     """
     assert weight is None or (weight > 0).all()
     _check_rows(settings, inputs, target)
@@ -145,17 +173,22 @@ def fit(
 
 
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
-    """Set the scale of constant inputs to infinity, so that they are scaled to 0.
+    """Set the scale of constant inputs to infinity, so that these inputs become 0 when they are divided by it.
 
-    With the scale `SCALE_FLOOR` instead, an input that is constant in the training rows, but not in the test rows,
-    would dominate all distances.
+    An input may be constant in the training rows, but not in the test rows. The scale of such an input would otherwise
+    be the tiny number `SCALE_FLOOR`. Its scaled values in the test rows would then be so large that they dominate all
+    distances between rows.
     """
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
 def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
-    """Group the targets that are known in the same rows; return the columns and the row numbers of each group."""
+    """Group the targets that are known in the same rows.
+
+    Returns a list of the groups. A group is a pair: the columns of its targets, and the numbers of the rows in which
+    these targets are known.
+    """
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
     for i in np.flatnonzero(known.any(axis=0)):
@@ -168,9 +201,10 @@ def _thin(
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of `rows_n` rows without replacement; return the row numbers and the weights of the drawn rows.
 
-    Rows whose weight is above the minimum are the few labelled rows of a new skin, so all of them are kept. Their
-    weight is multiplied by the fraction of the other rows that is kept, so that their share of the total weight is
-    unchanged.
+    If the weights of the rows differ, the rows with a weight above the minimum are the few labelled rows of a new skin.
+    All of them are kept, and only the other rows are drawn. The weights of the labelled rows are multiplied by the
+    fraction of the other rows that was drawn. The labelled rows thus have the same fraction of the total weight as
+    before.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -197,8 +231,10 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # rows per block, to limit memory; the kernel matrix of a block and 6000 training rows takes 200 MB
-_THREADS = ThreadpoolController()  # created only once, because this takes 3 ms, but each use takes only 15 us
+# Predictions are computed in blocks of this number of rows, to limit the use of memory. With 6000 training rows, the
+# kernel matrix of a block takes 200 MB.
+BLOCK_ROWS_N = 4096
+_THREADS = ThreadpoolController()  # created only once, because its creation takes 3 ms, while a use takes only 15 us
 
 
 def one_thread() -> Any:
@@ -207,8 +243,11 @@ def one_thread() -> Any:
 
 
 def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
-    """Create a regressor with these settings; it has methods fit(inputs, target, weight) and predict(inputs)."""
-    # scikit-learn is imported late, because it takes .7 s, and modules that only read settings do not need it.
+    """Create a regressor with these settings.
+
+    The regressor has the methods fit(inputs, target, weight) and predict(inputs).
+    """
+    # scikit-learn is imported here, because the import takes 0.7 s, and modules that only read settings do not need it.
     match settings:
         case Ridge():
             from sklearn import linear_model
@@ -219,8 +258,8 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
         case Neighbours(neighbours_n=k):
             from sklearn.neighbors import KNeighborsRegressor
 
-            # A k-d tree is fast here, because readings vary along few directions. By default, scikit-learn would use
-            # brute force for 16 or more inputs.
+            # The tree is requested explicitly, because scikit-learn would use brute force for 16 or more inputs. A k-d
+            # tree is fast here even for so many inputs, because readings vary along few directions only.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             from sklearn.kernel_ridge import KernelRidge
@@ -241,16 +280,17 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 
 
 class _BlockwiseCubicRidge:
-    """Ridge regression on products of inputs, computed in blocks of rows to limit memory.
+    """A regressor for cubic ridge regression (see `CubicRidge`), which computes the products in blocks of rows.
 
-    For all rows of the paper's data, the products would take 5 GB at once.
+    For all rows of the paper's data at once, the products would take 5 GB of memory.
     """
 
     def __init__(self, alpha: float) -> None:
         from sklearn.preprocessing import PolynomialFeatures
 
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is the constant 1, whose coefficient is not penalised
+        # The first product is the constant 1. Its coefficient is not penalised.
+        self.lift = PolynomialFeatures(3)
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_
@@ -268,9 +308,10 @@ class _BlockwiseCubicRidge:
 
 @dataclass(frozen=True)
 class _WeightedNeighbours:
-    """Nearest neighbours with row weights w, which scikit-learn does not support.
+    """A regressor by nearest neighbours that supports weights of the training rows, which scikit-learn's does not.
 
-    With targets y, the prediction is scikit-learn's prediction of w y, divided by its prediction of w.
+    Let w be the weights and y the targets. scikit-learn's regressor predicts w y and w as if they were targets. The
+    quotient of both predictions is the weighted mean of y over the neighbours.
     """
 
     neighbours: Any  # sklearn.neighbors.KNeighborsRegressor
@@ -285,16 +326,19 @@ class _WeightedNeighbours:
 
 
 def blocks(rows_n: int) -> list[slice]:
-    """Return slices that split `rows_n` rows into blocks of at most `BLOCK_ROWS_N`."""
+    """Return slices that split `rows_n` rows into blocks of at most `BLOCK_ROWS_N` rows."""
     return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
 @dataclass(frozen=True)
 class ClassicalJob:
-    """Training and test of a method on one fold; `train` and `test` are row numbers.
+    """A job: fit a method to the training rows of a fold, and predict the test rows.
 
-    If there are more than `rows_max_n` training rows, a random selection of them is used. `few_labels` are the row
-    numbers of additional training rows of a new skin. Their total weight equals that of all other training rows.
+    train, test: row numbers of the training rows and of the test rows.
+    few_labels: row numbers of additional training rows, which are from the new skin. Together, these rows have the same
+        weight as all other training rows together.
+    rows_max_n: if there are more training rows than this, a random selection of them is used. This number does not
+        include the rows in `few_labels`.
     """
 
     name: str
@@ -308,18 +352,18 @@ class ClassicalJob:
 
 @dataclass(frozen=True)
 class ClassicalResult:
-    """Predictions (mm, mm, N) for the test rows, the number of training rows, and computing times."""
+    """The result of a job: predictions for the test rows (x in mm, y in mm, force in N), and computing times."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
     seconds: float  # time of the fit
     started_s: float  # Unix time at which the fit started
-    one_reading_s: float  # median time of a prediction for a single reading
+    one_reading_s: float  # median time that a prediction for a single reading takes
 
 
 @dataclass(frozen=True)
 class _JobRows:
-    """The rows that one job needs; only they are sent to the process that runs the job."""
+    """The rows that one job needs. Only these rows are sent to the process that runs the job."""
 
     train: Float32[np.ndarray, "a c"]
     target: Float32[np.ndarray, "a 3"]
@@ -330,7 +374,10 @@ class _JobRows:
 def run_classical_jobs(
     jobs: Sequence[ClassicalJob], data: TrainingData, executor: Executor, log: Callable[[str], None]
 ) -> list[ClassicalResult]:
-    """Run all jobs in the executor, and return the results in the order of `jobs`."""
+    """Run all jobs in the executor, and return the results in the order of `jobs`.
+
+    `log` is called with one line of text for each finished job.
+    """
     running = [executor.submit(_fit, job.method, job.name, job.seed, _rows_of(job, data)) for job in jobs]
     results = []
     for job, future in zip(jobs, running, strict=True):

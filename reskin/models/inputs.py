@@ -1,8 +1,9 @@
-"""Convert field changes to the inputs of models, and targets to scaled outputs.
+"""Convert field changes to the inputs of models, and convert targets to and from scaled outputs.
 
-A view is a fixed function of the field change of a row. A scaler converts a view to a network's scaled inputs, and
-converts between targets in physical units and scaled outputs. It is fitted only to training rows, so that it contains
-no information about test rows.
+The inputs of a network are computed in two steps. First, a view is computed from the field change. A view is a fixed
+function, such as `shape`. Then, a scaler shifts and scales the view. The scaler also converts targets in mm and N to
+the scaled units in which a network is trained, and converts the network's outputs back. A scaler is fitted to training
+rows only, so that it contains no information about test rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,12 +12,14 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed lower limit of |dB|, the norm of the field change. It is below the noise of the norm (3 uT per channel, about
-# 15 uT for 15 channels). The logarithm of this limit is 0, so all inputs are 0 if the field change is 0.
+# Lower limit that is assumed for |dB|, the norm of the field change, so that its logarithm is finite. The limit is well
+# below the noise of the norm: with 3 uT per channel, this noise is about 15 uT for 15 channels. The logarithm of
+# the limit, in uT, is 0. Therefore, all inputs are 0 if the field change is 0.
 DB_FLOOR_uT = 1.0
-# Lower limit of scales, which avoids a division by zero for channels that are constant in training.
+# Lower limit of the scales. It avoids a division by zero for channels that are constant in the training rows.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # about the scale of the inputs in the network that the authors released
+# Scale of the inputs in standard deviations. It is about that of the network that the paper's authors released.
+RELEASED_INPUT_SDS = np.float32(5.0)
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
@@ -25,7 +28,10 @@ def raw(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
 
 
 def shape(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f c"]:
-    """Return dB / |dB|, which is independent of the strength of the magnets, and the natural logarithm of |dB| / uT."""
+    """Return the direction of the field change, dB / |dB|, and as a last column the natural logarithm of |dB| in uT.
+
+    The direction does not depend on the strength of the magnets.
+    """
     length_uT = np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True)  # [f 1]
     floored_uT = np.maximum(length_uT, DB_FLOOR_uT)
     return np.hstack([db_uT / floored_uT, np.log(floored_uT)]).astype(np.float32)
@@ -36,9 +42,10 @@ VIEW: Mapping[str, Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "
 
 @dataclass(frozen=True)
 class Scaler:
-    """Scaling of a network's inputs and outputs.
+    """The shifts and scales of the inputs and outputs of a network.
 
-    inputs = (view - input_shift) / input_scale, and (x_mm, y_mm, F_N) = outputs * target_scale + target_shift.
+    The inputs of the network are (view - input_shift) / input_scale. The predicted x_mm, y_mm and F_N are
+    outputs * target_scale + target_shift.
     """
 
     input_shift: Float32[np.ndarray, " ch"]
@@ -50,11 +57,11 @@ class Scaler:
         return (db_uT - self.input_shift) / self.input_scale
 
     def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Convert places and forces (mm, mm, N) to scaled targets."""
+        """Convert targets (x in mm, y in mm, forces in N) to scaled targets."""
         return (target - self.target_shift) / self.target_scale
 
     def decode(self, scaled: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Convert outputs of a network to places and forces (mm, mm, N)."""
+        """Convert the outputs of a network to targets (x in mm, y in mm, forces in N)."""
         return scaled * self.target_scale + self.target_shift
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -66,7 +73,7 @@ class Scaler:
 
 
 def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit a scaler that gives each channel and target a mean of 0 and a standard deviation of 1."""
+    """Fit a scaler after which each input and each target has mean 0 and standard deviation 1 over these rows."""
     known = ~np.isnan(target).all(axis=0)
     shift, scale = np.zeros(target.shape[1], np.float32), np.ones(target.shape[1], np.float32)
     shift[known] = np.nanmean(target[:, known], axis=0, dtype=np.float64)
@@ -80,9 +87,10 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
 
 
 def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit the scaling of the authors' released network: channels / (5 sd), x / 16 mm, y / 16 mm, F / 3 N.
+    """Fit a scaler that scales as the network does that the paper's authors released.
 
-    Means are not subtracted.
+    Each input is divided by 5 times its standard deviation, x and y are divided by 16 mm, and forces by 3 N. Means are
+    not subtracted.
     """
     return Scaler(
         input_shift=np.zeros(db_uT.shape[1], np.float32),

@@ -1,6 +1,8 @@
-"""Training jobs: training with a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
+"""Training jobs, their results, and the keys under which results are cached.
 
-`JobKeys` computes the cache key of a job: a digest of everything on which the job's result depends.
+A training job either trains a network from random weights, on one fold with one recipe and one seed, or it adapts or
+fine-tunes a trained network to a new skin. `JobKeys` computes the cache key of a job, which is a digest of everything
+on which the result of the job depends.
 """
 
 import hashlib
@@ -20,27 +22,31 @@ from reskin.models.inputs import Scaler
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Schedule
 from reskin.numerics import device, signature
 
-# A network has collapsed if, for any target, its explained variance (R2) on training rows is below this limit. Usually,
-# R2 is above 0.9.
+# A network has collapsed if it predicts nearly the same value of a target for all inputs. This is detected by the
+# explained variance (R2) of each target on training rows, which is usually above 0.9. The network has collapsed if the
+# R2 of any target is below this limit.
 COLLAPSED = 0.05
-# The modules on whose code the result of training depends (tests/models/test_job.py compares them with the imports).
+# The modules on whose code the result of a training run depends. A test (tests/models/test_job.py) compares this list
+# with the modules that are imported.
 CODE_MODULES = (
     "reskin.seeds",
     *(f"reskin.models.{name}" for name in ("batches", "inputs", "job", "losses", "network", "reproducible", "train")),
 )
 LIBRARIES = ("torch", "numpy", "scipy")
 REPEATS_N = 25
-CURVE_POINTS_N = 50  # number of points of a loss curve; a training run with fewer steps has one point per step
+# Number of points of a loss curve. If a training run has fewer steps, its curve has one point for each step.
+CURVE_POINTS_N = 50
 
 Weights = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss terms that are added to the squared error on labelled rows.
+    """The weights of the loss terms that are added to the squared error on the training rows.
 
-    triplet: weight of the triplet loss on labelled rows. unlabelled: weight of the triplet loss on unlabelled pokes of
-    the new skin. few_labels: weight of the squared error on labelled pokes of the new skin.
+    triplet: weight of the triplet loss on the training rows.
+    unlabelled: weight of the triplet loss on unlabelled pokes of the new skin.
+    few_labels: weight of the squared error on labelled pokes of the new skin.
     """
 
     triplet: float
@@ -50,9 +56,11 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Rows for training and test: field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the name of the skin.
+    """The rows of all skins. A training job selects its training rows and test rows from them by number.
 
-    The three rows of a triplet are from the same skin.
+    db_uT: the field changes.
+    target: the targets, which are either x, y, F or, with shear forces, x, y, Fx, Fy, Fz.
+    skin: the name of each row's skin. It is needed because the three rows of a triplet must be from the same skin.
     """
 
     db_uT: Float32[np.ndarray, "f ch"]
@@ -64,14 +72,21 @@ class TrainingData:
 class TrainingResult:
     """The result of a training run.
 
-    key: name of the result in the cache. curve: mean squared error in scaled units; point i is the mean over the steps
-    between entries i - 1 and i of `curve_steps`. predicted: x, y in mm and F in N for the test rows. stopped_step: step
-    at which training diverged, or None. If training diverged, `weights` are those before the divergence, and the curve
-    ends there. explained_min: smallest explained variance (R2) of a target on training rows; None for a short training
-    run.
-    seconds: training time of the stack, divided by its number of networks. started_s: Unix time at which the training
-    of the stack started. one_reading_s: median time of a prediction for one reading. reused: whether the result is
-    from the cache. collapsed_before_n: number of earlier training runs of this job, all of which collapsed.
+    Networks with equal settings are trained together as a stack (see `reskin.models.network`). Therefore, the times are
+    those of the stack.
+
+    key: the name of the result in the cache.
+    weights, scaler: the trained network. If training diverged, the weights are those before the divergence.
+    curve: the loss curve, which is the mean squared error in scaled units. Point i is the mean over the steps between
+        entries i - 1 and i of `curve_steps`. If training diverged, the curve ends before the divergence.
+    predicted: x and y in mm and forces in N, for the test rows.
+    stopped_step: the step at which training diverged, or None.
+    explained_min: the smallest explained variance (R2) of a target on training rows. It is None after a short run.
+    seconds: the training time of the stack, divided by the number of its networks.
+    started_s: the Unix time at which the training of the stack started.
+    one_reading_s: the median time that a prediction for one reading takes.
+    reused: whether the result was read from the cache.
+    collapsed_before_n: the number of earlier training runs of this job, all of which collapsed.
     """
 
     key: str
@@ -95,7 +110,7 @@ class TrainingResult:
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A trained network from which adaptation or fine-tuning starts; `key` is its name in the cache."""
+    """A trained network from which adaptation or fine-tuning starts. `key` is the name of its result in the cache."""
 
     key: str
     weights: Weights
@@ -104,9 +119,9 @@ class Pretrained:
 
 @dataclass(frozen=True)
 class Adaptation:
-    """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
+    """An adaptation: self-supervised training of a trained network on unlabelled pokes of a new skin (paper section 5).
 
-    From the new skin, only the field changes of the rows in `lines` and the order of these rows are used.
+    Of the data of the new skin, only the field changes of the rows in `lines` and the order of these rows are used.
     """
 
     start: Pretrained
@@ -116,7 +131,7 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class FineTuning:
-    """Fine-tuning on a few labelled pokes of a new skin; `row` contains their row numbers."""
+    """A fine-tuning of a trained network on a few labelled pokes of a new skin. `row` contains their row numbers."""
 
     start: Pretrained
     settings: FineTuningRecipe
@@ -125,11 +140,17 @@ class FineTuning:
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """One training run.
+    """The description of one training run.
 
-    experiment: the experiment that uses the result, such as `lobo` (leave one board out). train, test: row numbers.
-    tuning: None for training from random weights. skin: name of the skin to adapt to. what: additional text in the name
-    of the job. attempt_i: number of earlier training runs of this job, all of which collapsed.
+    experiment: the experiment that uses the result, such as `lobo` (leave one board out).
+    recipe_name, recipe: the settings of the training.
+    fold: the name of the fold.
+    seed, seed_i: the seed of the scene, and the index of this training run among the runs with different random draws.
+    train, test: the numbers of the training rows and of the test rows.
+    tuning: the adaptation or fine-tuning, or None for training from random weights.
+    skin: the name of the skin to which the network is adapted.
+    what: additional text in the name of the job.
+    attempt_i: the number of earlier training runs of this job, all of which collapsed.
     """
 
     experiment: str
@@ -147,7 +168,7 @@ class TrainingJob:
 
     @property
     def name(self) -> str:
-        """File name of the model, which is unique within a stage."""
+        """The name of the job, which is also the name of the model's file. It is unique within a stage."""
         parts = [self.experiment, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
         return ".".join(part for part in parts if part)
 
@@ -166,9 +187,11 @@ class TrainingJob:
 
 
 class JobKeys:
-    """Computes cache keys for jobs on the same data.
+    """Computes the cache keys of jobs on the same data.
 
-    A key is a digest of a job's rows, recipe, seed and initial weights, of the code, and of the versions of libraries.
+    A key is a digest of the rows, the recipe and the seed of a job. For adaptation and fine-tuning, the digest also
+    includes the network from which the job starts. The code of the training and the versions of libraries are included,
+    too.
     """
 
     def __init__(self, data: TrainingData) -> None:
@@ -195,7 +218,8 @@ class JobKeys:
         return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
-        if id(train) not in self._train_digests:  # the array is stored below, so no other array gets its id
+        # The array is stored with its digest, so that no other array can get the same id.
+        if id(train) not in self._train_digests:
             skin = np.unique(self.data.skin[train], return_inverse=True)[1]
             content = _digest(self.data.db_uT[train], self.data.target[train], skin)
             self._train_digests[id(train)] = (train, content)
@@ -211,7 +235,7 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def curve_steps(steps_n: int) -> list[int]:
-    """Return for each point of a loss curve the last step that it covers, in a training run of `steps_n` steps.
+    """Return the last step that each point of a loss curve covers, for a training run of `steps_n` steps.
 
     >>> curve_steps(3), curve_steps(800)[:3], len(curve_steps(800))
     ([1, 2, 3], [16, 32, 48], 50)
@@ -221,7 +245,7 @@ def curve_steps(steps_n: int) -> list[int]:
 
 
 def median_call_s(call: Callable[[], object]) -> float:
-    """Return the median time in s of `REPEATS_N` calls, after one call to warm the caches."""
+    """Return the median time of `REPEATS_N` calls in s. One earlier call, which is not timed, warms the caches."""
     call()
     times_s = []
     for _ in range(REPEATS_N):

@@ -1,7 +1,9 @@
-"""Training losses: the squared error and the triplet loss (paper section 5), with the sampling of triplets.
+"""The loss functions of the training: the squared error, and the triplet loss (paper section 5).
 
-A triplet consists of three points of the same group (a skin, or a line of pokes): an anchor, a positive and a negative.
-The positive is strictly nearer to the anchor than the negative.
+The triplet loss is computed from triplets, which this module draws at random. A triplet consists of three points of the
+same group, where a group is a skin or a line of pokes: an anchor, a positive and a negative. The positive is strictly
+nearer to the anchor than the negative. The loss makes the network's features of the anchor more similar to those of the
+positive than to those of the negative.
 """
 
 from dataclasses import dataclass
@@ -12,15 +14,18 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # if half of all draws are ties, all draws of an anchor are ties with a probability of only 1e-30
-# Two squared distances are a tie if they differ by less than this fraction of their sum. Rounding to float32 causes
-# differences of 1e-6.
+# Largest number of draws for an anchor. A draw is repeated if it is a tie, which means that both drawn points are
+# equally far from the anchor. Even if half of all draws were ties, the probability that 100 draws in a row are ties
+# would be only 1e-30.
+MAX_DRAWS_N = 100
+# Two squared distances count as equal (a tie) if their difference is at most this fraction of their sum. The fraction
+# is larger than the differences due to rounding to float32, which are about 1e-6.
 TIE_RTOL = 1e-5
-# Number of places per group to which distances are compared. A point at the same distance from all these places is not
-# used as an anchor.
+# To decide whether a point can be an anchor, its distances from this number of places in its group are compared. The
+# point is not used as an anchor if all these distances are equal.
 COMPARED_PLACES_N = 64
 
-Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
+Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]  # numbers of the positives and of the negatives
 
 
 def squared_error(
@@ -31,7 +36,8 @@ def squared_error(
     Unknown targets (NaN) contribute neither to the loss nor to the gradient.
     """
     known = ~torch.isnan(truth)
-    # Unknown differences are replaced before squaring, because otherwise their gradient would be 0 * NaN = NaN.
+    # Differences from unknown targets are replaced by 0 before they are squared. If their squares were replaced
+    # instead, the gradient would be 0 * NaN = NaN.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
@@ -39,10 +45,11 @@ def squared_error(
 def triplet_loss(
     anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
 ) -> Float[torch.Tensor, " m"]:
-    """Return the mean of max(0, |a - p|^2 - |a - n|^2) over a batch, for each of m networks (section 5 of the paper).
+    """Return the triplet loss of a batch for each of m networks (section 5 of the paper).
 
-    a, p and n are the features of the anchor, the positive and the negative. The loss has no margin. Distances are
-    squared, so that the gradient is 0, and not infinite, if two points coincide.
+    The loss is the mean of max(0, |a - p|^2 - |a - n|^2) over the batch, where a, p and n are the features of the
+    anchor, the positive and the negative. It has no margin. The distances are squared, so that the gradient is 0 if two
+    points coincide; the gradient of the distance itself would be undefined there.
     """
     positive_d2 = ((anchor - positive) ** 2).sum(-1)
     negative_d2 = ((anchor - negative) ** 2).sum(-1)
@@ -51,10 +58,13 @@ def triplet_loss(
 
 @dataclass(frozen=True)
 class TripletPoints:
-    """Points from which triplets are drawn, with an index of the points of each group.
+    """Points from which triplets are drawn, sorted into groups.
 
-    The numbers of the points of group g are `order[start[g] : start[g] + count[g]]`. A point can be an anchor if the
-    other points of its group are not all at the same distance from it.
+    place: the place of each point.
+    group: the number of each point's group.
+    order, start, count: the numbers of the points of group g are `order[start[g] : start[g] + count[g]]`.
+    is_anchor: whether a point can be an anchor. This is the case if the other points of its group are not all at the
+        same distance from it.
     """
 
     place: Float[np.ndarray, "n d"]
@@ -77,7 +87,8 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 
     Raises
     ------
-    TrainingError : if all points of a group are at the same place, or no point can be an anchor
+    TrainingError
+        If all points of a group are at the same place, or if no point of any group can be an anchor.
     """
     names, codes = np.unique(group, return_inverse=True)
     order = np.argsort(codes, kind="stable")
@@ -98,11 +109,12 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 
 
 def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
-    """Draw a positive and a negative for each anchor; return their point numbers.
+    """Draw a positive and a negative for each anchor; return the numbers of these points.
 
-    Two other points of the anchor's group are drawn uniformly; the nearer one is the positive. If both are equally near
-    (a tie), they are drawn again. If a point in `anchor` cannot be an anchor, the point itself is used as positive and
-    negative, so that the loss and the gradient are 0.
+    For each anchor, two other points of its group are drawn uniformly. The point that is nearer to the anchor is the
+    positive. If both are equally near (a tie), they are drawn again. `anchor` may contain points that cannot be anchors
+    (see `TripletPoints`). Such a point itself is used as positive and as negative, so that its loss and its gradient
+    are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
@@ -127,9 +139,9 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 
 
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Return the mask of points of one group that can be anchors.
+    """Return a mask of the points that can be anchors. `place` contains the places of all points of one group.
 
-    To save time, only the distances of a point from the group's first `COMPARED_PLACES_N` places are compared.
+    To save time, a point's distances are compared only for the first `COMPARED_PLACES_N` places of the group.
     """
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)
@@ -144,7 +156,8 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    The result equals that of `np.unique(place, axis=0, ...)`, which compares rows as records and is three times slower.
+    The result is the same as that of `np.unique(place, axis=0, ...)`. That function takes three times as long, because
+    it compares rows as records.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

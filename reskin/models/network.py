@@ -1,8 +1,10 @@
-"""The paper's network and the network that its authors released: architecture, initial weights, and stacks of networks.
+"""The networks: their architectures, their initial weights, and their computation in stacks.
 
-A stack is a set of m networks that are computed together. It has one weight tensor per layer, so that one batched
-product replaces m small products. This is faster, because the overhead of a call exceeds the time for the arithmetic of
-such small networks.
+There are two architectures: the one that the paper describes, and the one that the paper's authors released.
+
+A stack is a set of m networks that are computed together. For each layer, the weights of all m networks are in one
+tensor, so that one batched product replaces m small products. This is faster, because the networks are so small that
+the overhead of a call takes longer than the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -20,13 +22,13 @@ from reskin.models.reproducible import affine
 HIDDEN_N = 200
 FEATURES_N = 40  # width of the bottleneck layer, on whose output the triplet loss is computed (paper section 4)
 FEATURE_LAYERS_N = 3
-OUTPUTS_N = 3  # x, y, F; with shear forces, there are five outputs: x, y, Fx, Fy, Fz
-BLOCK_ROWS_N = 65_536  # rows per forward pass, to limit memory
+OUTPUTS_N = 3  # number of outputs: x, y, F. With shear forces, there are five outputs: x, y, Fx, Fy, Fz.
+BLOCK_ROWS_N = 65_536  # largest number of rows in a forward pass, to limit the use of memory
 
 
 @dataclass(frozen=True)
 class Layer:
-    """A linear layer, with or without a ReLU after it."""
+    """The description of a linear layer: its numbers of inputs and outputs, and whether a ReLU follows it."""
 
     in_n: int
     out_n: int
@@ -34,15 +36,19 @@ class Layer:
 
 
 def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """Return the layers of the paper's network, which the paper describes as follows.
+    """Return the layers of the network that the paper describes.
 
-    B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
+    The description in the paper is: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) ->
+    xyF(3).
     """
     return _layers(inputs_n, outputs_n, relus=(True, False, False, True, True, False))
 
 
 def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """Return the layers of the network that the authors released, with two more ReLUs: after layer 2 and at the end."""
+    """Return the layers of the network that the paper's authors released.
+
+    Compared with the network that the paper describes, it has two more ReLUs: after the second layer and at the end.
+    """
     return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
 
 
@@ -50,7 +56,10 @@ LAYERS = {"paper": paper_layers, "released": released_layers}
 
 
 def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw initial weights from PyTorch's distribution for linear layers: uniform within +-1/sqrt(fan-in)."""
+    """Draw initial weights in the same way as PyTorch's linear layers: uniformly between -1/sqrt(n) and 1/sqrt(n).
+
+    n is the number of inputs of the layer.
+    """
     weights = {}
     for i, layer in enumerate(layers, 1):
         limit = layer.in_n**-0.5
@@ -65,14 +74,18 @@ def _layers(inputs_n: int, outputs_n: int, relus: tuple[bool, ...]) -> tuple[Lay
 
 
 class Stack(nn.Module):
-    """Independent networks of the same architecture, computed together."""
+    """A stack: independent networks of the same architecture that are computed together (see the module's docstring).
+
+    `members` contains the weights of each network.
+    """
 
     def __init__(self, layers: Sequence[Layer], members: Sequence[Weights]) -> None:
         super().__init__()
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        # The weights are made contiguous, because autograd and AdamW would copy the gradients of a transposed view.
+        # The transposed weights are copied to contiguous tensors. With transposed views instead, autograd and AdamW
+        # would have to copy the gradients.
         self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
@@ -81,7 +94,7 @@ class Stack(nn.Module):
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def head(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
-        """Return the output of the remaining layers."""
+        """Return the output of the remaining layers, given the output of the first three layers."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
     def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
@@ -106,7 +119,10 @@ class Stack(nn.Module):
 
 
 class Predictor:
-    """A trained network as a function from scaled inputs to scaled outputs, computed in blocks of rows."""
+    """A trained network that can be called like a function. It converts scaled inputs to scaled outputs.
+
+    Many inputs are processed in blocks of rows, to limit the use of memory.
+    """
 
     def __init__(self, weights: Weights, architecture: str, device: str) -> None:
         inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])

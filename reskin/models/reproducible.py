@@ -1,11 +1,13 @@
 """Differentiable operations whose results are bit-identical on every x86-64 processor with AVX2.
 
-On a CPU, PyTorch computes matrix products, `exp`, `log`, `sqrt` and `erf` with MKL. MKL's results differ between AMD
-and Intel processors, even if MKL_CBWR is set. Training amplifies a difference in the last bit to millimetres.
-Therefore, this module computes matrix products with NumPy's OpenBLAS, which uses the kernels that `reskin.numerics`
-selects. For layers of this size, OpenBLAS is as fast as MKL. `exp` is computed with `exp2`, for which PyTorch does not
-use MKL. Logarithms are computed with NumPy. The other operations of the networks (sums, ReLU, sigmoid, AdamW) do not
-use MKL.
+On a CPU, PyTorch computes matrix products, `exp`, `log`, `sqrt` and `erf` with Intel's library MKL. The results of MKL
+differ between AMD and Intel processors in the last bits, even if the variable MKL_CBWR is set. Training amplifies such
+a difference, so that the predictions of the trained networks may differ by millimetres.
+
+Therefore, the networks do not use these operations of PyTorch. This module computes matrix products with NumPy's
+OpenBLAS instead, which uses the code that `reskin.numerics` selects. For layers of this size, OpenBLAS is as fast as
+MKL. `exp` is computed with `exp2`, for which PyTorch does not use MKL. Logarithms are computed with NumPy. The other
+operations of the networks (sums, ReLU, sigmoid, AdamW) do not use MKL.
 """
 
 import math
@@ -21,7 +23,8 @@ def affine(
 ) -> Float[torch.Tensor, "*n b o"]:
     """Return `values @ weight + bias`.
 
-    `weight` is 2-D for a single layer applied to all rows, or 3-D for a stack with one layer per network.
+    If `weight` is 2-D, the same layer is applied to all rows. If `weight` is 3-D, it contains one layer for each
+    network of a stack (see `reskin.models.network`).
     """
     if weight.ndim == 2 and values.ndim > 2:
         rows = affine(values.flatten(end_dim=-2), weight, bias)
@@ -56,6 +59,7 @@ class _Affine(torch.autograd.Function):
 
 
 def _product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    # as in PyTorch, an overflow gives inf without a warning; the training loop detects it
+    # NumPy's warnings are turned off. As in PyTorch, an overflow then gives inf without a warning, and the training
+    # loop detects it.
     with np.errstate(all="ignore"):
         return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

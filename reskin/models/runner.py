@@ -1,9 +1,10 @@
 """Run many training jobs in parallel, with a cache of completed training runs.
 
-Jobs with equal settings and seed are trained together as a stack. The last bits of a network's weights depend on the
-other networks of its stack. Therefore, stacks are formed from all requested jobs, including those with cached results,
-and the cache key of a result depends on the keys of all jobs in the stack. If a stage is killed and run again, it
-trains only the incomplete stacks.
+Jobs with equal settings and seed are trained together as a stack (several networks in one computation, see
+`reskin.models.network`). The last bits of a network's weights depend on the other networks in its stack. To give the
+same results in every run, stacks are formed from all requested jobs, including those with cached results. The cache key
+of a result depends on the keys of all jobs in the stack. If a stage is killed and run again, only the stacks that were
+not completed are trained.
 """
 
 import hashlib
@@ -23,15 +24,19 @@ from reskin.models.inputs import Scaler
 from reskin.models.job import JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.numerics import device
 
-# Largest number of training runs per job. If all of them collapse, the last network is kept and marked as collapsed,
-# and `reskin predict` rejects the network.
+# Largest number of training runs for a job. A training run has collapsed if its network predicts nearly the same value
+# for all inputs; the job is then run again. If all runs collapse, the network of the last run is kept and marked as
+# collapsed, and `reskin predict` refuses to use it.
 MAX_ATTEMPTS_N = 3
-STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
-NO_ROWS = np.zeros(0, np.int64)  # placeholder in a `RemoteJob`, whose row numbers are in the shared file
+# Largest number of networks in a stack, by device. On a CPU, larger stacks are not faster.
+STACK_N = {"cpu": 3, "cuda": 64}
 
-# a job without row numbers, and the names of `train` and `test` in the shared file
+NO_ROWS = np.zeros(0, np.int64)  # placeholder for the row numbers in a `RemoteJob`
+
+# A job as it is sent to a worker process. It consists of the job without its row numbers, and of the names under which
+# the row numbers `train` and `test` are stored in a file that all workers can read (the shared file).
 RemoteJob = tuple[TrainingJob, str, str]
-# id of an array of row numbers -> its name in the shared file, and the array
+# The arrays of row numbers, with their names in the shared file. The keys are the ids of the arrays.
 FoldRows = Mapping[int, tuple[str, np.ndarray]]
 
 
@@ -40,14 +45,18 @@ def run_jobs(
 ) -> list[TrainingResult]:
     """Train the jobs whose results are not in the cache, and return all results in the order of `jobs`.
 
-    A job whose network collapses is run again with other random draws; there are at most `MAX_ATTEMPTS_N` runs.
+    A job whose network collapses is run again with other random draws, until it has been run `MAX_ATTEMPTS_N` times.
 
     Parameters
     ----------
-    data : the rows to which the row numbers of the jobs refer
-    executor : runs the training of each stack
-    cache : folder with the results of completed training runs
-    log : called with one line per completed stack, and with warnings
+    data
+        The rows to which the row numbers of the jobs refer.
+    executor
+        Runs the training of each stack in a worker process.
+    cache
+        Folder with the results of completed training runs.
+    log
+        Function that is called with one line of text for each completed stack, and with warnings.
     """
     results = _run_once(jobs, data, executor, cache, log)
     for attempt_i in range(1, MAX_ATTEMPTS_N):
@@ -75,11 +84,13 @@ def _run_once(
     if len(fresh) < len(unique):
         log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
     if missing:
-        # The file's name contains the process number, because several processes may run jobs at the same time.
+        # The name of the file contains the number of this process, because several processes may run jobs on the same
+        # data at the same time.
         shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"
         work = [([unique[key] for key in stack], files) for stack, files in missing]
-        # Workers receive only the names of the arrays of row numbers (digests of their content), and read the arrays
-        # from the shared file. Therefore, little data is sent, and a worker reads each array only once.
+        # The arrays of row numbers are not sent to the workers. Workers receive only the names of the arrays, which are
+        # digests of their content, and read the arrays from the shared file. Therefore, little data is sent, and a
+        # worker reads an array only once for all jobs that use it.
         sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
         folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
         skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
@@ -94,7 +105,10 @@ def _run_once(
 
 
 def make_stacks(jobs: Mapping[str, TrainingJob], size_n: int) -> list[list[str]]:
-    """Group the keys of jobs with equal settings and seed into stacks of at most `size_n`, in the order of the jobs."""
+    """Group jobs with equal settings and seed into stacks of at most `size_n` jobs, in the order of `jobs`.
+
+    `jobs` is a mapping from cache keys to jobs. Each stack is returned as a list of keys.
+    """
     groups: dict[tuple[object, ...], list[str]] = {}
     for key, job in jobs.items():
         groups.setdefault((job.recipe, job.schedule, job.loss_weights, job.seed, job.seed_i), []).append(key)
@@ -132,7 +146,7 @@ def _run_stacks(
 
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
-    """Train a stack in a worker process, and write the result of each job to the job's file."""
+    """Train a stack, and write the result of each job to the job's file. This function runs in a worker process."""
     from reskin.models.train import train_stack  # imported here, because it imports torch, which only workers need
 
     jobs = [
@@ -142,7 +156,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     try:
         results = train_stack(jobs, _read_data(shared_file))
     except RuntimeError as error:
-        # torch reports exhausted CPU memory as a RuntimeError
+        # If there is not enough memory, torch raises a RuntimeError. It is converted to a MemoryError.
         if "out of memory" in str(error) or "allocate memory" in str(error):
             raise MemoryError(str(error)) from None
         raise
@@ -157,7 +171,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
 
 
 def _is_intact(file: Path, log: Callable[[str], None]) -> bool:
-    """Return whether a cached result exists and is intact; delete a damaged file, with a warning to `log`."""
+    """Return whether a cached result exists and is intact. A damaged file is deleted, with a warning to `log`."""
     if not file.exists():
         return False
     try:

@@ -1,4 +1,8 @@
-"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks (see `reskin.models.network`)."""
+"""The training loop for a stack of networks, which are trained together (see `reskin.models.network`).
+
+The optimiser is AdamW, with a one-cycle schedule of the learning rate. The networks of a stack do not affect each
+other: each network has its own batches, loss and gradient.
+"""
 
 import math
 import time
@@ -29,29 +33,35 @@ from reskin.models.network import LAYERS, Predictor, Stack
 from reskin.models.recipe import Schedule
 from reskin.numerics import device
 
-BLOCK_STEPS_N = 50  # steps in a block; batches are drawn and the loss is checked once per block
-# Training is stopped if the mean squared error (scaled units) exceeds this value, because networks hardly ever recover
-# from it. A network that predicts the mean has an error of 1.
+# Number of steps in a block. The batches of a block are drawn together, and the loss is checked at the end of a block.
+BLOCK_STEPS_N = 50
+# Training is stopped if the mean squared error exceeds this value, because networks hardly ever recover from such an
+# error. The error is in scaled units, in which a network that always predicts the mean has an error of 1.
 DIVERGED = 1e8
-# collapse is not checked after fewer steps, because the network may not have learned anything yet
+# Whether a network has collapsed (predicts nearly the same value for all inputs) is checked only after this number of
+# steps or more, because after fewer steps, the network may not have learned anything yet.
 CHECKED_STEPS_N = 200
-CHECKED_ROWS_N = 2000  # collapse is checked on about this many evenly spaced training rows
+CHECKED_ROWS_N = 2000  # approximate number of training rows, evenly spaced, on which collapse is checked
 
-# Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
+# The following values are the defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
 WARM_UP = 0.3  # fraction of the steps in which the learning rate rises
-FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # first rate relative to the peak rate; last rate relative to the first rate
+FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # first rate, relative to the peak rate; last rate, relative to the first rate
 MOMENTUM_MAX, MOMENTUM_MIN = 0.95, 0.85
 BETA2, EPS = 0.999, 1e-8
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The weights of a trained network, and its loss curve: the mean squared error between points (scaled units).
+    """The outcome of training one network.
 
-    Point i of the curve is the mean error of the steps after `curve_steps(steps_n)[i - 1]`, up to
-    `curve_steps(steps_n)[i]`. Training diverges in a block of steps if a loss or a weight is not finite, or if the loss
-    exceeds `DIVERGED`. In this case, `stopped_step` is the last step of the block, and the curve and the weights are
-    those after the previous block. Otherwise, `stopped_step` is None.
+    weights: the weights of the trained network.
+    curve: the loss curve, in scaled units. Point i is the mean squared error over the steps after
+        `curve_steps(steps_n)[i - 1]`, up to `curve_steps(steps_n)[i]`.
+    stopped_step: None if training did not diverge.
+
+    Training diverges in a block of steps if a loss or a weight is not finite, or if the mean loss exceeds `DIVERGED`.
+    In this case, `stopped_step` is the last step of the block, and the weights and the curve are those after the
+    previous block.
     """
 
     weights: Weights
@@ -60,8 +70,9 @@ class Outcome:
 
 
 def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[TrainingResult]:
-    """Train jobs with equal settings together, and predict for their test rows."""
-    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
+    """Train jobs with equal settings together, and predict the targets of their test rows."""
+    # Use one thread, so that the order of summation does not depend on the number of other processes.
+    torch.set_num_threads(1)
     started_s, start_s, on, first = time.time(), time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
         raise TrainingError("RESKIN_DEVICE=cuda, but torch finds no CUDA device. Unset it to train on the CPU.")
@@ -87,10 +98,11 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Train a stack: minimise the squared error plus the other loss terms, weighted by `loss_weights`.
+    """Train a stack of networks, and return the outcome for each network.
 
-    The paper specifies neither the optimiser nor the schedule. This implementation uses AdamW with PyTorch's one-cycle
-    schedule of learning rate and momentum.
+    The loss is the squared error on labelled rows, plus the other loss terms, each multiplied by its weight in
+    `loss_weights`. The paper specifies neither the optimiser nor the schedule. This implementation uses AdamW with
+    PyTorch's one-cycle schedule of learning rate and momentum.
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.initial_weights for job in jobs]).to(device)
@@ -114,8 +126,10 @@ def train(
                 predicted = net(batch["few_labels"])
                 loss = loss + loss_weights.few_labels * squared_error(predicted, batch["few_labels_targets"])
             net.zero_grad()
-            loss.sum().backward()  # each network's gradient depends only on the network's own loss
-            clip_gradients(net, schedule.gradient_norm_max)  # a single large step can make all ReLUs of a layer dead
+            # The losses of all networks are added, but the gradient of a network depends only on its own loss.
+            loss.sum().backward()
+            # Gradients are clipped, because a single large step can make all ReLUs of a layer output 0 forever.
+            clip_gradients(net, schedule.gradient_norm_max)
             optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
             errors[step_i - first_step] = error.detach()
         if not monitor.check(errors, first_step + steps_n):
@@ -124,21 +138,26 @@ def train(
 
 
 def clip_gradients(net: Stack, norm_max: float) -> None:
-    """Scale the gradient of each network, as one vector over all its weights, to a norm of at most `norm_max`."""
+    """Clip the gradient of each network to a norm of at most `norm_max`.
+
+    The norm is that of the gradient with respect to all weights of the network. A gradient with a larger norm is scaled
+    down.
+    """
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
-    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # if the norm is 0, the quotient is inf and is clamped to 1
+    # If the norm is 0, the quotient is infinite and is limited to 1.
+    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]
     for gradient in gradients:
         gradient.mul_(scale)
 
 
 def one_cycle(step_i: int, steps_n: int, rate_max: float) -> tuple[float, float]:
-    """Return the learning rate and the momentum (AdamW's beta1) of a step in a one-cycle schedule of `steps_n` steps.
+    """Return the learning rate and the momentum of a step in a one-cycle schedule of `steps_n` steps.
 
-    The rate rises to `rate_max` and then falls to nearly zero, each along half a cosine. The momentum falls while the
-    rate rises, and then rises.
+    The learning rate first rises to `rate_max` and then falls to nearly zero, both along half a period of a cosine.
+    The momentum, which is AdamW's parameter beta1, falls while the rate rises, and rises while the rate falls.
 
     >>> [round(one_cycle(i, 10, 25.0)[0], 4) for i in (0, 2, 9)]
     [1.0, 25.0, 0.0001]
@@ -158,10 +177,11 @@ def _cosine(start: float, end: float, part: float) -> float:
 
 
 class AdamW:
-    """PyTorch's fused AdamW, with learning rate and momentum passed to each step.
+    """PyTorch's optimiser AdamW (fused version). The learning rate and the momentum are arguments of each step.
 
-    This class calls PyTorch's functional interface, because the first use of `torch.optim.AdamW` in a process imports
-    PyTorch's compiler, which takes a second of CPU time. The results are bit-identical to `torch.optim.AdamW`.
+    This class calls the function `torch.optim.adamw.adamw` instead of using the class `torch.optim.AdamW`. The first
+    use of that class in a process would import PyTorch's compiler, which takes a second of CPU time. The results are
+    bit-identical to those of `torch.optim.AdamW`.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:
@@ -172,7 +192,7 @@ class AdamW:
 
     @torch.no_grad()
     def step(self, rate: float, momentum: float) -> None:
-        """Update the parameters from their gradients; torch raises an error if a parameter has no gradient."""
+        """Update the parameters, using their gradients. torch raises an error if a parameter has no gradient."""
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         adamw(
             self.parameters, gradients, self.mean, self.mean_square, [], self.steps_n, fused=True, amsgrad=False,
@@ -181,7 +201,11 @@ class AdamW:
 
 
 class Monitor:
-    """Records the errors of each network of a stack, and the weights after the last block without divergence."""
+    """Records the training of each network of a stack, and detects divergence.
+
+    A monitor keeps the errors of all steps. It also keeps the weights of each network after the last block of steps in
+    which its training had not diverged.
+    """
 
     def __init__(self, net: Stack) -> None:
         self.net = net
@@ -191,9 +215,13 @@ class Monitor:
         self.stopped_step: dict[int, int] = {}
 
     def check(self, errors: Float[torch.Tensor, "s m"], step: int) -> bool:
-        """Record the errors of a block of steps that ends at `step`; return False if all networks have diverged."""
+        """Record the errors of a block of steps that ends at `step`.
+
+        Returns False if the training of all networks has diverged, so that it can be stopped.
+        """
         self.errors.append(errors)
-        is_sound = (self.net.is_finite() & (errors.mean(dim=0) <= DIVERGED)).tolist()  # False for NaN
+        # The comparison is False if the mean error is NaN.
+        is_sound = (self.net.is_finite() & (errors.mean(dim=0) <= DIVERGED)).tolist()
         for i in set(range(len(is_sound))) - set(self.stopped_step):
             if is_sound[i]:
                 self.sound_steps_n[i] = step
@@ -203,7 +231,7 @@ class Monitor:
         return len(self.stopped_step) < len(is_sound)
 
     def outcomes(self, steps_n: int) -> list[Outcome]:
-        """Return the outcome of each network; `steps_n` is the planned number of steps."""
+        """Return the outcome of each network. `steps_n` is the number of steps that were planned."""
         errors = torch.cat(self.errors).double().cpu().numpy()
         outcomes = []
         for i, (weights, sound_n) in enumerate(zip(self.weights, self.sound_steps_n, strict=True)):
@@ -216,7 +244,11 @@ class Monitor:
 def _explained_min(
     job: TrainingJob, data: TrainingData, network: Callable[[np.ndarray], np.ndarray], scaler: Scaler
 ) -> float | None:
-    """Return the smallest explained variance (R2) of the known targets on training rows; None for a short run."""
+    """Return the smallest explained variance (R2) among the targets, computed on training rows.
+
+    Targets that are unknown or constant are left out. After a training run of fewer than `CHECKED_STEPS_N` steps, the
+    result is None.
+    """
     if job.schedule.steps_n < CHECKED_STEPS_N:
         return None
     rows = job.train[:: -(-len(job.train) // CHECKED_ROWS_N)]

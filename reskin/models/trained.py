@@ -19,8 +19,10 @@ from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
 
-FORMAT = "reskin-model/3"  # format of a model's card
-UNIVERSAL = "reskin-universal"  # prefix of the format of the universal model's card
+# A model is stored with a JSON card, a file that describes the model. The card's entry `format` is FORMAT for networks.
+# For the universal model, it begins with UNIVERSAL.
+FORMAT = "reskin-model/3"
+UNIVERSAL = "reskin-universal"
 SUFFIX = ".safetensors"
 
 if TYPE_CHECKING:
@@ -30,14 +32,14 @@ if TYPE_CHECKING:
 
 
 class CardRecipe(Strict, extra="ignore"):
-    """The settings of a model's recipe on which predictions depend."""
+    """Section `recipe` of a model's card: those settings of the training on which predictions depend."""
 
     architecture: Literal["paper", "released"]
     inputs: Literal["raw", "shape"]
 
 
 class CardInput(Strict, extra="ignore"):
-    """Section `input` of a model's card."""
+    """Section `input` of a model's card: the quantity, the unit and the number of the inputs."""
 
     quantity: Literal["change of field"]
     unit: Literal["uT"]
@@ -45,7 +47,7 @@ class CardInput(Strict, extra="ignore"):
 
 
 class Card(Strict, extra="ignore"):
-    """The entries of a model's JSON card on which predictions depend; other entries are ignored."""
+    """The entries of a model's JSON card on which predictions depend. Other entries are ignored."""
 
     format: str
     recipe: CardRecipe
@@ -56,7 +58,11 @@ class Card(Strict, extra="ignore"):
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network, with its card and its weights."""
+    """A trained network. It can be called like a function, to predict targets from field changes.
+
+    card: the content of the network's JSON card.
+    tensors: the weights of the network, and the shifts and scales of its inputs and outputs.
+    """
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
@@ -64,13 +70,16 @@ class Network:
     __repr__ = one_line
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f t"]:
-        """Predict x_mm, y_mm and F_N (or the other targets of the training) for each of f field changes in uT."""
+        """Predict the targets for each of f field changes in uT.
+
+        The targets are those with which the network was trained, usually x_mm, y_mm and F_N.
+        """
         scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
         return scaler.decode(self._predictor(scaler.encode(view)))
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """The network as a PyTorch model. The model is cached, because controllers predict for every frame."""
+        """The network as a PyTorch model. It is built only once, because a robot's controller predicts every frame."""
         from reskin.models.network import Predictor  # imported here, because it imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
@@ -78,14 +87,15 @@ class Network:
 
 
 def read_network(model: Path) -> Network:
-    """Read a trained network (.safetensors) and its card (.json), which is in the same folder.
+    """Read a trained network from its .safetensors file, and its JSON card, which is in the same folder.
 
     Raises
     ------
     ParamsError
         If the network or its card is missing.
     SchemaError
-        If the card is invalid or does not fit the weights, or the network has collapsed.
+        If the card is invalid or does not fit the weights, or if the network has collapsed, which means that it
+        predicts nearly the same value for all inputs.
     """
     card_file = model.with_suffix(".json")
     if model.is_dir():
@@ -128,7 +138,11 @@ def read_network(model: Path) -> Network:
 
 
 def _find_models(missing: Path) -> str:
-    """Return advice for the user on a missing model file. Pipeline stages write models to data/models/SCENE/STAGE."""
+    """Return advice for the user on a model file that is missing.
+
+    If other models are in the folder, the advice lists them. Otherwise, the scene that trains the model is taken from
+    the path, because pipeline stages write models to data/models/SCENE/STAGE.
+    """
     if names := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
         return f"Models in this folder: {', '.join(names[:3])}{', ...' if names[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
@@ -138,7 +152,7 @@ def _find_models(missing: Path) -> str:
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read the networks of stage `train_multi` for which the board was held out, one network per seed."""
+    """Read those networks of stage `train_multi` that were trained without this board. There is one for each seed."""
     networks = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -151,7 +165,10 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment: for each fold, one network per seed; {} if the scene does not run it."""
+    """Read the networks of an experiment by the name of the fold, one network for each fold and seed.
+
+    The result is empty if the scene does not run the experiment.
+    """
     by_fold: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -163,18 +180,22 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
 
 # --- ONNX ---
 
-OPSET, IR = 17, 8  # ONNX versions from 2022, which current runtimes support
-INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"
-Node = tuple[str, tuple[str, ...], str]  # operator, inputs, output
+OPSET, IR = 17, 8  # versions of ONNX's operators and file format; they are from 2022, and current runtimes support them
+INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"  # names of the input and of the output of the ONNX model
+Node = tuple[str, tuple[str, ...], str]  # a node of the graph: its operator, the names of its inputs, and of its output
 
 
 def write_onnx(network: Network, file: Path) -> None:
-    """Write a network as an ONNX file; replace an existing file."""
+    """Write a network as an ONNX file. An existing file is replaced."""
     file.write_bytes(build_onnx(network).SerializeToString())
 
 
 def build_onnx(network: Network) -> "ModelProto":
-    """Build the ONNX model of a network: view, input scaling, layers, and conversion of outputs to mm and N."""
+    """Build the ONNX model of a network.
+
+    The model consists of the same steps as the network: it computes the view of the field change (see
+    `reskin.models.inputs`), scales the inputs, applies the layers, and converts the outputs to mm and N.
+    """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
@@ -217,7 +238,10 @@ def _raw() -> Iterator[Node]:
 
 
 def _shape() -> Iterator[Node]:
-    """Yield the nodes of view `shape`: direction and log of the magnitude, as in `reskin.models.inputs.shape`."""
+    """Yield the nodes that compute view `shape`, as `reskin.models.inputs.shape` does.
+
+    The view consists of the direction of the field change and of the logarithm of its magnitude.
+    """
     yield "ReduceL2", (INPUT,), "length_uT"
     yield "Max", ("length_uT", "floor_uT"), "floored_uT"
     yield "Div", (INPUT, "floored_uT"), "direction"
