@@ -75,10 +75,9 @@ HOVER_MEANING = (
     "chips sense the magnetism of the tip itself. |dB| without contact includes the noise of the no-load reading."
 )
 TABLE_2_SPREAD = (
-    "± is the standard deviation, as in the paper. For networks that are trained on many skins, it is the standard "
-    "deviation over n held-out boards. For networks that are trained on one skin and tested on others, it is the "
-    f"standard deviation over n pairs of a training skin and a test skin. {INTERVAL} For networks that are trained on "
-    "one skin and tested on others, the interval is over training skins and tested boards."
+    "± is the standard deviation, as in the paper. It is over n held-out boards, or, for one skin tested on others, "
+    f"over n pairs of a training skin and a test skin. {INTERVAL} For one skin tested on others, the interval is over "
+    "training skins and tested boards."
 )
 SUMMARY_SPREAD = (
     f"{INTERVAL} For one skin tested on others, ± is the standard deviation over n pairs of skins. In all other rows, "
@@ -148,9 +147,8 @@ FINAL_MEANING = (
     "board. They estimate the scores of the final model on a further board. The final model itself was not tested."
 )
 SKINS_MEANING = (
-    "Each cell shows the mean over skins, the smallest and the largest value of a skin in brackets, and the number of "
-    "skins in parentheses. The field change of a reading is the length of the vector of all channels. The table shows "
-    "its median over readings whose force is within 20 % of the stated force. A dash (–) means that there are too few "
+    "Each cell: mean over skins [smallest … largest] (number of skins). The field change of a reading is the length of "
+    "the vector of all channels; the table uses the median over readings within 20 % of the stated force. –: too few "
     "readings."
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
