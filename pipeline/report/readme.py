@@ -30,8 +30,8 @@ COMPARED = ("compare", "compare_parameters", "compare_frames")
 MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
-    "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
-    "them run side by side, so less time passes."
+    "The table shows the time to compute everything from scratch, as if the training runs ran one after another. By "
+    "default, two training runs run at the same time, so less time passes."
 )
 BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
