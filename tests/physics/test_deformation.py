@@ -96,8 +96,8 @@ def test_deformation_by_a_shallow_poke_is_linear_in_the_depth(base):
     r_m, z_m = nodes(r_max_m=1e-3)
     deformed, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
-    # The tolerance is 5 % of the depth. The theory is exact for vanishing depth only, and the contact (0.3 mm) is as
-    # small as the shortest wave that is summed.
+    # The tolerance is 5 % of the depth. The linear theory neglects that the material moves, and the contact (0.3 mm) is
+    # as small as the shortest wave that is summed.
     np.testing.assert_allclose(deformed.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
     np.testing.assert_allclose(deformed.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 
