@@ -151,12 +151,10 @@ def test_law_without_slide_equals_the_nominal_skin():
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
+    # The depth of `nominal_uT` is fixed, so the force of this depth is found by trying many forces.
     lengths = [
         np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N)))
-        for force_N in
-        # The depth of `nominal_uT` is fixed, so the force of this depth is found by trying many forces.  # fmt:
-        # skip
-        np.geomspace(0.2, 8, 30)
+        for force_N in np.geomspace(0.2, 8, 30)
     ]
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
