@@ -1,4 +1,4 @@
-"""Compile bytecode and Numba kernels once (`make test`), because otherwise every test worker would compile them."""
+"""Compile bytecode and Numba kernels once, as `make test` does. Otherwise, every test worker would compile them."""
 
 import reskin
 from tests.stages.checkout import compile_modules

@@ -19,18 +19,18 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from tests.benchmarks import FULL
 
-# No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that
-# tests of unchanged code do not begin to fail; `--hypothesis-profile=thorough` draws many other examples.
+# No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that tests
+# of unchanged code do not begin to fail. With `--hypothesis-profile=thorough`, many other examples are drawn.
 always = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("same", max_examples=50, derandomize=True, **always)
 settings.register_profile("thorough", max_examples=1000, **always)
 settings.load_profile("same")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
-LONG = (  # the slowest test files: they run stages and commands
+LONG = (  # The slowest test files, which run stages and commands.
     "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
 )  # fmt: skip
-CHECKED_N = 50  # number of calls of a function that are checked in each test
+CHECKED_N = 50  # The number of calls of a function whose arrays are checked in each test.
 calls_n: Counter[Any] = Counter()
 
 
@@ -55,7 +55,7 @@ def check_arrays(decorated: Any = None, *, typechecker: Any) -> Any:
         calls_n[decorated] += 1
         if calls_n[decorated] > CHECKED_N:
             return decorated(*args, **kwargs)
-        # decorated at the first call, because decorating all functions would slow down the import
+        # The function is decorated at its first call, because decorating all functions would slow down the import.
         checked = checked or jaxtyped(decorated, typechecker=typechecker)
         return checked(*args, **kwargs)
 
@@ -64,7 +64,7 @@ def check_arrays(decorated: Any = None, *, typechecker: Any) -> Any:
 
 def _names_an_array(hint: Any) -> bool:
     if isinstance(hint, str):
-        return "[" in hint  # array annotations have brackets
+        return "[" in hint  # Only annotations of arrays have brackets.
     return (inspect.isclass(hint) and issubclass(hint, AbstractArray)) or any(map(_names_an_array, get_args(hint)))
 
 
@@ -72,10 +72,10 @@ def pytest_runtest_setup() -> None:
     calls_n.clear()
 
 
-gc.disable()  # imports are faster without garbage collection
-jaxtyping.jaxtyped = check_arrays  # the import hook applies `jaxtyped` to all functions of the project
-if not FULL:  # no checks in benchmarks at full size
-    # not with jaxtyping's pytest plugin, which would import NumPy before `pipeline`
+gc.disable()  # Imports are faster without garbage collection.
+jaxtyping.jaxtyped = check_arrays  # The import hook of jaxtyping applies `jaxtyped` to all functions of the project.
+if not FULL:  # Arrays are not checked in benchmarks at full size, because checks take time.
+    # The pytest plugin of jaxtyping is not used, because it would import NumPy before `pipeline`.
     jaxtyping.install_import_hook(["pipeline", "reskin"], "beartype.beartype")
 
 
@@ -85,7 +85,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude all imported objects from garbage collection; they are needed until the end."""
+    """Exclude all imported objects from garbage collection, because they are needed until the end."""
     gc.freeze()
     gc.enable()
 

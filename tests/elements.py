@@ -14,12 +14,17 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad, asm
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-SLIP_SHARE = 1e-3  # friction is proportional to slip below this fraction of the largest slip (smoothed Coulomb law)
+# If the slip is below this fraction of the largest slip, friction is proportional to the slip. This is a smoothed form
+# of Coulomb's law.
+SLIP_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacement [component, element, point] and gradient [component, axis, element, point] at integration points."""
+    """The displacement and its gradient at the integration points of finite elements.
+
+    The displacement is an array [component, element, point], and the gradient [component, axis, element, point].
+    """
 
     r_m: np.ndarray
     z_m: np.ndarray
@@ -30,7 +35,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solution:
-    """Motion inside the layer, at its base and at its top, and the load-weighted mean displacement along the load."""
+    """A finite-element solution: the motion inside the layer, at its base and at its top.
+
+    It includes the mean displacement along the load, weighted by the load.
+    """
 
     inside: Motion
     base: Motion
@@ -52,12 +60,15 @@ def along_x_strains(u, r):
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer meshed in the (r, z) plane, with uniform cells up to radius `fine_m` and growing cells up to `end_m`."""
+    """A layer that is meshed in the (r, z) plane.
+
+    Cells are uniform up to the radius `fine_m`, and grow from there up to `end_m`.
+    """
 
     thickness_m: float
     fine_m: float
     end_m: float
-    cells_n: int  # number of cells over the thickness
+    cells_n: int  # The number of cells over the thickness.
     strains: Callable = axisymmetric_strains
 
     @cached_property

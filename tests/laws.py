@@ -1,4 +1,4 @@
-"""Helper for tests of experiments whose results are checks (rows with error, tolerance and reason)."""
+"""A helper for tests of experiments whose results are checks. Each check has an error, a tolerance and a reason."""
 
 
 def broken(rows):

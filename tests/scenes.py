@@ -24,7 +24,7 @@ def recorded_scene(**changes: object) -> dict[str, object]:
 
 SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
-# content of params.yaml in tests
+# The content of params.yaml in tests.
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
     "faults": DEFAULT_POLICY.model_dump(),

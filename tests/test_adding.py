@@ -99,7 +99,9 @@ def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
 @pytest.mark.parametrize(
     "found", ["Compared with the scene, chips 1 and 2 are swapped.", None, CaptureError("no places")]
 )
-def test_difference_from_the_simulated_skin_is_a_warning(root, lab_file, monkeypatch, capsys, found):
+def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
+    root, lab_file, monkeypatch, capsys, found
+):
     def find_departure(*_: object) -> str | None:
         if isinstance(found, CaptureError):
             raise found
@@ -124,14 +126,14 @@ def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypat
     assert "warning" not in capsys.readouterr().err
 
 
-def test_repeated_readings_are_a_warning(root, tmp_path, capsys):
+def test_recording_with_repeated_readings_is_added_with_a_warning(root, tmp_path, capsys):
     """If a recorder reads faster than the chips convert, it writes each reading twice."""
     press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
     add_lab(root, write(tmp_path, *press) / "readings.csv")
     assert "board1_skin1_readings: 50% of readings repeat the one before." in capsys.readouterr().err
 
 
-def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
+def test_recording_with_exchanged_coordinates_is_added_with_a_warning(root, tmp_path, lab_file, capsys):
     columns = table.columns_of(5)
     for i, swapped in enumerate((False, True)):
         places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
@@ -147,7 +149,7 @@ def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
         assert ("other captures only with x and y swapped" in capsys.readouterr().err) == swapped
 
 
-def test_duplicates_are_refused_unless_allowed(root, lab_file):
+def test_recording_that_was_added_before_is_refused_unless_allowed(root, lab_file):
     add_lab(root, lab_file)
     assert_refused(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
     assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
@@ -157,7 +159,7 @@ def test_duplicates_are_refused_unless_allowed(root, lab_file):
     assert len(plan.check(root).stages["ingest"]) == 2
 
 
-def test_copy_with_other_formatting_is_a_copy(root, lab_file, tmp_path):
+def test_copy_of_a_recording_with_other_formatting_is_recognised(root, lab_file, tmp_path):
     add_lab(root, lab_file)
     (tmp_path / "copy.csv").write_text(lab_file.read_text().replace("21.5,", "21.50,"))
     assert_refused(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
@@ -170,12 +172,12 @@ def test_failed_removal_changes_nothing(root, lab_file):
     assert_refused(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 
-def test_existing_folder_of_a_killed_add_is_an_error(root, lab_file):
+def test_folder_left_by_a_killed_add_is_reported(root, lab_file):
     (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
     assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed")
 
 
-def test_errors_name_the_file_of_the_user(root, tmp_path):
+def test_errors_name_the_file_that_the_user_has_given(root, tmp_path):
     (tmp_path / "mine.csv").write_bytes(b"indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,Fx,Fy,Fz\n")
     assert_refused(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
 
@@ -454,7 +456,7 @@ def test_scene_with_too_little_data_is_an_error(root, lab_file):
     assert "Traceback" not in done.stderr + done.stdout
 
 
-def test_new_scene_holds_out_each_board_of_a_layout(root, tmp_path, monkeypatch):
+def test_new_scene_for_a_layout_holds_out_each_of_its_boards(root, tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     created = output_of(["new", "mine", "--boards", "b1,b2,b3", "--presses", "60", "--passes", "2"])
     assert "experiment calibrated is left out" in created
@@ -478,7 +480,7 @@ def test_new_scene_holds_out_each_board_of_a_layout(root, tmp_path, monkeypatch)
     assert read_settings("own", root).section(Compare, "compare").layout.gap_mm == 2
 
 
-def test_table_without_its_passes_is_a_warning(root, tmp_path, monkeypatch, capsys):
+def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(root)
     monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: None)
     output_of(["new", "mine", "--boards", "b1,b2", "--presses", "20", "--passes", "2"])

@@ -1,4 +1,7 @@
-"""Tests of which stages DVC would rerun after an edit, from DVC's index and hashes; only stage `code` is run."""
+"""Tests of which stages DVC would run again after an edit.
+
+They compare DVC's index and hashes before and after the edit. Only stage `code` is run.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +16,7 @@ from reskin.models.job import CODE_MODULES, JobKeys
 from tests.models.example_jobs import example_data, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
 STAGE = """\
   repeat: # how much force differs from reading to reading
     foreach: ${stages.repeat}
@@ -65,7 +68,7 @@ def before(root) -> dict[str, tuple[Any, ...]]:
 
 
 def state(root: Path) -> dict[str, tuple[Any, ...]]:
-    """Run stage `code`; return, for each other stage, the command, the hashes of the dependencies, and the outputs."""
+    """Run stage `code`. Return, for each other stage, its command, the hashes of its dependencies, and its outputs."""
     from dvc.dependency.param import read_param_file
     from dvc.repo import Repo
 
@@ -93,7 +96,7 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def stale_stages(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
-    """Return the stages that DVC would rerun: changed stages, and all stages that depend on their outputs."""
+    """Return the stages that DVC would run again: changed stages, and all stages that depend on their outputs."""
     stale: set[str] = set()
     more = {name for name in after if after[name] != before.get(name)}
     while more - stale:
@@ -109,7 +112,7 @@ def _overlap(path: Path, other: Path) -> bool:
 
 @contextmanager
 def edited_files(root: Path, files: dict[str, str]) -> Iterator[None]:
-    """Write files within the block; afterwards, restore the files and the plan."""
+    """Write files within the block. At its end, restore the files and the plan."""
     original = {root / name: (root / name).read_text() for name in [PLAN, *files] if (root / name).exists()}
     try:
         for name, text in files.items():
@@ -139,8 +142,8 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
     assert stale_stages(before, after) == {
-        "repeat@ci", "table2@ci", "report@ci",  # stages that read the numbers of all experiments
-        "contacts@ci",  # this stage reads the whole scene file
+        "repeat@ci", "table2@ci", "report@ci",  # These stages read the numbers of all experiments.
+        "contacts@ci",  # This stage reads the whole file of the scene.
     }  # fmt: skip
 
 
@@ -148,7 +151,7 @@ def test_edited_caption_reruns_the_report_and_edited_code_the_experiment(root, b
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
     with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
-    assert stale_stages(before, after) == {"table2@ci", "report@ci"}  # all tables are in one module
+    assert stale_stages(before, after) == {"table2@ci", "report@ci"}  # All tables are in one module.
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci"}

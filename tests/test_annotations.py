@@ -1,4 +1,4 @@
-"""Tests that array annotations are checked while tests run: a wrong shape or dtype is an error."""
+"""Tests that annotations of arrays are checked while tests run, so that a wrong shape or type is an error."""
 
 import numpy as np
 import pytest
@@ -26,4 +26,4 @@ def test_calls_are_counted_in_each_test(test_name):
         rotation_angle(np.zeros((4, 2, 2)))
     with pytest.raises(TypeCheckError, match="rotation_angle"):
         rotation_angle(np.zeros((4, 2, 3)))
-    rotation_angle(np.zeros((4, 2, 3)))  # after CHECKED_N calls in a test, arrays are not checked
+    rotation_angle(np.zeros((4, 2, 3)))  # After CHECKED_N calls in a test, arrays are no longer checked.

@@ -32,7 +32,7 @@ def test_examples_in_docstrings_run(name):
     assert (done.failed, done.attempted > 0) == (0, True)
 
 
-def test_import_is_cheap():
+def test_importing_reskin_imports_no_slow_packages():
     modules = ("torch", "scipy", "pandas", "sklearn", "mlflow")
     code = f"import sys, reskin; print([name for name in {modules} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -75,13 +75,14 @@ def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     noload_uT, b_uT, Fz_N = reskin.simulate_pokes(skin, places.tolist(), board=board, chip=QUIET_CHIP)
 
     per_poke = capture.b_uT.reshape(len(places), -1, 15)
-    # tolerance: the largest quantisation step of a chip; rounding of places to float32 changes the field less
+    # The tolerance is the largest step of a chip. The rounding of places to single precision changes the field less.
     step_uT = 0.5
     assert np.abs(per_poke[:, 1] - noload_uT).max() <= step_uT
     last_contact_i = per_poke.shape[1] - 1 - shared["rig"]["moving_frames_n"]
     assert np.abs(per_poke[:, last_contact_i] - b_uT).max() <= step_uT
     assert np.abs(b_uT - noload_uT).max() > 100 * step_uT
-    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # resolution of the force sensor
+    # The tolerance is the resolution of the force sensor.
+    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)
 
 
 def test_designs_accept_plain_values_and_refuse_wrong_ones():
@@ -95,21 +96,22 @@ def test_designs_accept_plain_values_and_refuse_wrong_ones():
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
-def test_no_pokes_give_empty_arrays():
+def test_simulating_no_pokes_gives_empty_arrays():
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), np.zeros((0, 3)))
     with_poke = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
     assert (noload_uT.shape, b_uT.shape, force_N.shape) == ((0, 15), (0, 15), (0,))
     assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in with_poke)
 
 
-def test_touch_has_keyword_arguments():
+def test_touch_and_record_accept_only_known_keyword_arguments():
     touch = reskin.touch(1, 2, depth_mm=0.5, Fx_N=0.1, Fz_N=3, pass_i=4)
     assert touch == (True, 1, 2, 0.5, 0.1, touch.Fy_N, 3, 4)
     assert np.isnan(touch.Fy_N)
     with pytest.raises(TypeError, match="unexpected keyword argument 'Fz'"):
         reskin.touch(1, 2, Fz=3)
     with pytest.raises(TypeError, match="unexpected keyword argument 'bord'"):
-        reskin.record(iter(()), port="/dev/none", bord="b1")  # a misspelt keyword is an error before the port is opened
+        # A misspelt keyword is an error before the port is opened.
+        reskin.record(iter(()), port="/dev/none", bord="b1")
 
 
 def test_open_accepts_loaded_models(model):  # noqa: F811

@@ -21,7 +21,7 @@ from reskin import io
 from reskin.config import parse
 from reskin.errors import ReskinError, SchemaError
 
-# SHA-256 of the files of published versions. These files never change; for a correction, add a version.
+# The SHA-256 of the files of published versions. These files never change: for a correction, a new version is added.
 PUBLISHED = {
     "v1/eflesh.json": "d7aeb2c6e57811c916b9bfadc59e30d226c6314ec7401d17a9fdd82479e28f6b",
     "v1/lab.json": "b5a0b3cdf9a882aa4ea66765a2ffbc6ec828183af4ff9e7d8468eff973ad71b7",
@@ -38,7 +38,7 @@ def test_published_versions_never_change():
 
 
 @pytest.mark.parametrize("dataset", ["lab", "eflesh", "simulated"])
-def test_no_press_has_two_roles(dataset):
+def test_each_press_has_only_one_role_in_a_fold(dataset):
     content = read_folds(dataset)
     for one in content.draws:
         assert one.board not in one.train
@@ -58,29 +58,29 @@ def lab(shared_data) -> Dataset:
     return read_dataset("lab", recordings(shared_data, "lab"))
 
 
-def test_lab_folds_are_those_that_the_code_draws(lab):
+def test_folds_of_lab_recordings_are_those_that_the_code_draws(lab):
     drawn = draw.draw_lab(list(lab.folds.recordings), lab.presses)
     content = json.loads((folds.FOLDER / "v1/lab.json").read_text())
     assert {name: content[name] for name in drawn} == json.loads(json.dumps(drawn))
 
 
-def test_eflesh_is_tested_on_its_last_pass(shared_data):
+def test_eflesh_recordings_are_tested_on_their_last_pass(shared_data):
     (task,) = benchmark.tasks("eflesh", recordings(shared_data, "eflesh"))
     assert (len(task.labels), len(task.tests_uT), len(task.train)) == (4 * 961, 961, 0)
-    assert np.unique(task.labels.place_mm[:961], axis=0).shape == (961, 2)  # each pass visits each place once
+    assert np.unique(task.labels.place_mm[:961], axis=0).shape == (961, 2)  # Each pass visits each place once.
     assert np.isnan(task.labels.force_N).all()
 
 
-def test_lab_tests_are_far_from_labels(lab):
+def test_tested_presses_of_lab_recordings_are_far_from_labels(lab):
     for one in lab.folds.draws:
         place_mm = lab.presses[one.board].place_mm
         tests_mm, labels_mm = place_mm[list(one.tests)], place_mm[list(one.labels)]
-        assert np.linalg.norm(tests_mm[:, None] - labels_mm, axis=2).min() >= 2  # places are 2 mm apart
+        assert np.linalg.norm(tests_mm[:, None] - labels_mm, axis=2).min() >= 2  # Places are 2 mm apart.
     assert len(lab.readings["board1"]) == 195 * 100
     assert lab.presses["board1"].recording.tolist() == [0] * 65 + [1] * 65 + [2] * 65
 
 
-def test_task_gives_only_what_a_method_may_use():
+def test_method_gets_only_the_data_that_it_may_use():
     data = read_dataset("simulated")
     one = data.folds.draws[0]
     task = data.task(one, 10)
@@ -94,7 +94,7 @@ def test_task_gives_only_what_a_method_may_use():
         task.predictions([[8.0, 8.0]])
 
 
-def test_changed_recording_is_an_error(shared_data, tmp_path):
+def test_recording_that_was_changed_is_refused(shared_data, tmp_path):
     for name in (f"board{board}_depth{depth}.csv" for board in (1, 2) for depth in (1, 2, 3)):
         (tmp_path / name).symlink_to(shared_data / "lab" / name)
     changed = tmp_path / "board2_depth3.csv"
@@ -131,7 +131,7 @@ ROWS = [
 
 @pytest.fixture(scope="module")
 def tiny_folder(tmp_path_factory) -> Path:
-    """Make a folder for a benchmark with one tiny dataset."""
+    """Make the folder of a benchmark that has one tiny dataset."""
     folder = tmp_path_factory.mktemp("benchmark")
     (folder / "t").mkdir()
     board = np.repeat(["a", "b", "c"], 4)
@@ -184,7 +184,7 @@ def test_scores_equal_those_computed_by_hand(tiny, tmp_path):
         "coverage_f_pct": 50.0,
         "interval_score_f_N": 20 * 1 / 2,
     }
-    # tolerance: scores are written with six significant digits
+    # Tolerance: scores are written with six significant digits.
     assert {name: a[name]["mean"] for name in a} == pytest.approx(expected, rel=1e-5)
     assert b["accuracy_pct"]["mean"] == 100
     assert b["interval_score_f_N"]["mean"] == 0
@@ -195,7 +195,7 @@ def test_scores_equal_those_computed_by_hand(tiny, tmp_path):
 
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(rows=st.permutations(ROWS))
-def test_order_of_rows_does_not_matter(tiny, tmp_path, rows):
+def test_order_of_rows_in_a_file_of_predictions_does_not_matter(tiny, tmp_path, rows):
     shuffled, ordered = (read_predictions(write_rows(tmp_path, some)) for some in (rows, ROWS))
     for name in ("fold", "press", "place_mm", "force_N"):
         np.testing.assert_array_equal(getattr(shuffled, name), getattr(ordered, name))
@@ -220,7 +220,7 @@ def test_all_folds_of_one_label_count_may_be_omitted(tiny, tmp_path):
 
 
 def edit(row_i: int, column_i: int, text: str) -> Callable[[list[str]], list[str]]:
-    """Return a function that replaces a cell of the rows."""
+    """Return a function that replaces one cell of the rows."""
 
     def change(rows: list[str]) -> list[str]:
         cells = rows[row_i].split(",")
@@ -276,7 +276,7 @@ def scale(**factors: float) -> Callable[[list[str]], list[str]]:
         (lambda rows: [], r"the file has no predictions"),
     ],
 )  # fmt: skip
-def test_bad_rows_are_errors(tiny, tmp_path, change, message):
+def test_invalid_rows_of_predictions_are_refused(tiny, tmp_path, change, message):
     with pytest.raises(SchemaError, match=message):
         score_file(write_rows(tmp_path, change(ROWS)), ABOUT)
 
@@ -293,7 +293,7 @@ def test_bad_rows_are_errors(tiny, tmp_path, change, message):
         ("F_sd_N", "x_sd_mm", r"both x_sd_mm and x_low_mm are given"),
     ],
 )
-def test_bad_columns_are_errors(tiny, tmp_path, old, new, message):
+def test_invalid_columns_of_predictions_are_refused(tiny, tmp_path, old, new, message):
     names = HEAD.strip().split(",")
     kept = [i for i, name in enumerate(names) if new or name not in old.split(",")]
     rows = [",".join(row.split(",")[i] for i in kept) for row in ROWS]
@@ -301,7 +301,7 @@ def test_bad_columns_are_errors(tiny, tmp_path, old, new, message):
         read_predictions(write_rows(tmp_path, rows, HEAD.replace(old, new, 1)))
 
 
-def test_other_files_are_errors(tiny, tmp_path):
+def test_files_that_contain_no_predictions_are_refused(tiny, tmp_path):
     with pytest.raises(SchemaError, match=r"must end in .csv or .parquet"):
         read_predictions(tmp_path / "mine.txt")
     with pytest.raises(SchemaError, match="file not found"):
@@ -343,11 +343,11 @@ def test_command_writes_the_scores_and_an_entry(tiny, tmp_path):
 # --- Our own methods ---
 
 
-def test_simulated_entry_of_nearest_label_is_the_committed_one(tmp_path):
+def test_method_nearest_label_has_its_committed_scores_on_simulated_boards(tmp_path):
     check_nearest_label(read_dataset("simulated"), tmp_path)
 
 
-def test_recorded_entry_of_nearest_label_is_the_committed_one(lab, tmp_path):
+def test_method_nearest_label_has_its_committed_scores_on_recorded_boards(lab, tmp_path):
     check_nearest_label(lab, tmp_path)
 
 
@@ -364,7 +364,7 @@ def test_universal_model_predicts_places_and_forces_with_intervals():
     task = data.task(data.folds.draws[0], 40)
     (rows,) = methods.universal([task])
     predicted, true = rows.to_pandas(), data.presses[task.board][rows["press"].to_numpy()]
-    # The committed mean over boards is about 0.1 mm2; a constant place would have about 15 mm2.
+    # The committed mean over boards is about 0.1 mm2; a constant place would have a mean of about 15 mm2.
     assert np.mean((predicted[["x_mm", "y_mm"]].to_numpy() - true.place_mm) ** 2) < 0.5
     assert np.mean((predicted["F_N"] - true.force_N) ** 2) < true.force_N.var() / 2
     inside = (predicted["F_low_N"] <= true.force_N) & (true.force_N <= predicted["F_high_N"])

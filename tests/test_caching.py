@@ -1,4 +1,7 @@
-"""Tests of `reskin check-cache`: damaged objects are moved out of DVC's cache and restored if possible."""
+"""Tests of `reskin check-cache`, which moves damaged objects (cached files) out of DVC's cache.
+
+It restores an object if an undamaged copy exists.
+"""
 
 import hashlib
 import json
@@ -63,13 +66,13 @@ def check(root: Path) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_intact_cache_has_no_damaged_objects(root):
-    # a temporary file left by a killed DVC
+def test_cache_without_damage_has_no_damaged_objects(root):
+    # This temporary file was left by DVC when it was killed.
     next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")
     assert check(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
 
 
-def test_damaged_object_and_its_copies_are_removed(root):
+def test_damaged_object_and_its_copies_in_the_checkout_are_removed(root):
     put_in_cache(root, md5(b"weights"), b"w3ights")
     (root / WEIGHTS / "a.safetensors").write_bytes(b"w3ights")
     status, output = check(root)
@@ -82,7 +85,7 @@ def test_damaged_object_and_its_copies_are_removed(root):
     assert check(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
 
 
-def test_object_is_restored_from_an_intact_output(root):
+def test_object_is_restored_from_an_undamaged_output(root):
     put_in_cache(root, md5(b"folds"), b"f0lds")
     assert f"It was restored from {FOLDS}." in check(root)[1]
     assert cache_file(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
@@ -90,7 +93,7 @@ def test_object_is_restored_from_an_intact_output(root):
     assert check(root)[0] == 0
 
 
-def test_edited_output_is_kept(root):
+def test_output_that_the_user_has_edited_is_kept(root):
     put_in_cache(root, md5(b"folds"), b"f0lds")
     (root / FOLDS).write_bytes(b"by hand")
     assert check(root)[0] == 1
@@ -104,7 +107,7 @@ def test_folder_is_kept_if_its_list_of_files_is_damaged(root):
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 
-def test_damaged_recording_is_kept(root):
+def test_recording_is_kept_although_it_is_damaged(root):
     put_in_cache(root, md5(b"recorded"), b"rec0rded")
     (root / RECORDED).write_bytes(b"rec0rded")
     assert f"dvc pull {RECORDED}.dvc, or add the recording again" in check(root)[1]

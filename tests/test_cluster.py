@@ -25,7 +25,7 @@ from tests.models.example_jobs import example_data
 from tests.models.test_runner import equal_results, jobs
 
 ROOT = Path(__file__).resolve().parents[1]
-# Options with which deploy/dask.sh starts workers.
+# The options with which deploy/dask.sh starts workers.
 CLI = "import pipeline.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 120.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
@@ -46,7 +46,7 @@ def dask_process(kind: str, *options: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory) -> Iterator[str]:
-    """Start a scheduler and two single-threaded workers; yield the scheduler's address."""
+    """Start a scheduler and two workers with one thread each. Yield the address of the scheduler."""
     reason = "Dask is not installed: pip install -c constraints.txt -e '.[dask]'"
     distributed = pytest.importorskip("distributed", reason=reason)
     file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
@@ -71,7 +71,7 @@ def describe_call(i: int) -> tuple[int, str, int]:
     return os.getpid(), os.getcwd(), i
 
 
-def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch):
+def test_sweep_on_two_workers_gives_the_results_of_a_local_sweep(address, tmp_path, monkeypatch):
     small_jobs = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=10) for seed_i in (0, 1)]
     results = []
     for name, executor_name in (("here", "here"), ("there", f"dask:{address}")):
@@ -91,7 +91,7 @@ def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch)
     assert {folder for _, folder, _ in ran} == {os.getcwd()}
 
 
-def test_error_on_a_worker_is_raised_here(address, monkeypatch):
+def test_error_on_a_worker_is_raised_in_the_client(address, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", f"dask:{address}")
     monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
     with make_executor(1, imports="json") as executor, pytest.raises(ValueError, match="invalid literal"):
@@ -125,7 +125,7 @@ def test_workers_with_other_arithmetic_are_an_error(workers, expected):
 def test_lost_scheduler_is_an_error():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
-    submitted.cancel()  # when Dask loses the scheduler, it cancels all calls
+    submitted.cancel()  # When Dask loses the scheduler, it cancels all calls.
     cluster._copy_outcome(future, "tcp://there", submitted)
     with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished training runs are cached"):
         future.result(0)
@@ -139,7 +139,7 @@ def import_fresh(file: Path) -> ModuleType:
     return module
 
 
-def test_worker_older_than_an_edit_is_an_error(tmp_path, monkeypatch):
+def test_worker_with_code_from_before_an_edit_is_refused(tmp_path, monkeypatch):
     for package in ("pipeline", "reskin"):
         (tmp_path / package).mkdir()
         shutil.copy(ROOT / package / "__init__.py", tmp_path / package)

@@ -38,7 +38,7 @@ def digest(monkeypatch, folder, source: str, beside: str = "") -> str:
         ("2 * x", "(\n            2 * x)"),
     ],
 )
-def test_comments_and_line_breaks_keep_the_digest(monkeypatch, tmp_path, old, new):
+def test_comments_and_line_breaks_do_not_change_the_digest(monkeypatch, tmp_path, old, new):
     assert old in SOURCE
     assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) == digest(monkeypatch, tmp_path, SOURCE)
 
@@ -46,7 +46,7 @@ def test_comments_and_line_breaks_keep_the_digest(monkeypatch, tmp_path, old, ne
 @pytest.mark.parametrize(
     ("old", "new"), [("2.0", "2"), ("x, y=None", "x"), ("2 * x", "x * 2"), ("Skin:", "Skin(object):")]
 )
-def test_code_changes_the_digest(monkeypatch, tmp_path, old, new):
+def test_changed_code_changes_the_digest(monkeypatch, tmp_path, old, new):
     assert old in SOURCE
     assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) != digest(monkeypatch, tmp_path, SOURCE)
 
@@ -55,14 +55,14 @@ def test_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path)
     assert digest(monkeypatch, tmp_path, SOURCE, "a: 1") != digest(monkeypatch, tmp_path, SOURCE, "a: 2")
 
 
-def test_imports_are_followed_within_the_packages():
+def test_digest_includes_imported_modules_of_the_packages():
     names = code.imported("reskin.models.train")
     assert {"reskin.models.train", "reskin.seeds"} <= set(names)
-    assert {"reskin", "reskin.models"} <= set(names)  # packages, whose __init__.py runs first
+    assert {"reskin", "reskin.models"} <= set(names)  # These are packages, whose __init__.py runs first.
     assert all(name.split(".")[0] in code.PACKAGES for name in names)
 
 
-def test_edit_of_the_library_reruns_its_stages():
+def test_stages_that_use_an_edited_module_of_the_library_run_again():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 

@@ -102,5 +102,5 @@ def test_scene_and_recipe_of_the_docs_are_valid():
 )
 def test_files_named_in_docs_exist(page):
     files = re.findall(r"`((?:reskin|pipeline|tests)/[\w./-]+)`", page.read_text(encoding="utf-8"))
-    examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # files of examples, which users create
+    examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # Files of examples, which users create.
     assert sorted({name for name in files if not (ROOT / name).exists() and not examples.match(name)}) == []

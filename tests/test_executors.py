@@ -24,7 +24,7 @@ def test_cpu_time_includes_ended_workers(monkeypatch):
     before_s = children_s()
     end_workers()
     assert children_s() - before_s >= 0.3
-    end_workers()  # a second call has no effect
+    end_workers()  # A second call has no effect.
 
 
 def children_s() -> float:
@@ -32,7 +32,7 @@ def children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def test_modules_are_imported_before_tasks(monkeypatch):
+def test_workers_import_modules_before_their_first_task(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     end_workers()
     with make_executor(imports="colorsys") as executor:
@@ -87,13 +87,13 @@ def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
 
     def call() -> None:
         calls.append(len(calls))
-        # the first call takes 1000 s, the next ones 2 s, 3 s, ...
+        # According to the clock of this test, the first call takes 1000 s, and the next ones 2 s, 3 s, and so on.
         now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))
 
     monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
     median_s = job.median_call_s(call)
     assert len(calls) == job.REPEATS_N + 1
-    assert median_s == (2 + job.REPEATS_N + 1) / 2  # median of 2 s to 26 s
+    assert median_s == (2 + job.REPEATS_N + 1) / 2  # This is the median of 2 s to 26 s.
 
 
 def test_single_slow_call_does_not_change_the_median(monkeypatch):

@@ -15,7 +15,7 @@ from reskin.schema import UNITS
 from tests.data.tables import readings
 
 
-def test_readings_round_trip(tmp_path):
+def test_readings_written_to_a_file_are_read_unchanged(tmp_path):
     before = readings(x_mm=np.array([0, np.nan, 2, 3, 4, 5], np.float32))
     io.write_readings(tmp_path / "c0.parquet", [before], {"rows_n": 6})
     after = io.read_readings(tmp_path / "c0.parquet")
@@ -41,7 +41,7 @@ def test_blocks_are_concatenated(tmp_path):
     assert len(io.read_readings(tmp_path / "blocks.parquet")) == 2 * len(io.read_readings(tmp_path / "whole.parquet"))
 
 
-def test_readings_are_written_reproducibly(tmp_path):
+def test_equal_readings_are_written_as_equal_files(tmp_path):
     for name in ("one", "other"):
         io.write_readings(tmp_path / name, [readings()], {"rows_n": 6})
     assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
@@ -60,7 +60,7 @@ def test_folder_that_cannot_be_created_is_an_error(tmp_path):
             io.write_text(folder / "out.csv", "new")
 
 
-def test_failed_write_keeps_the_old_file(tmp_path):
+def test_if_writing_fails_the_old_file_is_kept(tmp_path):
     io.write_text(tmp_path / "a.txt", "old")
     with pytest.raises(RuntimeError), io.replacing(tmp_path / "a.txt") as temporary:
         temporary.write_text("half")
@@ -70,7 +70,10 @@ def test_failed_write_keeps_the_old_file(tmp_path):
 
 def test_os_errors_name_the_right_file(tmp_path):
     def names_in_errors(*names: Path) -> tuple[str, ...]:
-        """Return the file that each error names if writing a.txt raises EACCES, ENOSPC and EIO with files `names`."""
+        """Return the file that each error names.
+
+        Writing a.txt to a folder with the files `names` raises EACCES, ENOSPC and EIO in turn.
+        """
         found = []
         for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
             metadata = (names[0], None, names[1]) if len(names) == 2 else names
@@ -82,7 +85,7 @@ def test_os_errors_name_the_right_file(tmp_path):
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
     assert names_in_errors(source) == ("source", "source", "source")
     assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    # EIO may be caused by either file of a copy
+    # EIO may be caused by either file of a copy.
     assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")
     assert names_in_errors() == ("a.txt", "a.txt", "")
 
@@ -166,7 +169,10 @@ def test_broken_safetensors_are_an_error(tmp_path):
 
 
 def flip_bits(file: Path, every_n: int = 1) -> Iterator[int]:
-    """For every n-th byte of a file, flip one bit, yield the index of the byte, and restore the byte."""
+    """Flip one bit in every n-th byte of a file, one after the other.
+
+    While a bit is flipped, the index of its byte is yielded. Then the byte is restored.
+    """
     content_before = file.read_bytes()
     for i in range(0, len(content_before), every_n):
         content = bytearray(content_before)
@@ -188,20 +194,22 @@ def test_flipped_bits_of_tensors_are_detected(tmp_path):
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
         assert {name: metadata[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
-    assert detected_n > file.stat().st_size - 8  # flips in the name of the digest's key remain undetected
+    # Flipped bits in the name under which the digest is stored remain undetected.
+    assert detected_n > file.stat().st_size - 8
 
 
 def test_flipped_bits_of_tables_are_detected(tmp_path):
     file = tmp_path / "c0.parquet"
     io.write_readings(file, [readings()], {"rows_n": 6})
     before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
-    end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # file metadata start after this byte
+    # The metadata of the file start after this byte.
+    end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0
     for i in flip_bits(file, every_n=3):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 6  # other bytes are in page headers, whose bits do not affect the values
+    assert detected_n > end // 6  # Other bytes are in headers of pages, whose bits do not affect the values.
 
 
 def test_tensors_without_digest_are_read(tmp_path):
@@ -211,7 +219,7 @@ def test_tensors_without_digest_are_read(tmp_path):
     assert metadata == {"format": "1"}
 
 
-def test_tensors_are_written_reproducibly(tmp_path):
+def test_equal_tensors_are_written_as_equal_files(tmp_path):
     metadata = {name: name for name in "cabdhgfe"}
     for seed in range(6):
         io.write_tensors(tmp_path / str(seed), {"b": np.arange(3), "a": np.ones((2, 2))}, metadata)

@@ -1,4 +1,7 @@
-"""Tests that training is equal bit for bit on all processors with AVX2, and that variables set by the user are kept."""
+"""Tests that training is equal bit for bit on all processors with AVX2.
+
+Environment variables that the user has set are kept.
+"""
 
 import os
 import subprocess
@@ -34,7 +37,7 @@ def digests_under(*settings: str) -> str:
 
 
 @needs_avx2
-def test_training_does_not_depend_on_mkl_or_threads():
+def test_training_does_not_depend_on_the_processor_that_mkl_detects_or_on_threads():
     # These variables select the code of MKL and oneDNN for unknown processors, and three threads instead of one.
     other = "MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41", "OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"
     assert digests_under(*other) == digests_under()
@@ -58,18 +61,19 @@ def test_affine_equals_pytorch():
         (affine(*ours) * weights).sum().backward()
         (torch.matmul(theirs[0], theirs[1]).add(theirs[2]) * weights).sum().backward()
         for one, other in zip(ours, theirs, strict=True):
-            # tolerance: float64 sums of at most 21 products of about 1
+            # The tolerance is rounding in double precision of sums of at most 21 products of about 1.
             torch.testing.assert_close(one.grad, other.grad)
         torch.testing.assert_close(affine(*ours), torch.matmul(theirs[0], theirs[1]) + theirs[2])
 
 
-def test_overflow_of_affine_is_infinite():
+def test_product_that_overflows_is_infinite():
     assert affine(torch.full((2, 3), 1e30), torch.full((3, 1), 1e30), torch.zeros(1, 1)).isinf().all()
 
 
 @given(st.floats(-80, 80, width=32))
-def test_exp_equals_numpy_in_float32(value):
-    # Tolerance: 80 log2(e) = 115 is rounded to 2^-18, a relative error of at most 3e-6 of the result.
+def test_exponential_function_equals_numpy_in_single_precision(value):
+    # Tolerance for arguments of up to 80: 80 log2(e) = 115 is rounded to 2^-18, a relative error of at most 3e-6 of the
+    # result.
     assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
 
 

@@ -11,7 +11,7 @@ from reskin.errors import ParamsError
 from tests.scenes import ADAPTATIONS, SECTIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
-ADAPTED = ("lobo", "triplet", "adapt")  # adaptation and the experiments that it needs
+ADAPTED = ("lobo", "triplet", "adapt")  # Adaptation, and the experiments that it needs.
 LEARNING = ("models", "curve", "study")
 
 
@@ -109,10 +109,10 @@ def test_simulated_experiment_needs_a_simulated_scene():
 @pytest.mark.parametrize(
     ("removed", "unused"),
     [
-        ("drift", ["drift"]),  # experiment variation also reads the captures of drift
+        ("drift", ["drift"]),  # Experiment variation also reads the captures of drift.
         ("shear", ["shear", "simulate.protocols.drag"]),
         ("transfer", ["split.transfer_skins_n"]),
-        ("adapt", ["adapt"]),  # the passes of the pool are still not tested
+        ("adapt", ["adapt"]),  # The passes of the pool are still not tested.
     ],
 )
 def test_removed_experiment_leaves_unused_settings(removed, unused):
@@ -165,7 +165,8 @@ def test_scene_with_all_experiments():
     assert checked.curves == {
         "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
     }  # fmt: skip
-    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # names of experiments with folds
+    # The names of experiments that have folds.
+    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}
 
 
 def test_scene_with_one_experiment():

@@ -1,4 +1,7 @@
-"""Tests of the safe pickle decoder (plain values, NumPy arrays), and of archives of samples from the lab's rig."""
+"""Tests of the safe decoder for pickles, which decodes plain values and NumPy arrays and runs no code.
+
+Further tests are about archives of samples from the lab's rig.
+"""
 
 import hashlib
 import os
@@ -28,7 +31,7 @@ values = st.recursive(
 
 
 @given(values, st.sampled_from(PROTOCOLS))
-def test_plain_values_round_trip(value, protocol):
+def test_pickled_plain_values_are_decoded_unchanged(value, protocol):
     assert decode(pickle.dumps(value, protocol), "a") == value
 
 
@@ -46,7 +49,7 @@ def test_numpy_values_become_lists(kind, protocol):
 
 
 class CommandPickle:
-    """An object whose pickle would run a command when loaded."""
+    """An object whose pickle would run a command if Python loaded it."""
 
     def __init__(self, command: str) -> None:
         self.command = command
@@ -56,13 +59,13 @@ class CommandPickle:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_pickled_commands_are_not_run(tmp_path, protocol):
+def test_command_in_a_pickle_is_not_run(tmp_path, protocol):
     command = f"touch {tmp_path / 'ran'}"
     with pytest.raises(CaptureError, match="a call of posix system"):
         decode(pickle.dumps([CommandPickle(command)], protocol), "a")
     assert not (tmp_path / "ran").exists()
     pickle.loads(pickle.dumps([CommandPickle(command)], protocol))
-    assert (tmp_path / "ran").exists()  # Python's pickle does run the command
+    assert (tmp_path / "ran").exists()  # Python's own pickle module does run the command.
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=50).map(lambda tail: pickle.dumps([1, {"a": 2.5}], 4)[:-1] + tail))
@@ -77,7 +80,7 @@ def sample(indent: int, place, fields, forces) -> dict:
 
 def archive_of(**samples) -> bytes:
     stream = BytesIO()
-    np.savez(stream, **samples)  # NumPy pickles a list of dicts as an array of objects
+    np.savez(stream, **samples)  # NumPy pickles a list of dicts as an array of objects.
     return stream.getvalue()
 
 
@@ -149,7 +152,7 @@ def test_invalid_archive_is_an_error(archive, message):
 
 
 def test_real_samples_give_the_recorded_file(shared_data):
-    """The original archive is not available, so an archive is built from the recorded values."""
+    """The original archive is not available. Therefore an archive is built from the recorded values."""
     file = shared_data / "lab/board1_depth1.csv"
     known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
     again = to_lab_csv(archive_of_csv(file.read_text()), "a")
@@ -159,6 +162,6 @@ def test_real_samples_give_the_recorded_file(shared_data):
 def test_nested_references_are_converted_once():
     nested: list = []
     for _ in range(60):
-        nested = [nested, nested]  # 2^60 paths through the references
+        nested = [nested, nested]  # There are 2^60 paths through these references.
     found = decode(pickle.dumps(nested, 4), "a")
     assert found[0] is found[1]

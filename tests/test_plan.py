@@ -28,7 +28,7 @@ def test_plan_of_the_checkout_is_up_to_date():
     plan.check(ROOT)
 
 
-def test_stages_without_scenes_are_empty():
+def test_stages_that_no_scene_needs_are_empty():
     generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
     assert generated["train_multi"] == ["lab"]
     assert generated["train_single"] == generated["verification"] == generated["runtime"] == []
@@ -60,7 +60,7 @@ def test_stage_runs_only_for_scenes_with_its_experiment(stage, experiments):
     assert make_plan({"one": plain}, captures)["stages"][stage] == []
 
 
-def test_recorded_experiment_reads_its_captures():
+def test_stage_of_an_experiment_on_recordings_depends_on_their_captures():
     with_experiment, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in (("lobo", "drift"), ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     generated = make_plan({"one": plain, "two": with_experiment}, captures)
@@ -70,7 +70,7 @@ def test_recorded_experiment_reads_its_captures():
     assert not any(generated["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
 
 
-def test_experiment_choice_adds_no_stage():
+def test_experiment_that_chooses_settings_has_no_stage_of_its_own():
     chosen, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
     with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
@@ -120,7 +120,7 @@ def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     assert generated["calibrated"] == {"mine": SHIPPED}
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
-    (root / SCENES / "mine.yaml").write_text(text)  # this checkout has no library and therefore no model
+    (root / SCENES / "mine.yaml").write_text(text)  # This checkout contains no library, and therefore no model.
     with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
         plan.plan_of(root, ["mine"])
 
@@ -189,7 +189,8 @@ def test_each_protocol_has_a_folder_and_stages(tmp_path):
     stages = plan.check(root).stages
     protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
-    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card log has no probe log
+    # The log of an SD card has no probe log.
+    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}
     assert stages["describe"] == ["one"]
     assert stages["drift"] == {"one": "one-wear"}
 
@@ -229,5 +230,5 @@ def test_dvc_checkout_keeps_outputs_of_other_scenes(tmp_path):
     run(root, "dvc", "repro", "simulate@ci")
     run(root, "reskin", "scenes", "use", "quick")
     run(root, "dvc", "repro", "simulate@quick")
-    run(root, "dvc", "checkout", check=False)  # the command fails, because other stages of quick never ran
+    run(root, "dvc", "checkout", check=False)  # The command fails, because other stages of scene quick have never run.
     assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]

@@ -41,7 +41,7 @@ def model(tmp_path):
 
 
 def log_of(chips_n=5):
-    """Return times, fields (two decimals) and temperatures of the frames of a log."""
+    """Return the times, fields (with two decimals) and temperatures of the frames of a log."""
     frames_n = QUIET_N + TOUCHED_N
     touched = np.arange(frames_n) >= QUIET_N
     noise_uT = 3 * rng_for(0, "log").standard_normal((frames_n, 3 * chips_n))
@@ -85,7 +85,8 @@ def test_stream_decoded_table_and_log_give_the_same_csv(tmp_path, model, wire):
 def test_uniform_field_is_no_contact_if_external_fields_are_expected(tmp_path, external_uT):
     t_s, b_uT, temperature_degC = log_of()
     touched = np.arange(len(t_s)) >= QUIET_N
-    turning_uT = to_chips(np.tile([40.0, -30.0, 60.0], 5)[None]) - 200  # instead of the equal changes along all axes
+    # These changes replace the changes that are equal along all axes.
+    turning_uT = to_chips(np.tile([40.0, -30.0, 60.0], 5)[None]) - 200
     b_uT = (b_uT + touched[:, None] * turning_uT).astype(np.float32)
     (tmp_path / "log.csv").write_text(render(t_s, b_uT, temperature_degC))
     counts = predict(tmp_path / "log.csv", None, tmp_path / "out.csv", external_uT=external_uT)
@@ -231,10 +232,10 @@ def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, mod
         load_model(FILE)
 
 
-def test_one_log_needs_one_network(tmp_path, model):
+def test_several_networks_are_refused_for_one_log(tmp_path, model):
     with pytest.raises(ReskinError, match="a log is estimated by one network. Use one --model"):
         predict(write_log(tmp_path), [model, model], tmp_path / "out.csv")
-    same = predict(write_log(tmp_path), FILE, tmp_path / "out.csv")  # the shipped model, named explicitly
+    same = predict(write_log(tmp_path), FILE, tmp_path / "out.csv")  # This is the shipped model, named explicitly.
     assert same == predict(write_log(tmp_path), None, tmp_path / "out.csv")
 
 
@@ -290,4 +291,4 @@ def test_summary_counts_misfits_and_forces_at_the_limit(tmp_path, model, capsys)
     output = capsys.readouterr().out
     assert "120 of 120 readings in contact are at a limit of the model's force range" in output
     assert "force_at_limit_readings_n 120" in output
-    assert "unknown_skin_readings_n" not in predict(log, model, out)  # only the universal model reports this count
+    assert "unknown_skin_readings_n" not in predict(log, model, out)  # Only the universal model reports this count.

@@ -48,7 +48,7 @@ def test_code_version_of_modules_is_their_last_functional_change(tmp_path, monke
         return found.stdout[:12]
 
     write(one_py="A = 1\n", two_py="B = 1\n")
-    assert code_version_of(modules) == "unknown"  # the folder is not a git repository
+    assert code_version_of(modules) == "unknown"  # The folder is not a git repository.
     subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
     first = commit(one_yaml="a: 1\n")
     assert code_version_of(modules) == first
@@ -114,9 +114,10 @@ def test_costs_are_in_seconds_and_megabytes(tmp_path):
     record_cost(tmp_path, "split", 2.345)
     costs = read_costs(tmp_path)
     assert list(costs) == ["split"]
-    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # 2.345 may be rounded up or down
-    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # CPU time of this process, including imports
-    assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # peak memory of this Python process in MB
+    # The value 2.345 may be rounded up or down.
+    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34
+    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # The CPU time of this process includes imports.
+    assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # The peak memory of this Python process in MB.
 
 
 def test_stage_cost_includes_reused_training(tmp_path):
@@ -126,7 +127,7 @@ def test_stage_cost_includes_reused_training(tmp_path):
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # 2 s: the rest of the stage
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # The last 2 s are the rest of the stage.
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
@@ -142,7 +143,7 @@ def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, 
     record_trainings(folder, "train", {str(i): one for i, one in enumerate(trained)}, waited_s)
     record_cost(folder, "train", waited_s + other_s)
     cost = read_costs(folder)["train"]
-    assert total_cost_s([cost]) >= cost["seconds"] - 0.02  # both values are rounded to 0.01 s
+    assert total_cost_s([cost]) >= cost["seconds"] - 0.02  # Both values are rounded to 0.01 s.
 
 
 def test_repeated_training_of_a_run_counts_once(tmp_path):
@@ -161,12 +162,12 @@ def test_training_run_used_by_two_stages_is_counted_once(tmp_path):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # 3 s: the second stage
+    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # The last 3 s are those of the second stage.
 
 
 def test_costs_of_a_killed_run_are_dropped(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"old": (8.0, False)}, waited_s=1.0)
-    clear_cost(tmp_path, "train")  # the stage was killed and starts again
+    clear_cost(tmp_path, "train")  # The stage was killed, and starts again.
     record_cost(tmp_path, "train", 2.0)
     assert read_costs(tmp_path)["train"]["trainings_s"] == {}

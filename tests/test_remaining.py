@@ -18,7 +18,7 @@ NONE = {"trainings_n": 0, "reused_n": 0}
 COSTS = {
     "simulate-wear": {"seconds": 28.5, "cpu_s": 31.0, "computed_s": 28.5, **NONE},
     "train_multi": {"seconds": 8.5, "cpu_s": 8.5, "computed_s": 108.5, "trainings_n": 6, "reused_n": 6},
-    "report": {"seconds": 50.0, "cpu_s": 8.5, "computed_s": 50.0, **NONE},  # the machine was busy
+    "report": {"seconds": 50.0, "cpu_s": 8.5, "computed_s": 50.0, **NONE},  # The machine was busy during this stage.
 }
 EXPECTED_S = {
     "code": 1.5,
@@ -118,7 +118,8 @@ def test_remaining_time_is_exact_at_the_recorded_speed(checkout, start):
     time_s = 100.0
     for stage in ORDER:
         left_s = sum(EXPECTED_S[name] for name in ORDER[ORDER.index(stage) :])
-        assert minutes_left(start(stage, time_s)) == pytest.approx(left_s / 60, abs=0.06)  # printed with one decimal
+        # The sentence gives the time with one decimal.
+        assert minutes_left(start(stage, time_s)) == pytest.approx(left_s / 60, abs=0.06)
         time_s += EXPECTED_S[stage]
 
 
@@ -128,7 +129,7 @@ def test_remaining_time_is_within_a_factor_of_two_on_other_machines(checkout, st
     start(ORDER[0], 0.0)
     start(ORDER[1], 1.5 * slower)
     sentence = start(ORDER[2], 31.5 * slower)
-    assert sentence.startswith("progress: 31 % after ")  # 31.5 of 103 seconds
+    assert sentence.startswith("progress: 31 % after ")  # These are 31.5 of 103 seconds.
     assert 0.5 < minutes_left(sentence) / (71.5 * slower / 60) < 2
 
 
@@ -155,7 +156,7 @@ def test_progress_of_a_scene_without_report_is_unknown(checkout, start):
 def test_stage_outside_dvc_prints_nothing(checkout, monkeypatch):
     monkeypatch.delenv(remaining.VARIABLE, raising=False)
     assert progress() is None
-    monkeypatch.setenv(remaining.VARIABLE, ORDER[1])  # inherited, but no DVC runs
+    monkeypatch.setenv(remaining.VARIABLE, ORDER[1])  # The variable is inherited, although no DVC runs.
     assert progress() is None
 
 

@@ -18,12 +18,13 @@ NESTED = st.recursive(
     max_leaves=9,
 )
 NUMBERS = st.dictionaries(st.sampled_from(NAMES), NESTED, max_size=4)
-FEW = settings(max_examples=40, deadline=None)  # few examples, because drawing nested values takes milliseconds
+# Fewer examples than usual, because drawing nested values takes milliseconds.
+FEW = settings(max_examples=40, deadline=None)
 
 
 @FEW
 @given(NUMBERS)
-def test_run_equals_itself(numbers):
+def test_run_has_no_difference_from_itself(numbers):
     done = compare(numbers, numbers)
     assert done.reproduced
     assert done.equal.total() == len(list(leaves(numbers)))
@@ -61,7 +62,7 @@ def test_equal_values_are_counted_by_section():
     assert compare(numbers, numbers).equal == {"table2": 2, "labels": 2}
 
 
-def test_nan_equals_nan():
+def test_nan_counts_as_equal_to_nan():
     assert compare({"a": float("nan")}, {"a": float("nan")}).reproduced
 
 
@@ -73,7 +74,7 @@ def test_additional_row_does_not_change_the_names_of_others():
     assert done.missing == []
 
 
-def test_equal_labels_are_numbered():
+def test_rows_with_equal_labels_are_numbered():
     names = [name for name, _ in leaves({"audit": [{"what": "a"}, {"what": "a"}, {"what": "b"}, {"x_mm": 8.0}]})]
     assert names == ["audit[a].what", "audit[a #2].what", "audit[b].what", "audit[#1].x_mm"]
 

@@ -37,7 +37,7 @@ def test_running_stage_is_an_error(tmp_path, locks):
 
 
 def test_stale_lock_is_named(tmp_path, locks):
-    # a process that is not DVC
+    # A process that is not DVC.
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         write_rwlock(locks, other.pid)
         with pytest.raises(ParamsError, match=rf"If process {other.pid} is not DVC, delete \.dvc/tmp/rwlock first"):

@@ -1,4 +1,7 @@
-"""Tests of `params` in dvc.yaml: they cover the settings that a stage reads, so overrides rerun the right stages."""
+"""Tests of `params` in dvc.yaml, which must list all settings that a stage reads.
+
+Then, a changed setting makes DVC run the right stages again.
+"""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -24,7 +27,7 @@ from tests.stages.checkout import copy_checkout
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = read_yaml(ROOT / "dvc.yaml")["stages"]
 SCENE, SKIN = f"{SCENES}/ci.yaml", str(NOMINAL.relative_to(ROOT))
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
 
 
 class RecordingMapping(Mapping[str, Any]):
@@ -72,7 +75,7 @@ def test_settings_of_all_stages_with_a_section_are_tested():
 
 
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
-def test_params_cover_the_settings_a_stage_reads(stage):
+def test_params_in_dvc_yaml_cover_the_settings_that_a_stage_reads(stage):
     scenes = ("ci", "lab", "eflash7", "hand", "decide", "universal")
     scene = next((one for one in scenes if scene_runs(one, stage)), None)
     of_scene = NEW_SCENE if scene is None else read_settings(scene, ROOT).of_scene
@@ -145,8 +148,8 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
-FINGERPRINTED = {"audit", "report"}  # stages that compare the skin's fingerprint with that of scene tuning
-SIMULATING = {  # experiments that simulate skins themselves
+FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
+SIMULATING = {  # These experiments simulate skins themselves.
     "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
 }  # fmt: skip
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml.

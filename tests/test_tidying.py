@@ -22,7 +22,10 @@ WRITTEN = {
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """Return a checkout: scene `one` ran drift and protocol `gone` and now has only lobo; `two` is not in the plan."""
+    """Return a checkout with two scenes.
+
+    Scene `one` has run drift and protocol `gone`, and now has only lobo. Scene `two` is not in the plan.
+    """
     folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():
@@ -34,7 +37,7 @@ def root(tmp_path) -> Path:
     return folder
 
 
-def test_stale_stages_are_listed_with_files(root):
+def test_stages_that_a_scene_no_longer_has_are_listed_with_their_files(root):
     assert tidy.stale_outputs(root, plan.check(root)) == {
         "drift@one": [root / WRITTEN["drift@one"]],
         "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
@@ -53,7 +56,7 @@ def test_tidy_removes_only_stale_outputs(root):
 
 def test_file_of_a_planned_stage_is_kept(root):
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
-    # this folder also contains outputs of train_multi
+    # This folder also contains outputs of train_multi.
     lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]
     with (root / tidy.LOCK).open("w") as stream:
         YAML().dump(lock, stream)

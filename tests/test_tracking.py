@@ -40,7 +40,7 @@ def silent_server() -> Iterator[str]:
 @pytest.fixture
 def dead_address() -> str:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        # the socket is closed on return, so nobody listens at the address
+        # The socket is closed when the function returns, so nobody listens at the address.
         return f"http://127.0.0.1:{server.getsockname()[1]}"
 
 
@@ -184,14 +184,14 @@ def test_runs_last_as_long_as_their_training(tmp_path):
     spans = {name: (run.info.start_time, run.info.end_time) for name, run in by_name.items()}
     assert spans["b0"] == (1_000_000, 1_004_000)
     assert spans["b1"] == (1_003_000, 1_009_500)
-    assert spans["train_multi"] == (1_000_000, 1_009_500)  # from the first start to the last end
+    assert spans["train_multi"] == (1_000_000, 1_009_500)  # The span is from the first start to the last end.
     assert spans["drift"] == (2_000_000, 2_009_000)
     assert by_name["b1"].data.metrics["train_s"] == 6.5
     stage = by_name["train_multi"].data.metrics
     assert (stage["accuracy_pct"], stage["train_s"]) == (51.0, 10.5)
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     curve = client.get_metric_history(by_name["b0"].info.run_id, "loss")
-    assert curve[-1].timestamp == 1_004_000  # the last step is at the end of the training
+    assert curve[-1].timestamp == 1_004_000  # The last step is at the end of the training.
 
 
 def test_views_list_the_scores_first(tmp_path):
@@ -249,7 +249,7 @@ def test_restored_results_become_current_without_new_runs(tmp_path):
     publish_state(tmp_path, old=True)
     first = current(tmp_path)
     publish_state(tmp_path, old=False)
-    assert len(first) == 4  # runs of a training, its stage, a sweep, the report
+    assert len(first) == 4  # These are the runs of a training, of its stage, of a sweep and of the report.
     assert current(tmp_path) & first == set()
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     before = {run.info.run_id: history_points_n(client, run) for run in runs(tmp_path, "")}
@@ -310,7 +310,7 @@ def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, 
     start_s = time.monotonic()
     with pytest.raises(TrackingUnavailable, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
-    assert time.monotonic() - start_s < 15  # the time limit is 2 s; MLflow's retries would take 20 s
+    assert time.monotonic() - start_s < 15  # The time limit is 2 s. The retries of MLflow would take 20 s.
 
 
 def test_check_of_the_store_does_not_create_it(tmp_path):
@@ -348,7 +348,8 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
 
 
 def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # plus 2 s per run: the limit for two runs is 0 s
+    # With -4 s plus 2 s per run, the time limit for two runs is 0 s.
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)
     with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()

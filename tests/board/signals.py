@@ -1,4 +1,7 @@
-"""Synthetic frames for tests. CR LF ends a frame, so a chosen fraction of the values contains these bytes."""
+"""Synthetic frames for tests.
+
+The bytes CR LF end a frame, so a chosen fraction of the values contains these bytes.
+"""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -6,7 +9,7 @@ from hypothesis import strategies as st
 from reskin import seeds
 from reskin.board.wire import Frames
 
-# Field values in uT at GAIN_SEL 6 whose float32 bytes contain CR LF.
+# Field values in uT at GAIN_SEL 6 whose bytes in single precision contain CR LF.
 CRLF_TEMPERATURE_degC = 34.513275
 CRLF_B_uT = (2208.8477, -2208.8477, 8835.308)
 WIRES = ("binary", "binary-clock", "text-xyzt", "text-txyz")
@@ -15,7 +18,10 @@ TEXT_WIRES = WIRES[2:]
 
 
 def make_frames(frames_n: int, chips_n: int, seed: int, *, crlf_share: float = 0.0) -> Frames:
-    """Return random readings that are multiples of 0.15 uT; the bytes of a fraction `crlf_share` contain CR LF."""
+    """Return random readings that are multiples of 0.15 uT.
+
+    The bytes of a fraction `crlf_share` of them contain CR LF.
+    """
     rng = seeds.rng_for(seed, "frames")
     b_uT = rng.integers(-20000, 20000, (frames_n, 3 * chips_n)) * 0.15
     temperature_degC = rng.integers(2000, 4000, (frames_n, chips_n)) / 100
@@ -27,7 +33,7 @@ def make_frames(frames_n: int, chips_n: int, seed: int, *, crlf_share: float = 0
 
 def frames_of(b_uT: np.ndarray, temperature_degC: np.ndarray) -> Frames:
     frames_n = len(b_uT)
-    clock_s = (np.arange(frames_n) / 512).astype(np.float64)  # multiples of 1/512 s are exact in float32
+    clock_s = (np.arange(frames_n) / 512).astype(np.float64)  # Multiples of 1/512 s are exact in single precision.
     return Frames(b_uT.astype(np.float32), temperature_degC.astype(np.float32), clock_s, np.zeros(frames_n, np.int64))
 
 

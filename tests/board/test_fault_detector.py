@@ -1,4 +1,4 @@
-"""Tests of fault detection on a stream that arrives in chunks."""
+"""Tests of the detection of faulty chips in a stream that arrives in chunks."""
 
 import dataclasses
 from itertools import pairwise
@@ -22,7 +22,7 @@ RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_u
 
 
 def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 0.242), seed: int = 0) -> Frames:
-    """Return frames of a constant field with 5 uT of noise, rounded to multiples of the LSB (`steps_uT`)."""
+    """Return frames of a constant field with 5 uT of noise, rounded to multiples of the steps `steps_uT`."""
     rng = seeds.rng_for(seed, "watch")
     rest_uT = seeds.rng_for(0, "rest").uniform(-1500, 1500, 3 * CHIPS_N)
     b_uT = rest_uT + 5 * rng.standard_normal((frames_n, 3 * CHIPS_N))
@@ -37,7 +37,7 @@ def with_chip_values(frames: Frames, rows: slice, chip_i: int, values_uT: np.nda
 
 
 def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | None = None) -> np.ndarray:
-    """Feed the frames in chunks that end at `ends`; return the mask of frames in which a chip is stuck."""
+    """Feed the frames in chunks that end at `ends`. Return the mask of frames in which a chip is stuck."""
     detector = FaultDetector(CHIPS_N, expected_lsb_uT=expected_lsb_uT)
     log = FaultLog(DEFAULT_POLICY, "stream.bin", "ms")
     masks = []
@@ -48,14 +48,16 @@ def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | No
     return np.concatenate(masks)
 
 
-def test_working_board_has_no_fault() -> None:
+def test_board_that_works_has_no_fault() -> None:
     assert not detect(board(2000)).any()
     assert not detect(board(2000), expected_lsb_uT=(0.15, 0.242)).any()
 
 
 @pytest.mark.parametrize("chips", [(1,), (0, 1, 2)])
 @pytest.mark.parametrize("expected_lsb_uT", [None, (0.15, 0.242)])
-def test_chip_reset_is_refused(chips: tuple[int, ...], expected_lsb_uT: tuple[float, float] | None) -> None:
+def test_board_with_a_chip_at_power_on_settings_is_refused(
+    chips: tuple[int, ...], expected_lsb_uT: tuple[float, float] | None
+) -> None:
     frames, reset = board(2000), board(2000, steps_uT=RESET_uT)
     for chip_i in chips:
         columns = slice(3 * chip_i, 3 * chip_i + 3)
@@ -65,7 +67,7 @@ def test_chip_reset_is_refused(chips: tuple[int, ...], expected_lsb_uT: tuple[fl
         detect(frames, 500, 1300, expected_lsb_uT=expected_lsb_uT)
 
 
-def test_change_of_lsb_on_all_chips_is_refused() -> None:
+def test_board_whose_chips_all_change_their_step_is_refused() -> None:
     frames, other = board(1600), board(1600, steps_uT=(0.6, 0.6, 0.968))
     for chip_i in range(CHIPS_N):
         frames = with_chip_values(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
@@ -73,7 +75,7 @@ def test_change_of_lsb_on_all_chips_is_refused() -> None:
         detect(frames)
 
 
-def test_frozen_chip_is_stuck() -> None:
+def test_chip_that_repeats_its_reading_is_stuck() -> None:
     frames = board(1500)
     frozen = with_chip_values(frames, slice(500, None), 1, frames.b_uT[500, 3:6])
     stuck = detect(frozen)
@@ -83,13 +85,13 @@ def test_frozen_chip_is_stuck() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(ends=st.lists(st.integers(0, 3 * SCALE_FRAMES_N), max_size=6))
-def test_result_does_not_depend_on_chunks(ends: list[int]) -> None:
+def test_detected_faults_do_not_depend_on_chunks(ends: list[int]) -> None:
     frames = board(3 * SCALE_FRAMES_N)
     frozen = with_chip_values(frames, slice(100, 300), 1, frames.b_uT[100, 3:6])
     np.testing.assert_array_equal(detect(frozen, *ends), detect(frozen))
 
 
-def test_chip_with_failed_reads_is_not_stuck() -> None:
+def test_chip_with_failed_reads_does_not_count_as_stuck() -> None:
     failed = with_chip_values(board(100), slice(10, 60), 0, np.array(faults.FAILED_B_uT))
     failed.temperature_degC[10:60, 0] = faults.FAILED_TEMPERATURE_degC
     assert not detect(failed).any()

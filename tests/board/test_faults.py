@@ -9,14 +9,17 @@ from reskin import seeds
 from reskin.board import faults
 from tests.board.signals import frames_of
 
-NOISE_uT = 5.0  # upper end of the noise of real boards (3.0 to 5.0 uT)
+NOISE_uT = 5.0  # The upper end of the noise of real boards, which is 3.0 to 5.0 uT.
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
 
 
 def readings_on_grid(
     lsb_uT: list[tuple[float, float]], frames_n: int, seed: int, *, noise_uT: float = 5.0
 ) -> np.ndarray:
-    """Return noisy fields of chips with the given LSB (xy, z), rounded to two decimals as the text firmware does."""
+    """Return noisy fields of chips with the given steps (xy, z).
+
+    They are rounded to two decimals, as the firmware that writes text does.
+    """
     rng = seeds.rng_for(seed, "faults")
     step_uT = np.array([[xy, xy, z] for xy, z in lsb_uT]).reshape(-1)
     field_uT = rng.uniform(-3000, 3000, len(step_uT)) + NOISE_uT * rng.standard_normal((frames_n, len(step_uT)))
@@ -35,11 +38,11 @@ class TestFailedReads:
         b_uT[0, 4] = 5194.2
         assert faults.failed_reads(b_uT, temperature_degC).tolist() == [[True, False, False]]
 
-    def test_unknown_temperature_is_ignored(self):
+    def test_read_without_a_temperature_is_judged_by_its_fields(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
 
-    def test_float32_failure_is_recognised(self):
+    def test_failed_read_in_single_precision_is_recognised(self):
         sent = frames_of(np.tile([8028.16, 5194.00, 12943.36], 5)[None], np.full((1, 5), -880.49))
         assert faults.failed_reads(sent.b_uT, sent.temperature_degC).all()
 
@@ -51,7 +54,7 @@ class TestFailedReads:
 
 
 class TestZeroReads:
-    def test_zero_read_needs_three_zero_fields(self):
+    def test_read_of_zeros_needs_three_zero_fields(self):
         b_uT = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
         assert faults.zero_reads(b_uT).tolist() == [[True, False], [False, True]]
 
@@ -73,19 +76,20 @@ class TestZeroReads:
 
 class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 1000))
-    def test_lsb_is_found(self, name, seed):
-        # Tolerance 2 %: rounding to two decimals changes a step of 0.15 uT by at most 2 %, and a mean of steps by less.
+    def test_step_of_readings_is_found(self, name, seed):
+        # The tolerance is 2 %, because rounding to two decimals changes a step of 0.15 uT by at most 2 %, and a mean of
+        # steps by less.
         lsb_uT = faults.find_lsb(readings_on_grid([GRIDS_uT[name]], 400, seed))
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 
     @given(st.integers(0, 1000))
-    def test_values_without_a_common_step_have_no_lsb(self, seed):
+    def test_values_that_are_not_multiples_of_a_step_have_no_step(self, seed):
         field_uT = 5.0 * seeds.rng_for(seed, "smooth").standard_normal((400, 6))
         assert np.isnan(faults.find_lsb(field_uT)).all()
         assert not faults.reset_chips(field_uT, None).any()
 
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 4), st.integers(0, 1000))
-    def test_reset_chip_is_found(self, name, chip_i, seed):
+    def test_chip_with_power_on_settings_is_found(self, name, chip_i, seed):
         grids_uT = [GRIDS_uT[name]] * 5
         grids_uT[chip_i] = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid(grids_uT, 400, seed)
@@ -93,13 +97,13 @@ class TestScale:
         assert faults.reset_chips(b_uT, None).tolist() == expected
         assert faults.reset_chips(b_uT, GRIDS_uT[name]).tolist() == expected
 
-    def test_expected_lsb_may_equal_the_reset_lsb(self):
+    def test_step_at_power_on_is_accepted_if_it_is_expected(self):
         grid_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid([grid_uT] * 5, 400, 0)
         assert faults.reset_chips(b_uT, None).all()
         assert not faults.reset_chips(b_uT, grid_uT).any()
 
-    def test_reset_chips_of_real_recordings_are_found(self, shared_data):
+    def test_chips_with_power_on_settings_in_real_recordings_are_found(self, shared_data):
         one_chip, _ = load_ini(shared_data, "faults/b20_artillery_AFG_test_new_board15.head400.txt")
         all_chips, _ = load_ini(shared_data, "faults/b20_artillery_piezo.head400.txt")
         assert faults.reset_chips(one_chip, None).tolist() == [False, False, False, True, False]
@@ -118,7 +122,10 @@ class TestScale:
 
 class TestStuck:
     def stuck_naively(self, b_uT: np.ndarray) -> np.ndarray:
-        """Reference: for each reading, walk back over equal readings and count frames in which another chip changed."""
+        """Return the reference: for each reading, walk back over equal readings.
+
+        On the way, count the frames in which another chip changed.
+        """
         frames_n, chips_n = len(b_uT), b_uT.shape[1] // 3
         rows = b_uT.reshape(frames_n, chips_n, 3)
         stuck = np.zeros((frames_n, chips_n), bool)
@@ -135,8 +142,11 @@ class TestStuck:
         return stuck
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
-    def test_stuck_chips_equal_naive_loop(self, stretches, chips_n):
-        """In each run of frames, chip 0 changes if bit 0 is set, the last chip if bit 1 is set; others are constant."""
+    def test_stuck_chips_equal_those_of_a_loop(self, stretches, chips_n):
+        """In each run of frames, chip 0 changes if bit 0 is set, and the last chip if bit 1 is set.
+
+        The other chips are constant.
+        """
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)
@@ -150,14 +160,14 @@ class TestStuck:
         parts = [detector.feed(part) for part in np.split(b_uT, sorted(ends))]
         np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
 
-    def test_chip_is_stuck_from_its_20th_equal_reading_on(self):
+    def test_chip_counts_as_stuck_from_its_20th_equal_reading_on(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)
         expected[120 + faults.STUCK_FRAMES_MIN_N - 1 :, 1] = True
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), expected)
 
-    def test_board_without_changes_is_not_stuck(self):
+    def test_board_on_which_no_chip_changes_does_not_count_as_stuck(self):
         assert not faults.stuck_chips(np.ones((100, 15))).any()
 
     def test_real_working_board(self, shared_data):

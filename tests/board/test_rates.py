@@ -1,4 +1,4 @@
-"""Tests of measured frame rates, computed rate limits, and the sentence that explains the rate by a limit."""
+"""Tests of measured frame rates, computed limits of the rate, and the sentence that explains a rate by a limit."""
 
 import re
 from dataclasses import astuple
@@ -18,7 +18,7 @@ from tests.live.boards import make_script
 
 
 def recognise_at_due_times(script):
-    """Return the board recognised from a script whose frames all arrive at their due times."""
+    """Return the board that is recognised from a script. All frames arrive at the times at which they are due."""
     return find.recognise("port", [(piece, t_s) for piece, t_s in zip(script.pieces, script.t_s, strict=True) if piece])
 
 
@@ -38,19 +38,19 @@ def measured(**changed):
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-txyz"])
 @pytest.mark.parametrize("rate_hz", [15.0, 83.0, 400.0])
-def test_rate_of_the_emulator_is_measured(wire, rate_hz):
+def test_frame_rate_of_the_emulator_is_measured(wire, rate_hz):
     script = make_script(pokes_n=0, wire=wire, rate_hz=rate_hz, quiet_s=5.0)
     board = recognise_at_due_times(script)
     rate = board.rate
     assert rate.arrived_hz == pytest.approx(rate_hz, rel=1e-6)
-    assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)  # the board's clock is a float32
+    assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)  # The clock of the board is in single precision.
     assert rate.method == ("clock" if wire == "binary-clock" else "arrivals")
     assert board.frame_bytes_n == np.mean([len(piece) for piece in script.pieces])
     assert (rate.repeated_frames, rate.repeated_readings) == (0, 0)
 
 
 @given(st.lists(st.integers(1, 300), min_size=1, max_size=8))
-def test_measurement_does_not_depend_on_portions(lengths):
+def test_measured_rate_does_not_depend_on_the_size_of_portions(lengths):
     script = with_fault("slow-chips", wire="binary-clock")
     frames, _ = decode_all(b"".join(script.pieces), "binary-clock", 5, "script")
     meter, portion = RateMeter(5, 0.0), np.searchsorted(np.cumsum(lengths), np.arange(len(frames)), "right")
@@ -61,7 +61,7 @@ def test_measurement_does_not_depend_on_portions(lengths):
     assert (parts.frames_n, *astuple(parts)[3:]) == (whole.frames_n, *astuple(whole)[3:])
 
 
-def test_silence_and_buffered_bytes_do_not_change_the_rate():
+def test_silence_and_bytes_that_arrive_together_do_not_change_the_rate():
     script = make_script(pokes_n=0)
     chunks = list(zip(script.pieces, script.t_s.tolist(), strict=True))
     waiting = [(b"".join(script.pieces[:200]), 0.0), *((piece, t_s - 0.4975) for piece, t_s in chunks[200:])]
@@ -72,8 +72,8 @@ def test_silence_and_buffered_bytes_do_not_change_the_rate():
 
 @pytest.mark.parametrize(("every_n", "stuck", "frames"), [(1, False, 0.0), (2, False, 0.0), (5, False, 0.0),
                                                          (5, True, 0.2), (10, False, 0.5)])  # fmt: skip
-def test_repeats_are_counted_per_chip(every_n, stuck, frames):
-    """Each chip converts once in n frames. A single stuck chip must not affect the median over chips."""
+def test_repeated_readings_are_counted_per_chip(every_n, stuck, frames):
+    """Each chip converts once in n frames. A single chip that is stuck must not affect the median over chips."""
     frame_i, chip_i = np.indices((1000, 5))
     values = rng_for(every_n, "values").normal(size=(1000, 5, 3))
     b_uT = values[frame_i - (frame_i - chip_i) % every_n, chip_i]
@@ -86,8 +86,8 @@ def test_repeats_are_counted_per_chip(every_n, stuck, frames):
     assert counter.frames == pytest.approx(frames, abs=0.002)
 
 
-def test_rate_limits_of_the_papers_board():
-    """Reference: count the I2C bits independently (9 per byte, plus start, repeated start and stop)."""
+def test_limits_of_the_rate_of_the_papers_board_equal_a_count_of_bits():
+    """The bits on the I2C bus are counted independently: 9 per byte, plus start, repeated start and stop."""
     read = ["address", "RM", "address", "status", *"TTXXYYZZ"]
     start = ["address", "SM", "address", "status"]
     read_s, start_s = ((9 * len(part) + 3) / 400e3 for part in (read, start))
@@ -110,7 +110,9 @@ def test_rate_limits_of_the_papers_board():
 
 
 @given(st.integers(1, 64), st.floats(18, 2000), st.floats(1e-4, 0.3))
-def test_rate_limits_fall_with_chips_frame_length_and_conversion_time(chips_n, frame_bytes_n, conversion_time_s):
+def test_limits_of_the_rate_fall_with_more_chips_longer_frames_and_slower_conversion(
+    chips_n, frame_bytes_n, conversion_time_s
+):
     def rates(*arguments):
         limits = find_limits(arguments[0], arguments[1], baud=115200, conversion_time_s=arguments[2])
         return np.array([limit.hz for limit in limits if "together" not in limit.cause])
@@ -139,13 +141,13 @@ def test_rate_limits_fall_with_chips_frame_length_and_conversion_time(chips_n, f
         (with_fault("torn", wire="binary-clock"), "^321 Hz arrive of 400 Hz .*: 20 % of the frames are lost "),
     ],
 )  # fmt: skip
-def test_rate_of_an_emulated_board_is_explained(script, sentence):
-    """In fault `torn`, each cut frame is lost together with the next frame, so two of ten frames are lost."""
+def test_rate_of_an_emulated_board_is_explained_by_its_limit_or_fault(script, sentence):
+    """In fault `torn`, each frame that is cut is lost together with the next frame, so two of ten frames are lost."""
     board = recognise_at_due_times(script)
     assert re.search(sentence, explain(board.rate, find_limits(board.chips_n, board.frame_bytes_n, baud=find.BAUD)))
 
 
-def test_settings_change_the_explanation():
+def test_explanation_depends_on_the_settings_of_the_chips():
     slow = measured(arrived_hz=0.98, sent_hz=0.98)
     assert "no computed limit" in explain(slow, find_limits(5, 82, baud=115200))
     limits = find_limits(5, 82, baud=115200, conversion_time_s=0.2)
@@ -154,7 +156,7 @@ def test_settings_change_the_explanation():
     assert "all repeat the same reading" in explain(frozen, limits)
 
 
-def test_command_prints_rate_sentence_and_limits(monkeypatch, capsys):
+def test_command_prints_the_rate_its_explanation_and_the_limits(monkeypatch, capsys):
     listened_s = []
 
     def scan(names, *, listening_s):

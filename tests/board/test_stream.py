@@ -48,7 +48,7 @@ def split_bytes(data: bytes, sizes: list[int]) -> list[bytes]:
 
 
 @given(frames_strategy(), EVERY_WIRE, st.lists(st.integers(0, 200), max_size=8))
-def test_frames_round_trip_in_any_chunks(frames, wire, sizes):
+def test_encoded_frames_are_decoded_in_chunks_of_any_size(frames, wire, sizes):
     data = encode(frames, wire)
     decoded, account = decode_portions(split_bytes(data, sizes), wire, chips_of(frames))
     decimals = 2 if wire in TEXT_WIRES else 10
@@ -59,7 +59,7 @@ def test_frames_round_trip_in_any_chunks(frames, wire, sizes):
 
 
 @given(st.integers(1, 5), st.binary(max_size=400))
-def test_any_finite_floats_round_trip(chips_n, payload):
+def test_frames_with_any_finite_numbers_are_decoded_unchanged(chips_n, payload):
     values = np.frombuffer(payload[: len(payload) // (16 * chips_n) * 16 * chips_n], "<f4").reshape(-1, 4 * chips_n)
     values = np.where(np.isfinite(values), values, np.float32(0))
     data = b"".join(struct.pack(f"<{4 * chips_n}f", *row) + b"\r\n" for row in values)
@@ -79,7 +79,7 @@ def test_stream_fed_byte_by_byte_decodes_like_the_whole(wire):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_frame_is_emitted_with_its_last_byte(wire):
+def test_frame_is_returned_when_its_last_byte_has_arrived(wire):
     frames = make_frames(4, 5, 2)
     frame_stream, data = FrameStream(wire, 5), encode(frames, wire)
     arrivals = [i + 1 for i in range(len(data)) for _ in range(len(frame_stream.feed(data[i : i + 1])))]
@@ -109,7 +109,8 @@ def test_terminators_decode_equally_in_any_chunks(data, chips_n, sizes):
     check_account(account, data)
 
 
-# Damaged streams: `decode_damaged` checks the lost frames, the false frames and the account of bytes -------------
+# Damaged streams: `decode_damaged` checks which frames are lost, that there are no false frames, and the account of
+# bytes -------------
 
 
 @settings(max_examples=150)
@@ -118,8 +119,8 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_shar
     data = encode(frames, wire)
     missing_n = 1 + int(missing_share * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
-    # The decoder mistakes the remains of two damaged frames for a frame only if a payload has CR LF one frame length
-    # before their end.
+    # The decoder mistakes the remains of two damaged frames for a frame only if the numbers of a frame contain CR LF,
+    # and this is one frame length before the end of the remains.
     false_n = int(data.count(b"\r\n") > len(frames))
     check_damage(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
@@ -133,7 +134,7 @@ def test_inserted_bytes_cost_at_most_two_frames(frames, wire, where, noise):
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(TEXT_WIRES), st.floats(0, 1), st.integers(1, 40))
-def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing_n):
+def test_missing_bytes_of_text_cost_only_the_lines_that_contain_them(frames, wire, where, missing_n):
     data = encode(frames, wire)
     first = int(where * max(len(data) - missing_n, 0))
     damaged = data[:first] + data[first + missing_n :]
@@ -144,11 +145,12 @@ def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing
 @given(frames_strategy(min_frames_n=4), st.sampled_from(BINARY_WIRES), st.floats(0, 1))
 def test_stream_that_starts_within_a_frame_loses_one_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
-    joined_n = 1 + int(where * (length_n - 3))  # the cut is not between CR and LF, which would lose the next frame too
+    # The cut is not between CR and LF. Otherwise, the next frame would be lost too.
+    joined_n = 1 + int(where * (length_n - 3))
     assert decode_damaged(join_mid_frame(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
 
 
-def test_terminator_bytes_in_a_constant_temperature():
+def test_frames_whose_temperature_contains_the_terminator_are_decoded():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
     assert not broken(
@@ -156,7 +158,7 @@ def test_terminator_bytes_in_a_constant_temperature():
     )
 
 
-def test_remains_of_two_frames_are_not_a_frame():
+def test_remains_of_two_damaged_frames_are_not_taken_for_a_frame():
     frames = make_frames(6, 1, 3)
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
@@ -174,7 +176,7 @@ def test_frames_with_failed_reads_are_decoded(wire):
     assert account["frames_n"] == 19
 
 
-def test_lost_bytes_are_counted_by_reason():
+def test_skipped_bytes_are_counted_by_reason():
     frames = make_frames(10, 5, 5)
     frames.b_uT[3, 2], frames.temperature_degC[6, 0] = np.nan, np.inf
     data = b"junk\r\n" + encode(frames, "binary")[:-20]
@@ -186,7 +188,7 @@ def test_lost_bytes_are_counted_by_reason():
     }  # fmt: skip
 
 
-def test_infinite_clock_is_not_finite():
+def test_frame_with_an_infinite_clock_is_counted_as_not_finite():
     frames = make_frames(3, 2, 6)
     frames.device_s[1] = np.inf
     assert decode_portions([encode(frames, "binary-clock")], "binary-clock", 2)[1]["not_finite_frames_n"] == 1
@@ -194,7 +196,7 @@ def test_infinite_clock_is_not_finite():
 
 @pytest.mark.parametrize("word", ["nan", "inf", "-inf", "ovf"])
 @pytest.mark.parametrize("wire", TEXT_WIRES)
-def test_text_nan_and_inf_are_not_finite(wire, word):
+def test_text_frame_with_nan_or_inf_is_counted_as_not_finite(wire, word):
     line = encode(make_frames(1, 2, 7), wire)
     damaged = word.encode() + line[line.index(b"\t") :]
     _, account = decode_portions([line + damaged + line], wire, 2)
@@ -204,7 +206,7 @@ def test_text_nan_and_inf_are_not_finite(wire, word):
 
 
 @pytest.mark.parametrize("chunk_n", [1, 7, 10**6])
-def test_endless_line_is_skipped(chunk_n):
+def test_line_without_an_end_is_skipped(chunk_n):
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     data = line + b"9" * 3 * line_bytes_max_n(1) + line + line
     kept, account = decode_portions([data[i : i + chunk_n] for i in range(0, len(data), chunk_n)], "text-xyzt", 1)
@@ -212,7 +214,7 @@ def test_endless_line_is_skipped(chunk_n):
     check_account(account, data)
 
 
-def test_rest_of_endless_line_is_not_a_frame():
+def test_rest_of_a_line_without_an_end_is_not_a_frame():
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     kept, account = decode_portions([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
@@ -237,9 +239,10 @@ def test_long_stream_with_many_damaged_frames_is_decoded():
 # Errors ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)  # an error is slow, because it tries all wire formats
+# Fewer examples than usual, because an error is slow: all wire formats are tried.
+@settings(max_examples=25, deadline=None)
 @given(st.binary(max_size=2000), EVERY_WIRE, st.integers(1, 6))
-def test_random_bytes_decode_or_raise_capture_error(data, wire, chips_n):
+def test_random_bytes_are_decoded_or_raise_a_capture_error(data, wire, chips_n):
     try:
         frames, _ = decode_all(data, wire, chips_n, "random")
         assert len(frames)
@@ -253,7 +256,7 @@ def test_empty_stream_is_refused(wire):
         decode_all(b"", wire, 5, "empty.bin")
 
 
-def test_error_suggests_matching_wire():
+def test_error_suggests_the_wire_format_that_fits():
     data = encode(make_frames(20, 4, 10), "binary")
     with pytest.raises(CaptureError, match="Wrong baud rate, chip count or wire format\\? It fits binary with 4 chips"):
         decode_all(data, "binary", 5, "a.bin")

@@ -26,12 +26,12 @@ def one_frame(chips_n: int):
 
 
 @pytest.mark.parametrize(("chips_n", "bytes_n"), [(1, 18), (5, 82), (40, 642)])
-def test_binary_frame_size(chips_n, bytes_n):
+def test_binary_frame_has_the_size_of_the_firmwares_frames(chips_n, bytes_n):
     assert record_type("binary", chips_n).itemsize == bytes_n
     assert record_type("binary-clock", chips_n).itemsize == bytes_n + 4
 
 
-def test_binary_frame_layout():
+def test_binary_frame_has_the_bytes_of_the_firmware():
     values = (25.0, 1.25, -2.5, 56.78, 28.0, 4.25, 0.5, 59.78)
     assert encode(one_frame(2), "binary") == struct.pack("<8f", *values) + b"\r\n"
 
@@ -43,7 +43,7 @@ def test_clock_frame_starts_with_seconds():
     assert data[86 + 4 : 2 * 86] == encode(frames, "binary")[82 : 2 * 82]
 
 
-def test_text_layout_of_reskin():
+def test_text_line_is_that_of_the_reskin_firmware():
     assert encode(one_frame(2), "text-xyzt") == b"1.25\t-2.50\t56.78\t25.00\t4.25\t0.50\t59.78\t28.00\t\r\n"
 
 
@@ -58,13 +58,13 @@ def test_values_without_tab_are_split_after_two_decimals():
     assert frames.b_uT[0].tolist() == [1.0, 2.0, np.float32(-56.78), -3.0, -4.0, np.float32(0.05)]
 
 
-def test_synthetic_signals_contain_the_terminator():
+def test_synthetic_signals_contain_the_bytes_of_the_terminator():
     for value in (signals.CRLF_TEMPERATURE_degC, *signals.CRLF_B_uT):
         assert b"\r\n" in struct.pack("<f", value)
 
 
 @given(frames_strategy(), st.sampled_from(BINARY_WIRES))
-def test_binary_frames_round_trip(frames, wire):
+def test_encoded_binary_frames_are_decoded_unchanged(frames, wire):
     data, chips_n = encode(frames, wire), frames.temperature_degC.shape[1]
     length_n = record_type(wire, chips_n).itemsize
     decoded, _ = decode_runs(np.frombuffer(data, np.uint8), [(0, len(frames))], wire, chips_n)
@@ -77,7 +77,7 @@ def test_binary_frames_round_trip(frames, wire):
     assert decoded.end_byte.tolist() == [(i + 1) * length_n for i in range(len(frames))]
 
 
-def test_round_trip_over_several_blocks():
+def test_frames_of_several_blocks_are_decoded_unchanged():
     frames = make_frames(2 * wires.BLOCK_FRAMES_N + 5, 2, 0)
     for wire in BINARY_WIRES:
         decoded, _ = decode_runs(np.frombuffer(encode(frames, wire), np.uint8), [(0, len(frames))], wire, 2)

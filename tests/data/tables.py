@@ -10,7 +10,10 @@ from reskin.seeds import rng_for
 
 
 def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 6, **changes: object) -> Readings:
-    """Return readings of a chip: two passes, every reading at another place, 1 N, field change = row number."""
+    """Return readings of one chip in two passes.
+
+    Every reading is at another place, with a force of 1 N, and its field change is the number of its row.
+    """
     ones = np.ones(f, np.float32)
     values = {
         "capture": capture, "board": board, "skin": skin, "source": "recorded",
@@ -25,7 +28,7 @@ def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 
 
 
 def rows(boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> Rows:
-    """Return rows with these labels and random fields; every row is an indentation of its own."""
+    """Return rows with these labels and random fields. Every row is an indentation of its own."""
     rng = rng_for(0, "rows")
     f = len(boards)
     return Rows(

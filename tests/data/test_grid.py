@@ -11,7 +11,7 @@ from reskin.data.grid import points_mm, protocol
 depths_mm = st.lists(st.floats(0.1, 1.2), min_size=1, max_size=6, unique=True)
 
 
-def test_grid_has_65_points():
+def test_grid_has_65_places():
     points = {tuple(point) for point in points_mm()}
     full = {(2.0 * i, 2.0 * j) for i in range(9) for j in range(9)}
     missing = {(x, y) for x in (0.0, 2.0, 14.0, 16.0) for y in (0.0, 2.0, 14.0, 16.0)}
@@ -24,7 +24,7 @@ def test_places_are_visited_in_snake_order():
     assert (steps_mm[:, 1] <= 2).all()
     along = steps_mm[:, 1] == 0
     assert (steps_mm[along, 0] == 2).all()
-    # larger steps occur only between rows, whose lengths differ by at most two places
+    # Larger steps occur only from one row to the next. The lengths of these rows differ by at most two places.
     assert (steps_mm[~along, 0] <= 4).all()
 
 
@@ -34,7 +34,7 @@ def test_order_of_places_equals_that_of_lab_recordings(shared_data):
     np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
 
 
-def test_six_depths_make_390_indentations():
+def test_six_depths_at_65_places_are_390_indentations():
     plan = protocol((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), 26)
     assert len(plan) == 26 * 390
     assert np.bincount(plan.pass_i).tolist() == [390] * 26
@@ -50,7 +50,7 @@ def test_every_pass_covers_every_point_and_depth(depths, passes_n):
 
 
 @given(depths_mm)
-def test_additional_pass_leaves_earlier_passes_unchanged(depths):
+def test_adding_a_pass_does_not_change_earlier_passes(depths):
     short, long = protocol(depths, 1), protocol(depths, 2)
     for name in ("indentation", "pass_i", "x_mm", "y_mm", "depth_mm"):
         assert np.array_equal(getattr(short, name), getattr(long, name)[: len(short)])

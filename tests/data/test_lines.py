@@ -15,11 +15,11 @@ from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as make_rows
 
-READINGS_N = 2  # readings of each indentation
+READINGS_N = 2  # The number of readings of each indentation.
 
 
 def rows_at(place_mm, skins=None, indentation=None) -> Rows:
-    """Return rows at these places (x, y in mm); by default, every row is an indentation of its own."""
+    """Return rows at these places (x, y in mm). By default, every row is an indentation of its own."""
     f = len(place_mm)
     skins = ["s0"] * f if skins is None else skins
     table = make_rows([f"b_{skin}" for skin in skins], skins)
@@ -39,7 +39,10 @@ def all_rows(table: Rows) -> np.ndarray:
 
 
 def as_set(lines: Lines, names=None) -> set:
-    """Return the set of lines, each as a set of (row, index); line numbers are ignored."""
+    """Return the set of lines.
+
+    Each line is a set of pairs (row, index along the line); the numbers of lines are ignored.
+    """
     names = np.arange(lines.row.max() + 1) if names is None else np.asarray(names)
     pairs_of = {line: [] for line in lines.line_i.tolist()}
     for row, line, order in zip(lines.row, lines.line_i, lines.order_i, strict=True):
@@ -48,7 +51,7 @@ def as_set(lines: Lines, names=None) -> set:
 
 
 def grid_lines_naively(table: Rows, chosen) -> set:
-    """Reference: rows with equal y form a line, indexed by x; rows with equal x form a line, indexed by y."""
+    """Return the reference: rows with equal y form a line, with x as the index, and rows with equal x form a line."""
     found = set()
     place = {int(i): (str(table.skin[i]), *(round(float(v) * 10) for v in table.target[i, :2])) for i in chosen}
     for i in place:
@@ -68,7 +71,7 @@ places = st.lists(
 
 
 @given(places, st.data())
-def test_grid_lines_equal_nested_loops(labels, data):
+def test_lines_of_a_grid_equal_nested_loops(labels, data):
     table = rows_at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
     chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(labels) - 1), min_size=1))))
     lines, naive = grid_lines(table, chosen), grid_lines_naively(table, chosen)
@@ -77,16 +80,17 @@ def test_grid_lines_equal_nested_loops(labels, data):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_65_places_form_9_rows_and_9_columns():
+def test_65_places_form_lines_along_9_rows_and_9_columns():
     lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
-    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # lines along rows of the grid, then along columns
+    # The lengths of lines along the rows of the grid, then along its columns.
+    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2
     assert lines.line_i.max() == 17
-    # Each table row belongs to one row and to one column of the grid.
+    # Each row of the table belongs to one row and one column of the grid.
     assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
 
 
-def test_visits_to_one_place_share_line_and_index():
+def test_visits_to_one_place_have_the_same_lines_and_index():
     table = grid(depths_n=2, passes_n=3)
     lines = grid_lines(table, all_rows(table))
     of_row = {row: set() for row in range(len(table))}
@@ -97,11 +101,11 @@ def test_visits_to_one_place_share_line_and_index():
         by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
     assert len(by_place) == 65
     assert all(len(seen) == 1 for seen in by_place.values())
-    assert len(set.union(*by_place.values())) == 65  # every place has another pair of lines
+    assert len(set.union(*by_place.values())) == 65  # Every place is on another pair of lines.
 
 
 @given(places, st.data())
-def test_lines_do_not_depend_on_row_order(labels, data):
+def test_lines_do_not_depend_on_the_order_of_rows(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
     original = rows_at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
     reordered = [labels[i] for i in order]
@@ -114,7 +118,7 @@ def test_lines_do_not_depend_on_row_order(labels, data):
 
 
 @given(places, st.lists(st.floats(0.3, 5), min_size=10, max_size=10), st.floats(-20, 20))
-def test_distances_between_places_do_not_matter(labels, gaps_mm, origin_mm):
+def test_lines_do_not_depend_on_the_distances_between_places(labels, gaps_mm, origin_mm):
     skins = [skin for skin, _, _ in labels]
     along_mm = origin_mm + np.cumsum(gaps_mm)
     plain = rows_at([(x, y) for _, x, y in labels], skins)
@@ -132,7 +136,7 @@ def test_places_that_differ_by_rounding_are_one_place():
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
 
 
-def test_missing_place_leaves_a_gap_in_the_indices():
+def test_missing_place_leaves_a_gap_in_the_indices_along_a_line():
     lines = grid_lines(rows_at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
     assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
     assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
@@ -144,18 +148,18 @@ def test_no_rows_or_a_single_place_form_no_line():
 
 
 @pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
-def test_lines_expose_no_place_force_or_field(lines):
+def test_lines_give_no_access_to_place_force_or_field(lines):
     assert [field.name for field in fields(lines)] == ["row", "line_i", "order_i"]
     assert set(vars(lines)) == {"row", "line_i", "order_i"}
     for array in vars(lines).values():
         assert array.dtype.kind == "i"
-        assert array.base is None  # a copy: a view would give access to the whole table
+        assert array.base is None  # The array is a copy. A view would give access to the whole table.
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
-def test_hand_lines_equal_nested_loops(pokes):
+def test_lines_of_hand_pokes_equal_nested_loops(pokes):
     pass_i, poke_i = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
-    indentation = (10 * pass_i + poke_i).astype(np.int32)  # numbering continues from pass to pass
+    indentation = (10 * pass_i + poke_i).astype(np.int32)  # The numbers of indentations continue from pass to pass.
     naive = set()
     for one in set(pass_i.tolist()):
         pokes_of_pass = [i for i in range(len(pokes)) if pass_i[i] == one]
@@ -202,7 +206,7 @@ def test_smaller_choice_is_a_subset_of_a_larger_one(one_n, other_n, seed):
 
 
 @given(st.integers(0, 2**32))
-def test_choice_does_not_depend_on_row_order(seed):
+def test_chosen_pokes_do_not_depend_on_the_order_of_rows(seed):
     table = grid(depths_n=2)
     order = rng_for(seed, "order").permutation(len(table))
     shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
@@ -212,28 +216,28 @@ def test_choice_does_not_depend_on_row_order(seed):
 
 def test_pokes_are_chosen_from_the_pool_only():
     table = grid(depths_n=2, passes_n=2)
-    pool = np.flatnonzero(table.indentation >= 130)  # the rows of the second pass
+    pool = np.flatnonzero(table.indentation >= 130)  # The pool consists of the rows of the second pass.
     assert take_pokes(table, pool, 130, rng_for(0, "pokes")).tolist() == pool.tolist()
     assert set(take_pokes(table, pool, 20, rng_for(0, "pokes")).tolist()) < set(pool.tolist())
 
 
-def test_places_and_visits_are_equally_likely():
-    # Place 0 has 8 visits, place 1 has one. A poke is at either place with equal probability; at place 0, all visits
+def test_each_place_and_each_of_its_visits_is_equally_likely_to_be_chosen():
+    # Place 0 has 8 visits, and place 1 has one. Both places are chosen with equal probability. At place 0, all visits
     # are equally likely.
     table = rows_at([(0, 0)] * 8 + [(2, 0)])
     draws_n = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
-    # four standard deviations of a binomial distribution with p = 1/2
+    # The tolerance is four standard deviations of a binomial distribution with p = 1/2.
     assert abs(draws_n[8] - 800) < 4 * np.sqrt(1600 / 4)
     assert all(abs(draws_n[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
-def test_too_many_pokes_are_refused():
+def test_choosing_more_pokes_than_there_are_is_refused():
     table = grid()
     with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
         take_pokes(table, all_rows(table), 66, rng_for(0, "pokes"))
 
 
-def test_pokes_are_chosen_on_one_skin():
+def test_pokes_are_chosen_on_one_skin_only():
     with pytest.raises(ParamsError, match="of several skins: s0, s1"):
         take_pokes(rows_at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
@@ -249,7 +253,7 @@ def hand_readings(skin: str = "s0", **changes: object):
 
 
 @given(st.integers(2, 12), st.integers(2, 12))
-def test_stacking_keeps_rows_and_renumbers_indentations(above_n, below_n):
+def test_stacked_tables_keep_their_rows_and_get_new_indentation_numbers(above_n, below_n):
     above, below = (
         gather([readings("c0", f=above_n)], ALL_READINGS),
         gather([readings("c1", skin="s1", f=below_n)], ALL_READINGS),
@@ -284,7 +288,7 @@ def test_lines_of_a_skin_contain_only_its_rows():
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
-def test_stacking_other_channels_or_the_same_skin_is_refused():
+def test_stacking_tables_with_other_channels_or_the_same_skin_is_refused():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], ALL_READINGS)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):

@@ -10,7 +10,7 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 
 
-def test_change_uses_the_no_load_reading_of_the_row():
+def test_field_change_uses_the_no_load_reading_of_the_row():
     rows = gather([readings()], ALL)
     assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
 
@@ -20,17 +20,18 @@ def test_rows_without_place_or_force_are_counted():
     y_mm = np.array([0, 1, 2, 3, np.nan, 5], np.float32)
     Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
     rows = gather([readings(x_mm=x_mm, y_mm=y_mm, Fz_N=Fz_N)], Selection(force_min_N=0.1))
-    assert rows.target[:, 0].tolist() == [0, 3, 5]  # the row at x = 3 mm is kept: the selection ignores unknown forces
+    # The row at x = 3 mm is kept, because the selection ignores forces that are unknown.
+    assert rows.target[:, 0].tolist() == [0, 3, 5]
     assert rows.dropped == {"no_contact_rows_n": 2, "low_force_rows_n": 1}
 
 
-def test_passes_continue_across_captures_of_a_skin():
+def test_pass_numbers_continue_across_captures_of_a_skin():
     rows = gather([readings("c1"), readings("c0"), readings("c2", skin="s1")], ALL)
     assert rows.pass_i.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 0, 0, 0, 1, 1, 1]
 
 
-def test_indentation_numbers_are_unique_in_the_scene():
-    # both captures use these indentation numbers, which do not start at 0
+def test_indentation_numbers_are_unique_in_a_scene():
+    # Both captures use these indentation numbers, which do not start at 0.
     press = np.array([7, 7, 2, 2, 9, 9], np.int32)
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
@@ -63,12 +64,12 @@ def test_rows_do_not_depend_on_the_order_of_captures():
         ),
     ],
 )
-def test_inconsistent_captures_are_refused(second, message):
+def test_captures_that_do_not_fit_together_are_refused(second, message):
     with pytest.raises(ParamsError, match=message):
         gather([readings(), second], ALL)
 
 
-def test_capture_without_usable_rows_is_refused():
+def test_capture_in_which_no_row_is_usable_is_refused():
     with pytest.raises(ParamsError, match=r"capture c1: none of \d+ readings has a known place and at least 0.0 N"):
         gather([readings(), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, -3, np.float32))], ALL)
 
@@ -78,7 +79,7 @@ def test_scene_without_captures_is_refused():
         gather([], ALL)
 
 
-def test_target_columns_are_configurable():
+def test_columns_of_the_targets_can_be_chosen():
     rows = gather(
         [readings(Fx_N=np.full(6, 0.5, np.float32), Fy_N=np.full(6, -0.25, np.float32))], ALL, targets=SHEAR_TARGETS
     )

@@ -1,4 +1,7 @@
-"""Tests of splits within a skin: only the paper's split separates readings of one indentation or pass."""
+"""Tests of splits within a skin.
+
+Only the paper's split puts readings of one indentation on both sides.
+"""
 
 from dataclasses import replace
 
@@ -20,7 +23,10 @@ splits = st.builds(
 
 
 def make_passes(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
-    """Return rows of `skins_n` skins on one board: `passes_n` passes of `pokes_n` indentations of `readings_n` rows."""
+    """Return rows of `skins_n` skins on one board.
+
+    Each skin has `passes_n` passes of `pokes_n` indentations with `readings_n` rows each.
+    """
     labels = [(skin, p) for skin in range(skins_n) for p in range(passes_n) for _ in range(pokes_n * readings_n)]
     table = rows(["b0"] * len(labels), [f"b0_s{skin}" for skin, _ in labels], [p for _, p in labels])
     return replace(table, indentation=np.arange(len(labels)) // readings_n)
@@ -28,7 +34,7 @@ def make_passes(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int =
 
 @pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
-def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, split, seed):
+def test_readings_of_an_indentation_or_pass_are_on_one_side(experiment, passes_n, pokes_n, split, seed):
     table = make_passes(passes_n, pokes_n)
     group = getattr(table, UNSPLIT_BY[experiment])
     folds = draw_folds(table, [experiment], split, seed)
@@ -43,7 +49,7 @@ def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, sp
 
 @pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(order=st.permutations(range(24)))
-def test_split_does_not_depend_on_row_order(experiment, order):
+def test_split_does_not_depend_on_the_order_of_rows(experiment, order):
     table = make_passes(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
@@ -53,7 +59,7 @@ def test_split_does_not_depend_on_row_order(experiment, order):
         assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
 
 
-def test_paper_split_separates_readings_of_one_indentation():
+def test_papers_split_puts_readings_of_one_indentation_on_both_sides():
     table = make_passes(4, 10, readings_n=5)
     (fold,) = draw_folds(table, ["single_random"], Split(random_test_fraction=0.1, random_repeats_n=1), 0)
     shared = {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
@@ -76,7 +82,7 @@ def test_at_least_one_pass_is_tested():
     table = make_passes(4, 5)
     folds = draw_folds(table, ["single_pass"], Split(random_test_fraction=0.1, random_repeats_n=20), 0)
     assert {len({*table.pass_i[fold.test]}) for fold in folds} == {1}
-    # The probability that one of four passes is never tested is 4 (3/4)^20 = 1 % for an arbitrary seed.
+    # For an arbitrary seed, the probability that one of four passes is never tested is 4 (3/4)^20 = 1 %.
     assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {0, 1, 2, 3}
 
 

@@ -1,4 +1,7 @@
-"""Tests of folds: rows for training, for test and for the pool (pokes for adaptation), and the JSON format of folds."""
+"""Tests of folds, which divide rows into rows for training, for tests and for the pool (pokes for adaptation).
+
+Further tests are about the JSON format of folds.
+"""
 
 import doctest
 import json
@@ -32,7 +35,7 @@ def six_by_three(readings_n: int = 4):
 
 
 @given(labels.filter(lambda pairs: len({board for board, _ in pairs}) > 1))
-def test_every_row_is_held_out_once(pairs):
+def test_every_row_is_held_out_in_one_fold(pairs):
     table = rows_of_pairs(pairs)
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert sorted(np.concatenate([fold.test for fold in folds]).tolist()) == list(range(len(table)))
@@ -42,7 +45,7 @@ def test_every_row_is_held_out_once(pairs):
             assert not set(names[fold.train]) & set(names[fold.test])
 
 
-def test_six_boards_give_six_folds():
+def test_six_boards_make_six_folds():
     table = six_by_three()
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert [fold.name for fold in folds] == [f"b{i}" for i in range(6)]
@@ -50,7 +53,7 @@ def test_six_boards_give_six_folds():
 
 
 @given(st.permutations(range(18)))
-def test_folds_do_not_depend_on_row_order(order):
+def test_folds_do_not_depend_on_the_order_of_rows(order):
     pairs = [(board, skin) for board in range(6) for skin in range(3)]
     original, shuffled = rows_of_pairs(pairs), rows_of_pairs([pairs[i] for i in order])
     for experiment, split in (("lobo", Split()), ("transfer", TRANSFER)):
@@ -60,7 +63,7 @@ def test_folds_do_not_depend_on_row_order(order):
             assert set(original.skin[one.test]) == set(shuffled.skin[other.test])
 
 
-def test_transfer_trains_on_three_skins_and_tests_on_nine():
+def test_transfer_folds_train_on_three_skins_and_test_nine():
     table = six_by_three()
     folds = draw_folds(table, ["transfer"], TRANSFER, 0)
     assert [set(table.skin[fold.train]) for fold in folds] == [{"b0_s0"}, {"b1_s0"}, {"b2_s0"}]
@@ -69,7 +72,7 @@ def test_transfer_trains_on_three_skins_and_tests_on_nine():
         assert not set(table.board[fold.train]) & set(table.board[fold.test])
 
 
-def test_random_readings_stay_within_one_skin():
+def test_randomly_split_readings_are_of_one_skin():
     table = six_by_three(50)
     folds = draw_folds(table, ["single_random"], RANDOM, 5)
     assert len(folds) == 4
@@ -108,7 +111,7 @@ SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
 
 
 @pytest.mark.parametrize(("experiment", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
-def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
+def test_pool_consists_of_the_first_passes_of_held_out_skins(experiment, split):
     table = six_by_three_in_passes(5)
     for fold in draw_folds(table, [experiment], split, 0):
         board = {*table.board[fold.test]}
@@ -121,9 +124,10 @@ def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
 
 @pytest.mark.parametrize("experiment", ["lobo", "sensors"])
 @given(order=st.permutations(range(12)))
-def test_pool_and_skins_do_not_depend_on_row_order(experiment, order):
+def test_pool_and_chosen_skins_do_not_depend_on_the_order_of_rows(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
-    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # passes have the numbers 3 and 5
+    # The two passes have the numbers 3 and 5.
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)
     original, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
@@ -153,7 +157,7 @@ def test_folds_without_adaptation_have_no_pool(experiment, split):
 
 
 @given(st.integers(0, 2**32))
-def test_smaller_sensor_sets_are_subsets_within_a_draw(seed):
+def test_smaller_sets_of_sensors_are_subsets_of_larger_ones_in_the_same_draw(seed):
     table = six_by_three_in_passes(3, readings_n=1)
     folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
     boards = [f"b{i}" for i in range(6)]
@@ -171,7 +175,7 @@ def test_smaller_sensor_sets_are_subsets_within_a_draw(seed):
         assert board not in {skin[:2] for skin in all_of_them}
 
 
-def test_fold_of_all_sensors_equals_the_lobo_fold():
+def test_fold_with_all_sensors_equals_the_leave_one_board_out_fold():
     table = six_by_three_in_passes(3)
     split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
     for fold, whole in zip(
@@ -192,14 +196,14 @@ def test_draws_of_sensors_are_independent():
     assert [fold.train.tolist() for fold in few[:2]] == [fold.train.tolist() for fold in first[:2]]
 
 
-def test_boards_draw_their_skins_independently():
+def test_skins_are_drawn_independently_on_each_board():
     table = six_by_three_in_passes(1)
     folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
     ranks = {
         tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
         for fold in folds
     }
-    assert len(ranks) > 1  # the three drawn skins are not the same on all boards
+    assert len(ranks) > 1  # The three skins that are drawn are not the same on all boards.
 
 
 def test_repeated_number_of_sensors_is_refused():
@@ -209,12 +213,15 @@ def test_repeated_number_of_sensors_is_refused():
 
 LABELS = Split(labels_pool_n=5, labels_draws_n=3)
 PLACES_N = 4
-# Place numbers of ten indentations. As in recordings, some places are pressed more often than others.
+# The place numbers of ten indentations. As in recordings, some places are pressed more often than others.
 PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])
 
 
 def poked_rows(boards_n: int = 3, readings_n: int = 2):
-    """Return rows of two skins per board. Each skin has ten indentations in two passes, at the places `PLACES`."""
+    """Return rows of two skins per board.
+
+    Each skin has ten indentations in two passes, at the places `PLACES`.
+    """
     labels = [
         (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
         for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
@@ -232,7 +239,8 @@ def test_held_out_board_has_a_pool_on_each_skin(seed, pool_n, draws_n):
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
     for fold in folds:
         held = np.flatnonzero(table.board == fold.name[:2])
-        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # every held-out row is in the pool or in the test set
+        # Every held-out row is either in the pool or in the test set.
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()
         assert sorted([*fold.train, *held]) == list(range(len(table)))
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
         for skin in np.unique(table.skin[held]):
@@ -270,7 +278,7 @@ def test_skins_of_a_board_have_different_label_pools():
         assert one != other
 
 
-def test_adaptation_pool_does_not_change_label_folds():
+def test_folds_with_labels_do_not_depend_on_the_pool_for_adaptation():
     table = poked_rows()
     plain, pooled = (
         draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
@@ -311,7 +319,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
 )  # fmt: skip
-def test_impossible_folds_are_refused(table, experiment, split, message):
+def test_settings_that_allow_no_fold_are_refused(table, experiment, split, message):
     with pytest.raises(ParamsError, match=message):
         draw_folds(table, [experiment], split, 0)
 
@@ -328,7 +336,7 @@ TABLE = rows(["b0", "b0", "b1", "b2"], ["s0", "s0", "s1", "s2"])
 
 
 @given(st.sets(st.integers(0, 200)))
-def test_row_numbers_round_trip_as_ranges(numbers):
+def test_row_numbers_saved_as_ranges_are_read_unchanged(numbers):
     sorted_numbers = np.array(sorted(numbers), np.int64)
     assert from_ranges(to_ranges(sorted_numbers)).tolist() == sorted_numbers.tolist()
 
@@ -337,7 +345,7 @@ PASSES = rows(["b0"] * 3 + ["b1"] * 2, ["s0"] * 3 + ["s1"] * 2, [0, 1, 2, 0, 1])
 
 
 @pytest.mark.parametrize(("table", "split"), [(TABLE, Split()), (PASSES, Split(pool_passes_n=1))])
-def test_folds_round_trip(table, split):
+def test_saved_folds_are_read_unchanged(table, split):
     def listed(folds):
         return [[one.name, one.train.tolist(), one.test.tolist(), one.pool.tolist()] for one in folds]
 
@@ -358,13 +366,13 @@ def test_saved_folds_list_boards_and_skins():
     ]
 
 
-def test_saved_folds_of_other_rows_are_refused():
+def test_folds_that_were_saved_for_other_rows_are_refused():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
     with pytest.raises(SchemaError, match="but the captures have 2 rows"):
         parse_folds(document, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
 
 
-def test_docstring_examples():
+def test_examples_in_docstrings_run():
     outcome = doctest.testmod(splits, extraglobs={"np": np})
     assert outcome.attempted > 0
     assert outcome.failed == 0

@@ -16,7 +16,7 @@ sizes = st.tuples(st.integers(1, 60), st.integers(1, 10), st.integers(0, 10), st
 
 
 @given(sizes)
-def test_windows_equal_naive_loop(sizes):
+def test_windows_equal_a_loop(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     expected, cut_n, start = [], 0, every_n
@@ -37,7 +37,7 @@ def test_windows_equal_naive_loop(sizes):
 
 
 @given(sizes)
-def test_test_units_are_tested_once_and_never_trained_on(sizes):
+def test_each_test_unit_is_tested_once_and_never_used_for_training(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     windows = make_windows(
@@ -47,14 +47,14 @@ def test_test_units_are_tested_once_and_never_trained_on(sizes):
     assert len(used) == len(set(used))
 
 
-def test_windows_end_with_the_shortest_capture():
+def test_last_window_ends_with_the_shortest_capture():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    # The last window ends with the shorter capture; these are later units of the longer one.
+    # The last window ends with the shorter capture; the longer capture has these units later.
     assert windows.left_out_units_n == 24 - 15
 
 
-def test_part_contains_whole_rows():
+def test_part_of_a_capture_contains_whole_rows():
     taken = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
     assert taken.x_mm.tolist() == [1, 4] == taken.indentation.tolist()
     assert taken.b_uT[:, 0].tolist() == [101, 104]
@@ -67,7 +67,7 @@ def test_two_captures_of_one_skin_are_refused():
     check_one_per_skin([readings("c0"), readings("c1", skin="s1")])
 
 
-def test_docstring_examples():
+def test_examples_in_docstrings_run():
     outcome = doctest.testmod(documented)
     assert (outcome.attempted, outcome.failed) == (2, 0)
 
@@ -79,7 +79,10 @@ POLICIES = {
 
 
 def capture(skin: str, f: int = 24):
-    """Return `f` indentations of one reading: no-load field = indentation number; every fifth force is too low."""
+    """Return `f` indentations with one reading each.
+
+    The no-load field is the number of the indentation. Every fifth force is too low to be selected.
+    """
     noload_uT = np.tile(np.arange(f, dtype=np.float32)[:, None], (1, 3))
     weak = np.where(np.arange(f) % 5 == 0, 0.01, 1).astype(np.float32)
     return readings(skin, skin=skin, f=f, noload_uT=noload_uT, b_uT=np.full((f, 3), 100, np.float32), Fz_N=weak)
@@ -91,7 +94,7 @@ def example_parts(*skins: str):
     return make_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
 
 
-def test_every_window_has_the_change_of_each_policy():
+def test_each_window_has_the_field_changes_of_each_no_load_policy():
     for part in example_parts("s0", "s1"):
         start, end = {TRAIN: (0, 6), 0: (8, 12), 1: (16, 20)}[part.window_i]
         strong = [i for i in range(start, end) if i % 5]
@@ -101,9 +104,9 @@ def test_every_window_has_the_change_of_each_policy():
         np.testing.assert_allclose(part.noload_off_uT, np.sqrt(np.mean(off)))
 
 
-def test_first_no_load_reading_may_be_in_an_unselected_row():
+def test_first_no_load_reading_may_belong_to_a_row_that_is_not_selected():
     first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
-    # the initial no-load field is that of reading 0, which is not selected because its force is too low
+    # The initial no-load field is that of reading 0, whose row is not selected because its force is too low.
     assert (first.rows.db_uT == 100).all()
 
 
@@ -116,7 +119,7 @@ def test_parts_contain_the_indices_of_their_rows():
         assert (rows.skin[part.row_i] == part.readings.skin).all()
 
 
-def test_unselected_rows_are_counted_once():
+def test_rows_that_are_not_selected_are_counted_once():
     weak_n = sum(i % 5 == 0 for window in ((0, 6), (8, 12), (16, 20)) for i in range(*window))
     assert stack(example_parts("s0")).dropped == {"no_contact_rows_n": 0, "low_force_rows_n": weak_n}
 

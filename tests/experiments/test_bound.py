@@ -1,4 +1,7 @@
-"""Tests of the lower bound on errors: against simulated chips, a linear estimate and a dipole; scaling with noise."""
+"""Tests of the lower bound on the errors of any unbiased estimate.
+
+References are simulated chips, a linear estimate and the field of a dipole.
+"""
 
 import math
 from dataclasses import replace
@@ -31,7 +34,8 @@ from tests.report.synthetic import scores
 from tests.simulation.scene import synthesis
 
 ROWS_N = 40_000
-# SAMPLING * sqrt(2) is six standard errors (sqrt(2 / n) each) of a sample variance, relative to the variance
+# The standard error of a sample variance is sqrt(2 / n), relative to the variance. Therefore SAMPLING * sqrt(2) is six
+# standard errors.
 SAMPLING = 6 / math.sqrt(ROWS_N)
 CHIP = ChipDesign(gain_sel=6, noise_xy_uT=3.3, noise_z_uT=5.0, noise_temperature_degC=0.0)
 SCENE = synthesis()
@@ -39,12 +43,15 @@ NO_LABEL_ERRORS = {"place_sd_mm": 0.0, "force_sd_N": 0.0}
 
 
 def linear_sensor(rng):
-    """Return the slopes of 15 channels (x and y are coupled) and of the force (which depends on depth only)."""
+    """Return the slopes of 15 channels and of the force, with respect to x, y and depth.
+
+    The slopes along x and y are correlated. The force depends on the depth only.
+    """
     db_slopes = rng.normal(size=(1, 15, 3)) * np.array([2.0, 3.0, 8.0])
     return db_slopes + 0.7 * db_slopes[:, :, [1, 0, 2]], np.array([[0.0, 0.0, 1.7]])
 
 
-def test_linear_estimate_reaches_the_bound():
+def test_errors_of_the_best_linear_estimate_equal_the_bound():
     rng = rng_for(1, "linear sensor")
     db_slopes, force_slopes = linear_sensor(rng)
     var_uT2 = np.tile([10.0, 10.0, 25.0], 5)
@@ -58,20 +65,20 @@ def test_linear_estimate_reaches_the_bound():
     truth[:, 2] *= force_slopes[0, 2]
     label_errors = np.array([labels["place_sd_mm"]] * 2 + [labels["force_sd_N"]]) * rng.standard_normal((ROWS_N, 3))
     scores = score(truth + label_errors, estimated)
-    assert 20 < scores["accuracy_pct"] < 98  # not near 0 or 100 %, where any estimate would agree
+    assert 20 < scores["accuracy_pct"] < 98  # The accuracy is not close to 0 or 100 %, where any estimate would agree.
     assert expected["accuracy_pct"][0] == pytest.approx(scores["accuracy_pct"], abs=100 * SAMPLING / 2)
     assert expected["mse_xy_mm2"][0] == pytest.approx(scores["mse_xy_mm2"], rel=SAMPLING * math.sqrt(2))
     assert expected["mse_f_N2"][0] == pytest.approx(scores["mse_f_N2"], rel=SAMPLING * math.sqrt(2))
 
 
 @given(st.floats(0.05, 5.0), st.floats(0.05, 5.0))
-def test_probability_of_uncorrelated_errors_is_a_product(h, k):
+def test_probability_that_uncorrelated_errors_are_within_limits_is_a_product(h, k):
     expected = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
     assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(expected, abs=1e-12)
 
 
 @given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(-0.95, 0.95))
-def test_probability_of_correlated_errors_equals_an_integral(h, k, r):
+def test_probability_that_correlated_errors_are_within_limits_equals_an_integral(h, k, r):
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x, root = h * nodes, math.sqrt(1 - r**2)
     reach = np.vectorize(math.erf)
@@ -80,7 +87,7 @@ def test_probability_of_correlated_errors_equals_an_integral(h, k, r):
     assert probability_within(np.array([[h, k]]), np.array([r]))[0] == pytest.approx(expected, abs=1e-10)
 
 
-def test_noise_variance_equals_that_of_sampled_readings():
+def test_noise_variance_equals_that_of_simulated_readings():
     board, readings_n, noload_n = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0"), 2, 10
     no_field = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
     b_uT = read_field(no_field, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
@@ -91,7 +98,7 @@ def test_noise_variance_equals_that_of_sampled_readings():
 
 
 def test_slopes_of_a_dipole_field_equal_the_closed_form():
-    def read(mm):  # Bz of a dipole along z, 3 mm above the chip, which the poke moves down
+    def read(mm):  # The reading is Bz of a dipole along z, 3 mm above the chip. A poke moves the dipole down.
         x, y, z = mm[:, 0], mm[:, 1], 3.0 - mm[:, 2]
         r2 = x**2 + y**2 + z**2
         return ((3 * z**2 - r2) / r2**2.5)[:, None]
@@ -102,12 +109,12 @@ def test_slopes_of_a_dipole_field_equal_the_closed_form():
     per_rho = (3 * r2 - 15 * z**2) / r2**3.5
     per_z = (9 * z * r2 - 15 * z**3) / r2**3.5
     expected = np.stack([x * per_rho, y * per_rho, -per_z], axis=1)[:, None]
-    # the error of central differences is quadratic in the step
+    # Tolerance: the error of central differences is quadratic in their step.
     np.testing.assert_allclose(slopes(read, pokes_mm), expected, rtol=1e-3, atol=1e-6)
 
 
 @given(st.floats(0.1, 10.0))
-def test_bound_scales_with_noise_and_readings(factor):
+def test_bound_scales_with_noise_and_falls_with_the_number_of_readings(factor):
     db_slopes, force_slopes = linear_sensor(rng_for(2, "linear sensor"))
     one, four = (noise_var_uT2(CHIP, 5, readings_n=n, noload_frames_n=10 * n) for n in (1, 4))
     least = least_covariance(db_slopes, force_slopes, one)
@@ -129,7 +136,7 @@ def test_bound_falls_with_depth_and_grows_with_label_errors():
     assert scored["mse_f_N2"] - signal["mse_f_N2"] == pytest.approx(SCENE.rig.force_noise_N**2)
 
 
-def test_pokes_above_the_skin_are_marked():
+def test_depths_at_which_the_tip_does_not_touch_the_skin_are_marked():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
     assert reach_skin(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
@@ -137,7 +144,7 @@ def test_pokes_above_the_skin_are_marked():
         reach_skin(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
 
 
-def test_networks_of_another_skin_are_an_error(tmp_path):
+def test_networks_that_were_trained_on_another_skin_are_refused(tmp_path):
     card = {"question": NETWORK, "recipe_name": "paper", "train_skins": ["b0_s1"]}
     io.write_json(tmp_path / "one.json", card)
     with pytest.raises(SchemaError, match="networks of single_pass were trained on .*, not on b0_s0"):
@@ -153,7 +160,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_network_is_compared_with_the_bound():
+def test_table_compares_the_network_with_the_bound():
     table = tables(NUMBERS, "simulated")["bound"]
     assert table["depth, mm"].tolist() == ["0.2", "1.2", "all"]
     assert table["MSE_xy, mm² (bound)"].tolist() == ["0.01"] * 3
@@ -162,7 +169,7 @@ def test_network_is_compared_with_the_bound():
     assert set(table["source"]) == {"simulated"}
 
 
-def test_caption_counts_pokes_without_contact():
+def test_caption_counts_presses_without_contact():
     assert "left out" not in tables(NUMBERS, "simulated")["bound"].attrs["meaning"]
     meaning = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
     assert "65 pokes that do not touch the skin are excluded" in meaning

@@ -31,19 +31,19 @@ def nearest_by_loops(known, tested):
     return np.array(found)
 
 
-def test_neighbour_distance_equals_loops():
+def test_distance_to_neighbours_equals_a_loop():
     known, tested = random_fields("known", 40, 4) * [1, 10, 100, 1000], random_fields("tested", 7, 4)
     scaled = nearest_by_loops(known / known.std(axis=0), tested / known.std(axis=0))
     np.testing.assert_allclose(neighbour_distance(known, tested), scaled, rtol=1e-9)
 
 
-def test_direction_distance_equals_loops():
+def test_distance_of_directions_equals_a_loop():
     known, tested = random_fields("known", 40, 4), random_fields("tested", 7, 4)
     soft = [np.array([row / (np.sqrt((row**2).sum()) + NOISE_uT) for row in rows]) for rows in (known, tested)]
     np.testing.assert_allclose(direction_distance(known, tested), nearest_by_loops(*soft), rtol=1e-9)
 
 
-def test_direction_distance_does_not_depend_on_strength():
+def test_distance_of_directions_does_not_depend_on_the_strength_of_fields():
     known, tested = 1e7 * random_fields("known", 40, 4), 1e7 * random_fields("tested", 7, 4)
     np.testing.assert_allclose(direction_distance(known, 2 * tested), direction_distance(known, tested), rtol=1e-5)
 
@@ -54,21 +54,22 @@ def linear_skin(n):
     return target, target @ rng.normal(0, 30, (3, 15))
 
 
-def test_residual_is_zero_for_known_contacts_and_large_for_others():
+def test_residual_is_zero_for_known_contacts_and_large_for_negated_ones():
     target, db_uT = linear_skin(200)
-    # zero, except for rounding
+    # The residual is zero, except for rounding.
     np.testing.assert_allclose(residual((target, db_uT), target[:9], db_uT[:9]), 0, atol=1e-9)
-    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5  # without noise, it would be 2
+    # Without noise, the residual of negated field changes would be 2.
+    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5
 
 
-def test_residual_without_forces_interpolates_places():
+def test_residual_without_forces_is_zero_between_known_places():
     target, db_uT = linear_skin(200)
     unknown = np.column_stack([target[:, :2], np.full(200, np.nan)])
     ours = residual((unknown, db_uT), target[:9], db_uT[:9])
-    np.testing.assert_allclose(ours, 0, atol=1e-9)  # zero, except for rounding
+    np.testing.assert_allclose(ours, 0, atol=1e-9)  # The residual is zero, except for rounding.
 
 
-def test_disagreement_is_rms_distance_from_the_mean():
+def test_disagreement_is_the_rms_distance_of_estimates_from_their_mean():
     predicted = random_fields("predicted", 3, 5, 3)
     naive = []
     for i in range(5):

@@ -36,7 +36,7 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 from tests.report.synthetic import card, texts_of
 
-SINGLE = 1e-4  # rounding of sums of single-precision forces of a few N
+SINGLE = 1e-4  # The rounding error of sums of forces of a few N in single precision.
 
 
 BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}
@@ -60,14 +60,14 @@ PREDICTIONS = [
 
 
 @given(st.floats(-2, 2))
-def test_bias_equals_the_added_force(over_N):
+def test_bias_of_predicted_forces_equals_the_added_force(over_N):
     true = truth("s0")
     result = bias(true, true + np.array([5, -5, over_N], np.float32))
     assert result["bias_f_N"] == pytest.approx(over_N, abs=SINGLE)
     assert result["bias_f_pct"] == pytest.approx(100 * over_N / true[:, 2].mean(), abs=100 * SINGLE)
 
 
-def test_bias_in_percent_of_the_force():
+def test_bias_is_also_given_in_percent_of_the_true_force():
     true = truth("s0")
     predictions = [
         VariantPrediction(BEFORE, "b0", "s0", 0, true, true * np.float32(1.5)),
@@ -77,7 +77,7 @@ def test_bias_in_percent_of_the_force():
     assert force_biases(predictions)["bias_f_N"][AFTER]["mean"] == 0
 
 
-def test_score_of_a_board_is_the_mean_over_skins_and_seeds():
+def test_score_of_a_board_is_the_mean_over_its_skins_and_seeds():
     adapted = [one for one in PREDICTIONS if one.variant == AFTER]
     skins = {
         skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in adapted if one.skin == skin])
@@ -90,7 +90,7 @@ def test_score_of_a_board_is_the_mean_over_skins_and_seeds():
     assert ours["n"] == 2
 
 
-def test_differences_equal_the_summary_of_cards():
+def test_differences_equal_those_computed_from_model_cards():
     cards = {
         variant: [
             card("adapt", a.board, score_groups(a.true, a.predicted, np.full(30, a.board), np.full(30, a.skin)))
@@ -112,7 +112,7 @@ def scores_by_seed(variant: str, skin: str) -> np.ndarray:
     return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in by_seed])
 
 
-def test_differences_are_paired_by_seed():
+def test_differences_between_variants_are_paired_by_seed():
     result = summarise_variants(PREDICTIONS)[AFTER]["mse_xy_mm2"]
     assert result["sd_seeds"] == pytest.approx(np.mean([scores_by_seed(AFTER, skin).std(ddof=1) for skin in BOARD]))
     result = compare_variants(PREDICTIONS, AFTER, BEFORE)["mse_xy_mm2"]
@@ -120,7 +120,7 @@ def test_differences_are_paired_by_seed():
     assert result["sd_seeds"] == pytest.approx(np.mean([one.std(ddof=1) for one in differences]))
 
 
-def test_single_network_has_no_spread_over_seeds():
+def test_scores_of_one_network_have_no_standard_deviation_over_seeds():
     first = [one for one in PREDICTIONS if one.seed_i == 0]
     assert "sd_seeds" not in summarise_variants(first)[AFTER]["accuracy_pct"]
     assert "sd_seeds" not in compare_variants(first, AFTER, BEFORE)["accuracy_pct"]
@@ -128,7 +128,7 @@ def test_single_network_has_no_spread_over_seeds():
     assert "sd_seeds" in summarise_flexible(PREDICTIONS)["bias_f_N"][AFTER]
 
 
-def test_hand_poke_summary_has_counts_and_differences():
+def test_summary_of_hand_pokes_has_counts_and_differences():
     summary = summarise_manual(PREDICTIONS, pokes_n=[325, 324, 325], lines_n=[13, 13, 13])
     counts = ("pokes_n", "lines_n", "skins_n", "boards_n", "seeds_n")
     assert {name: summary[name] for name in counts} == dict(zip(counts, (325, 13, 3, 2, 2), strict=True))
@@ -138,14 +138,14 @@ def test_hand_poke_summary_has_counts_and_differences():
         assert difference == pytest.approx(after - before)
 
 
-def test_without_control_there_is_no_difference():
+def test_without_a_control_there_is_no_difference_from_it():
     summary = summarise_manual([one for one in PREDICTIONS if one.variant != CONTROL], pokes_n=[3], lines_n=[1])
     assert CONTROL not in summary
     assert "after_minus_control" not in summary["paired"]
 
 
 @given(st.floats(0.5, 3))
-def test_strength_ratio_is_the_ratio_of_fields(ratio):
+def test_strength_ratio_is_the_ratio_of_the_field_changes(ratio):
     rng = rng_for(1, "fields")
     depth_mm = np.tile(np.array([0.2, 0.8, 1.2], np.float32), 20)
     db_uT = rng.normal(0, 50, (60, 15)).astype(np.float32)
@@ -160,12 +160,12 @@ def test_strength_ratio_is_the_ratio_of_fields(ratio):
     assert result["n"] == 3
 
 
-def test_depths_of_only_one_variant_are_ignored():
+def test_depths_that_only_one_variant_has_are_ignored():
     one, other = ({d: np.array([float(i + d)]) for d in depths} for i, depths in ((1, (0.2, 0.4)), (3, (0.4, 0.6))))
     assert strength_ratio([one], [other]) == {"mean": pytest.approx(1.4 / 3.4), "n": 1}
 
 
-def test_figure_shows_readings_of_both_variants():
+def test_figure_shows_the_same_random_readings_of_both_variants():
     many = [
         VariantPrediction(variant, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for variant in (BEFORE, AFTER)
     ]
@@ -175,7 +175,7 @@ def test_figure_shows_readings_of_both_variants():
     assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(plotted[BEFORE]["true_N"])
 
 
-def test_flexible_numbers_list_variants_and_bias():
+def test_numbers_of_experiment_flexible_list_all_variants_and_their_bias():
     summary = summarise_flexible(PREDICTIONS)
     assert set(summary["bias_f_N"]) == {BEFORE, AFTER, CONTROL, GRID} < set(summary)
 
@@ -187,9 +187,9 @@ def make_drag(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(st.integers(0, 1000))
-def test_errors_equal_scikit_learn(seed):
+def test_errors_of_five_targets_equal_those_of_scikit_learn(seed):
     true, predicted = make_drag(seed)
-    ours, rel = score5(true, predicted), 1e-5  # relative tolerance for single-precision input
+    ours, rel = score5(true, predicted), 1e-5  # Inputs are in single precision, so the relative tolerance is 1e-5.
     assert ours["mse_xy_mm2"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]), rel=rel)
     assert ours["mse_fxy_N2"] == pytest.approx(mean_squared_error(true[:, 2:4], predicted[:, 2:4]), rel=rel)
     assert ours["mse_fz_N2"] == pytest.approx(mean_squared_error(true[:, 4], predicted[:, 4]), rel=rel)
@@ -199,7 +199,7 @@ def test_errors_equal_scikit_learn(seed):
 
 
 @given(st.integers(0, 1000), st.floats(0.1, 10))
-def test_explained_variance_is_scale_invariant(seed, size):
+def test_explained_variance_does_not_depend_on_the_unit(seed, size):
     true, predicted = make_drag(seed)
     scale = np.array([1, 1, size, size, size])
     one, other = score5(true, predicted), score5(true * scale, predicted * scale)
@@ -208,14 +208,14 @@ def test_explained_variance_is_scale_invariant(seed, size):
     assert other["mse_xy_mm2"] == pytest.approx(one["mse_xy_mm2"])
 
 
-def test_explained_variance_is_1_for_truth_and_0_for_the_mean():
+def test_explained_variance_is_1_for_exact_predictions_and_0_for_the_mean():
     true, _ = make_drag(0)
     assert score5(true, true)["explained_fxy"] == 1
     mean = np.broadcast_to(true.mean(axis=0, dtype=np.float64), true.shape)
     assert score5(true, mean)["explained_xy"] == pytest.approx(0, abs=1e-6)
 
 
-def test_seeds_of_a_fold_are_averaged_first():
+def test_scores_are_averaged_over_seeds_before_folds():
     scores = [("a", {"mse": 1.0}), ("a", {"mse": 3.0}), ("b", {"mse": 6.0})]
     summary = summarise_shear(scores, scores[:1], target=make_drag(0)[0], lines_n=3, passes_n=1, seeds_n=2)
     assert summary["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5), "sd_seeds": pytest.approx(2**0.5)}
@@ -223,7 +223,7 @@ def test_seeds_of_a_fold_are_averaged_first():
     assert summary["seeds_n"] == 2
 
 
-def test_summary_has_both_splits_and_force_sizes():
+def test_summary_of_shear_has_both_splits_and_the_size_of_forces():
     true, predicted = make_drag(1)
     score = score5(true, predicted)
     summary = summarise_shear(
@@ -274,7 +274,7 @@ CASES = {
 
 @pytest.mark.parametrize("experiment", CASES)
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_rows_and_figures_have_their_source(experiment, source):
+def test_tables_and_figures_name_their_source(experiment, source):
     module, numbers, figure_data = CASES[experiment]
     (table,) = module.tables(numbers, source).values()
     assert set(table["source"]) == {source}
@@ -285,7 +285,7 @@ def test_rows_and_figures_have_their_source(experiment, source):
         assert [text] == list(module.figures(numbers, figure_data, source).values())
 
 
-def test_shear_table_has_both_splits():
+def test_shear_table_has_both_splits_of_the_data():
     text = to_markdown(shear.tables(SHEAR_NUMBERS, "simulated")["shear"])
     for mean, sd in SHEAR.values():
         assert f"{mean:g} ± {sd:g}" in text
@@ -299,7 +299,7 @@ def test_shear_table_has_both_splits():
     assert text.count("/ N") == 6
 
 
-def test_manual_table_has_variants_and_differences():
+def test_manual_table_has_all_variants_and_their_differences():
     table = manual.tables(MANUAL_NUMBERS, "simulated")["manual"].set_index("networks")
     for variant, name in (("before", "before"), ("after", "adapted with hand pokes")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[variant]['accuracy_pct']:g}"
@@ -313,7 +313,7 @@ def test_manual_table_has_variants_and_differences():
     assert len(manual.tables(without, "simulated")["manual"]) == 4
 
 
-def test_flexible_table_has_bias_and_differences():
+def test_flexible_table_has_biases_and_differences():
     text = to_markdown(flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"])
     assert f"{FLEXIBLE['mse_xy_mm2']:g}" in text
     assert "30 % less; in the paper it is 80 % less" in text
@@ -325,7 +325,7 @@ def test_flexible_table_has_bias_and_differences():
     assert "bias -0.83 ± 0.10 ± 0.02 (seeds) N" in text
 
 
-def test_direction_networks_are_extra_rows():
+def test_networks_with_input_shape_are_additional_rows():
     shape = {name: FLEXIBLE_NUMBERS[name] for name in ("before", "after", "bias_f_N", "bias_f_pct")}
     table = flexible.tables(FLEXIBLE_NUMBERS | {"shape": shape}, "simulated")["flexible"]
     assert table["networks"].str.startswith("direction and length").tolist() == [False] * 3 + [True] * 2

@@ -1,4 +1,4 @@
-"""Tests of a simulated gripper that controls the force estimated by a linear skin."""
+"""Tests of a simulated gripper that controls the estimated force, on a skin whose field is linear in the force."""
 
 import numpy as np
 import pytest
@@ -24,27 +24,28 @@ def true_force(b_uT):
     return (b_uT - 50.0) @ DIRECTION / np.linalg.norm(DIRECTION) / GAIN_uT_PER_N
 
 
-def test_skin_and_object_bear_the_same_force():
+def test_force_in_equilibrium_is_that_of_skin_and_object_in_series():
     closed_mm, stiffness_N_mm = np.array([0.4, 0.4]), np.array([0.3, 3.0])
     both_N_mm = 1 / (1 / SKIN_N_MM + 1 / stiffness_N_mm)
     np.testing.assert_allclose(finger().squeezed_N(closed_mm, stiffness_N_mm), both_N_mm * closed_mm)
 
 
 @pytest.mark.parametrize(("factor", "held"), [(1.0, 100.0), (1.3, 0.0)])
-def test_gripper_holds_the_estimated_force_not_the_true_one(factor, held):
+def test_gripper_controls_the_estimated_force(factor, held):
+    """If the estimate is 1.3 times the true force, the true force settles at 1 / 1.3 of the aim."""
     held_N = hold(finger(), lambda b_uT: factor * true_force(b_uT), 1.0, SETTINGS, rng_for(0, "hold"))
     np.testing.assert_allclose(held_N[50:].mean(), 1 / factor, rtol=0.05)
     assert judge({"b0": [held_N]}, 1.0)["held_pct"] == held
 
 
-def test_calibration_by_one_press_removes_a_scale_error():
+def test_calibration_by_one_press_corrects_a_wrong_scale():
     skin = finger(noise_uT=1.0)
     press = Press(1.0, skin.read(np.ones(5), rng_for(0, "press")).mean(axis=0))
     forces = scale_to_press(lambda b_uT: 1.3 * true_force(b_uT), press)
     assert judge({"b0": [hold(skin, forces, 1.0, SETTINGS, rng_for(0, "hold"))]}, 1.0)["held_pct"] == 100.0
 
 
-def test_opposite_errors_of_networks_do_not_cancel():
+def test_opposite_errors_of_two_networks_do_not_cancel():
     settings = SETTINGS.model_copy(update={"aims_N": (1.0,)})
     networks = [
         lambda db_uT, factor=factor: factor * true_force(db_uT + 50.0)[:, None] + np.zeros(3) for factor in (0.7, 1.3)
@@ -62,7 +63,7 @@ def test_opposite_errors_of_networks_do_not_cancel():
     assert "over 2 network seeds" in table.attrs["meaning"]
 
 
-def test_tables_list_every_aim_and_feedback():
+def test_tables_have_a_row_for_each_aim_and_kind_of_feedback():
     settings = SETTINGS.model_copy(update={"aims_N": (0.5,)})
     networks = {"b0": [lambda db_uT: true_force(db_uT + 50.0)[:, None] + np.zeros(3)]}
     numbers, figure_data = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)

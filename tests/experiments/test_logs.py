@@ -1,4 +1,7 @@
-"""Tests of estimates from logs: start without contact, contacts, scores, a board that pitches in the earth's field."""
+"""Tests of estimates from logs, which are long recordings without labels.
+
+Further tests are about a board that is tilted (pitched) in the earth's field.
+"""
 
 import numpy as np
 import pytest
@@ -28,7 +31,11 @@ NOISE_uT = 3.0
 
 
 def make_log(quiet_s=2.0, steps_n=4, name="walk"):
-    """Return times, fields and forces: rest, then steps of 0.3 s in contact and 0.2 s off; 200 uT per newton."""
+    """Return the times, fields and forces of a simulated log.
+
+    The log begins without contact. Then follow steps of 0.3 s in contact and 0.2 s without contact. The field changes
+    by 200 uT per newton.
+    """
     quiet_n, on_n, off_n = round(quiet_s * RATE_HZ), 75, 50
     force_N = np.zeros(quiet_n + steps_n * (on_n + off_n))
     for step_i in range(steps_n):
@@ -50,13 +57,13 @@ def truth(force_N):
 
 
 @pytest.mark.parametrize("quiet_s", [0.8, 2.0, 5.0])
-def test_quiet_start_ends_before_the_first_step(quiet_s):
+def test_start_without_contact_ends_before_the_first_step(quiet_s):
     t_s, b_uT, _ = make_log(quiet_s)
     found_s = quiet_start(t_s, b_uT, where="log") / RATE_HZ
     assert quiet_s - 0.1 <= found_s <= quiet_s
 
 
-def test_log_without_quiet_start_is_an_error():
+def test_log_that_begins_with_a_contact_is_refused():
     t_s, b_uT, _ = make_log(0.2)
     with pytest.raises(CaptureError, match=r"log: the start without contact lasts .* less than 0\.5 s"):
         quiet_start(t_s, b_uT, where="log")
@@ -64,7 +71,7 @@ def test_log_without_quiet_start_is_an_error():
         quiet_start(t_s[:40], b_uT[:40], where="log")
 
 
-def test_quiet_log_has_no_contact():
+def test_log_without_steps_has_no_contact():
     t_s, b_uT, _ = make_log(5.0, steps_n=0)
     found = estimate(t_s, b_uT, [predict], where="log")
     assert found.quiet_n >= 0.9 * len(t_s)
@@ -73,7 +80,7 @@ def test_quiet_log_has_no_contact():
     assert "force_max_N" not in numbers
 
 
-def test_contacts_forces_and_noise_are_recovered():
+def test_number_of_contacts_forces_and_noise_are_recovered():
     t_s, b_uT, force_N = make_log()
     found = estimate(t_s, b_uT, [predict], where="log")
     np.testing.assert_array_equal(found.contact, force_N > 0)
@@ -87,24 +94,25 @@ def test_contacts_forces_and_noise_are_recovered():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # Variance of the mean of 15 noisy channels, in N^2; the no-load reading adds 1 / 500 of this variance.
+    # The expected error is the variance of the mean of 15 noisy channels, in N^2. The no-load reading is a mean of many
+    # readings, and adds only 1 / 500 of this variance.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
-def test_network_errors_do_not_cancel():
+def test_scores_are_averaged_over_networks_instead_of_predictions():
     t_s, b_uT, force_N = make_log()
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
     found = estimate(t_s, b_uT, networks, where="log")
     scores = score_contacts(found, truth(force_N))
-    # the mean prediction of the three networks would have 0.44
+    # The mean prediction of the three networks would have a squared error of 0.44 N^2.
     assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)
     assert scores["spread"]["mse_f_N2"] == pytest.approx(np.std([1, 1, 4], ddof=1), rel=0.02)
-    # mean of the maxima 3, 5 and 6 N of three networks
+    # The largest force is the mean of the largest forces of the three networks, which are 3, 5 and 6 N.
     assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)
     assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
 
-def test_plotted_series_has_the_first_network_and_the_range_of_all():
+def test_plotted_series_has_the_first_network_and_the_range_over_all_networks():
     t_s, b_uT, force_N = make_log(steps_n=40)
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
     plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
@@ -114,19 +122,19 @@ def test_plotted_series_has_the_first_network_and_the_range_of_all():
 
 
 @given(st.lists(st.booleans(), max_size=40))
-def test_short_runs_and_gaps_are_ignored(contact):
+def test_contacts_and_gaps_of_a_single_reading_are_ignored(contact):
     closed = [now or (0 < i < len(contact) - 1 and contact[i - 1] and contact[i + 1]) for i, now in enumerate(contact)]
     runs = "".join("x" if now else " " for now in closed).split()
     assert contacts_n(np.array(contact, bool)) == sum(len(run) > 1 for run in runs)
 
 
-def test_truth_of_a_reading_is_that_of_its_step():
+def test_true_values_of_a_reading_are_those_of_the_step_at_its_time():
     true = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     found = truth_at(np.array([0.0, 1.5, 2.5, 3.5, 9.0]), np.array([1.0, 3.0]), np.array([2.0, 4.0]), true)
     np.testing.assert_array_equal(found, [[np.nan] * 3, true[0], [np.nan] * 3, true[1], [np.nan] * 3])
 
 
-def test_plotted_series_is_thinned_and_empty_off_contact():
+def test_plotted_series_has_fewer_points_and_no_values_without_contact():
     t_s, b_uT, force_N = make_log(steps_n=40)
     plotted = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
     assert len(plotted["t_s"]) <= 1500
@@ -138,7 +146,7 @@ def test_plotted_series_is_thinned_and_empty_off_contact():
 
 
 def plain_board(name, chips_n):
-    """Return a board with perfect chips that are not rotated."""
+    """Return a board whose chips are exact and not rotated."""
     eyes = np.tile(np.eye(3), (chips_n, 1, 1))
     return Board(name, np.zeros((chips_n, 3)), eyes, eyes, np.zeros((chips_n, 3)))
 
@@ -155,34 +163,35 @@ def pitched_log(noise_uT=0.0):
     return log, score_pitches(log, instrument(noise_uT), [predict], rng_for(0, "aside"))
 
 
-def test_pitching_board_reads_the_rotated_earth_field():
+def test_pitched_board_reads_the_earth_field_in_rotated_axes():
     np.testing.assert_allclose(earth_in_board_T(np.array([0.0])), EARTH_T[None])
-    # If the pitch equals the dip of the earth's field, the board's x axis is parallel to the field.
+    # If the pitch equals the dip of the earth's field, the x axis of the board is parallel to the field.
     along_T = earth_in_board_T(np.radians([EARTH_DIP_DEG]))
     np.testing.assert_allclose(along_T, [[EARTH_SIZE_T, 0, 0]], atol=1e-18)
 
 
 @given(st.floats(-1.5, 1.5))
-def test_field_change_is_the_chord_of_the_rotation(pitch_rad):
+def test_change_of_the_earth_field_is_the_chord_of_the_rotation(pitch_rad):
     rotated_T = earth_in_board_T(np.array([pitch_rad]))[0]
     assert np.linalg.norm(rotated_T) == pytest.approx(EARTH_SIZE_T)
     chord_T = 2 * EARTH_SIZE_T * np.sin(abs(pitch_rad) / 2)
-    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)  # rounding error of fields of 50 uT
+    # The tolerance is the rounding error of fields of 50 uT.
+    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)
 
 
-def test_board_rests_then_swings_periodically():
+def test_pitch_is_zero_at_the_start_and_then_oscillates():
     t_s = np.array([0.0, 1.0, 1.125, 1.25, 1.375, 1.5])
     np.testing.assert_allclose(swing(t_s, start_s=1.0, period_s=0.5), [0, 0, 1, 0, -1, 0], atol=1e-12)
 
 
-def test_swing_period_is_the_median_time_between_contacts():
+def test_period_of_the_swing_is_the_median_time_between_contacts():
     t_s = np.arange(12) / 10
     assert step_period_s(t_s, np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1, 1], bool)) == pytest.approx(0.45)
     assert step_period_s(t_s, np.arange(12) == 3) == PERIOD_S
     assert step_period_s(t_s, np.zeros(12, bool)) == PERIOD_S
 
 
-def test_board_without_pitch_reads_no_earth_field():
+def test_board_that_is_not_pitched_has_the_scores_of_the_log():
     log, rows = pitched_log()
     found = estimate(log.t_s, log.b_uT, [predict], where="log")
     level = rows[0]
@@ -190,16 +199,17 @@ def test_board_without_pitch_reads_no_earth_field():
     assert level["contacts_n"] == contacts_n(found.contact) == 4
     scores = score_contacts(found, log.true)
     assert level["false_readings_n"] == scores["false_readings_n"] == 0
-    assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)  # rounding of 1000 uT to float32: 6e-5 uT
+    # The tolerance allows for the rounding of 1000 uT to single precision, which is 6e-5 uT.
+    assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)
 
 
-def test_reference_chip_removes_false_contacts_of_pitch():
+def test_reference_chip_removes_the_false_contacts_caused_by_pitch():
     log, rows = pitched_log()
     assert [row["pitch_deg"] for row in rows] == list(PITCHES_DEG)
     false_n = [row["false_readings_n"] for row in rows]
     assert false_n == sorted(false_n)
-    # At 45 degrees, the norm of the field changes of five chips swings up to sqrt(5) 38 uT = 86 uT. This norm is below
-    # the contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
+    # At 45 degrees, the norm of the field changes of five chips oscillates between 0 and sqrt(5) 38 uT = 86 uT. This
+    # norm is below the contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
     off_n = int((np.isnan(log.true[:, 2]) & (np.arange(len(log.t_s)) >= log.quiet_n)).sum())
     assert 0.6 * off_n < false_n[-1] < off_n
     for row in rows:
@@ -207,7 +217,7 @@ def test_reference_chip_removes_false_contacts_of_pitch():
         assert row["reference_chip"]["false_readings_n"] == 0
 
 
-def test_reference_chip_adds_noise():
+def test_noise_of_the_reference_chip_increases_the_force_error():
     rows = pitched_log(noise_uT=3.0)[1]
     assert all(row["reference_chip"]["mse_f_N2"] > 1.5 * rows[0]["mse_f_N2"] for row in rows)
     assert all(row["reference_chip"]["contacts_n"] == 4 for row in rows)
@@ -221,7 +231,7 @@ NUMBERS = {
 SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
 
 
-def test_log_without_truth_has_no_scores():
+def test_log_without_true_forces_has_no_scores():
     table = tables(NUMBERS, "recorded")["logs"].set_index("what")["ours"]
     assert table["accuracy, %"] == table["true contacts"] == "unknown"
     assert table["readings lost to failed reads and stuck chips"] == "1"
@@ -231,7 +241,7 @@ def test_log_without_truth_has_no_scores():
 FOUND = {"contacts_n": 5, "false_readings_n": 7, "missed_readings_n": 2, "mse_f_N2": 0.25}
 
 
-def test_pitched_log_has_a_table():
+def test_log_of_a_pitched_board_has_a_table():
     pitched = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
     numbers = NUMBERS | {"contacts_true_n": 3, "turning": [pitched], "turning_period_s": 0.7, "earth_uT": 50.0}
     table = tables(numbers, "simulated")["logs_turning"]
@@ -243,13 +253,13 @@ def test_pitched_log_has_a_table():
     assert "logs_turning" not in tables(NUMBERS, "recorded")
 
 
-def test_caption_states_the_rate_of_the_log():
+def test_caption_states_the_frame_rate_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
     assert "A log at 133 Hz with" in table.attrs["meaning"]
     assert "The board does not rotate" in table.attrs["meaning"]
 
 
-def test_table_shows_the_spread_over_networks():
+def test_table_shows_standard_deviations_over_networks():
     numbers = NUMBERS | {"accuracy_pct": 80.0, "spread": {"accuracy_pct": 2.5}}
     table = tables(numbers, "simulated")["logs"]
     assert table.set_index("what")["ours"]["accuracy, %"] == "80 ± 2.5"
@@ -258,7 +268,7 @@ def test_table_shows_the_spread_over_networks():
     assert "range over 3 network seeds" in figures(numbers, plotted, "simulated")["logs.svg"]
 
 
-def test_figure_shows_the_truth_if_known():
+def test_figure_shows_true_values_if_they_are_known():
     plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
     assert ">true<" not in figures(NUMBERS, plotted, "recorded")["logs.svg"]
     both = figures(NUMBERS, plotted | {"true": SERIES}, "simulated")["logs.svg"]

@@ -1,4 +1,4 @@
-"""Tests of experiment mounting: changes of the mounting, rates of warnings, accuracy on turned skins, tables."""
+"""Tests of experiment mounting, in which skins are turned, chips are exchanged or the axes of labels are wrong."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ SKINS = simulated_skins(SETUP, SECTION.skins_n, 5, "mounting")
 
 @pytest.fixture(scope="module")
 def board() -> BoardPresses:
-    """Return presses on the nominal skin: two forces at each place of the grid, one reading per press."""
+    """Return presses on the nominal skin: two forces at each place of the grid, with one reading per press."""
     place_mm = np.repeat(grid(), 2, axis=0)
     force_N = np.tile([1.0, 3.0], len(grid())) * rng_for(0, "mounting").uniform(0.9, 1.1, len(place_mm))
     presses = LabelledPresses(place_mm, force_N, simulate_uT(NOMINAL, SETUP, place_mm, force_N).reshape(-1, 15))
@@ -39,7 +39,7 @@ def board() -> BoardPresses:
     return BoardPresses("b1", rest_uT, presses, presses, np.arange(len(place_mm)))
 
 
-def test_changed_mounting_changes_the_fields_as_stated():
+def test_turned_and_swapped_skins_have_the_stated_changes_of_fields():
     skin = SKINS[0]
     np.testing.assert_array_equal(skin.changed(AS_RECORDED).db_uT, skin.db_uT)
     np.testing.assert_array_equal(skin.changed(TURNED).rest_uT, -skin.rest_uT)
@@ -48,7 +48,7 @@ def test_changed_mounting_changes_the_fields_as_stated():
     np.testing.assert_array_equal(skin.changed(SWAPPED).changed(SWAPPED).db_uT, skin.db_uT)
 
 
-def test_turned_skins_are_found():
+def test_turned_skins_are_recognised():
     as_recorded, turned = (
         orientations([skin.changed(change) for skin in SKINS], 0) for change in (AS_RECORDED, TURNED)
     )
@@ -57,16 +57,16 @@ def test_turned_skins_are_found():
     assert as_recorded["skins_n"] == 3
 
 
-def test_wrong_axes_of_labels_raise_a_warning():
+def test_labels_with_wrong_axes_raise_a_warning():
     rows = label_rows("simulated", SKINS, SECTION, 0, draws_n=2)
     warned = {row["axes"]: row["warned_pct"] for row in rows}
     assert len(warned) == 8
     assert {row["trials_n"] for row in rows} == {6}
     assert warned.pop("as given") == 0
-    assert np.mean([*warned.values()]) > 60  # by chance, few trials would raise a warning
+    assert np.mean([*warned.values()]) > 60  # Most trials raise a warning. By chance alone, few would.
 
 
-def test_turned_skin_keeps_its_accuracy_only_with_the_check(board):
+def test_model_keeps_its_accuracy_on_a_turned_skin_only_with_the_check(board):
     rows = accuracy_rows(board, SECTION, 0)
     scores = {(row["change"], row["check"]): row["accuracy_pct"] for row in rows if not row["labels_n"]}
     assert scores[TURNED, WITH_CHECK] == scores[AS_RECORDED, WITH_CHECK] == scores[AS_RECORDED, WITHOUT_CHECK]
@@ -79,4 +79,5 @@ def test_turned_skin_keeps_its_accuracy_only_with_the_check(board):
     shown = tables(numbers, "recorded")
     assert list(shown) == ["mounting", "mounting_labels", "mounting_accuracy"]
     assert shown["mounting"].iloc[0]["skins"] == "3 simulated"
-    assert len(shown["mounting_accuracy"]) == 2 * 2 * 2  # mountings, with and without the check, numbers of labels
+    # One row for each mounting, with and without the check, and for each number of labels.
+    assert len(shown["mounting_accuracy"]) == 2 * 2 * 2

@@ -1,4 +1,7 @@
-"""Tests of experiment moving_hand: external fields, compensation, thresholds, places, and the whole stage."""
+"""Tests of experiment moving_hand, which studies touches while a hand moves in magnetic fields.
+
+Tested are the external fields, their compensation, thresholds for contacts, places, and the whole stage.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -39,26 +42,31 @@ def pad_of(db_uT: np.ndarray, joint_counts: np.ndarray | None = None) -> Pad:
 # --- External fields ---
 
 
-def test_distance_and_size_of_drawn_fields_are_estimated():
+def test_distance_of_the_magnet_and_size_of_its_field_are_estimated():
     cov = external.covariance(np.array(CHIPS_MM), 100.0, 60.0)
     rng = rng_for(0, "moving hand", "source")
     db_uT = rng.multivariate_normal(np.zeros(15), cov, 2000, method="eigh") + NOISE_uT * rng.standard_normal((2000, 15))
     assert hand.find_source(db_uT, NOISE_uT) == (60.0, 100.0)
 
 
-def test_turned_field_is_uniform_and_keeps_its_length():
+def test_uniform_field_in_a_turned_board_keeps_its_length():
     changes_uT = to_board(hand.turn(50.0, 3000, rng_for(0, "turn"))).reshape(-1, 5, 3)
     np.testing.assert_allclose(changes_uT, np.repeat(changes_uT[:, :1], 5, axis=1), atol=1e-9)
-    start_uT = -changes_uT[:, 0].mean(axis=0)  # fields after the turn have random directions
-    assert np.linalg.norm(start_uT) == pytest.approx(50, abs=3)  # standard error per axis: 50 / sqrt(3 x 3000) = 0.5 uT
+    # After the turn, the fields have random directions, so their mean is 0 and the mean change is minus the first
+    # field.
+    start_uT = -changes_uT[:, 0].mean(axis=0)
+    # The standard error of each component is 50 / sqrt(3 x 3000) = 0.5 uT.
+    assert np.linalg.norm(start_uT) == pytest.approx(50, abs=3)
     np.testing.assert_allclose(np.linalg.norm(changes_uT[:, 0] + start_uT, axis=1), 50, atol=3)
 
 
-def test_moved_magnet_has_the_stated_field_at_the_board():
+def test_field_of_a_moved_magnet_has_the_stated_size_at_the_board():
     changes_uT = to_board(hand.move_magnet(140.0, (40.0, 40.0), 20_000, rng_for(0, "magnet"))).reshape(-1, 5, 3)
-    sd_uT = changes_uT.std(axis=0)  # all changes start from the same field, and the mean of the later fields is 0
-    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # chip at the centre; the standard error is below 1 %
-    assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()  # outer chips can be nearer to the magnet
+    # All changes start from the same field, so their standard deviation is that of the later fields.
+    sd_uT = changes_uT.std(axis=0)
+    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # The chip at the centre. The standard error is below 1 %.
+    # Outer chips can be nearer to the magnet, so their fields are larger.
+    assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()
 
 
 # --- Contacts ---
@@ -69,14 +77,13 @@ def test_contact_threshold_equals_that_of_the_live_page(external_uT):
     readings_uT = NOISE_uT * rng_for(0, "live").standard_normal((4000, 15))
     matrix = load_universal(external_uT=external_uT).suppressor(NOISE_uT)
     live_uT = np.median(magnitudes_uT(readings_uT, matrix)) + CONTACT_SDS * NOISE_uT
-    assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(
-        live_uT, rel=0.02
-    )  # a median is up to 1.5 % below the root mean square
+    # The live page takes a median, which is up to 1.5 % below the root mean square.
+    assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(live_uT, rel=0.02)
 
 
 @pytest.mark.parametrize("learner", ["ridge", "boosting"])
 @pytest.mark.parametrize("trained_on", [OTHER, FIRST_HALF])
-def test_compensation_removes_fields_that_depend_on_the_joints(learner, trained_on):
+def test_compensation_removes_fields_that_depend_on_joint_angles(learner, trained_on):
     rng = rng_for(0, "moving hand", learner)
     slopes = rng.normal(size=15)
     pads = []
@@ -90,7 +97,7 @@ def test_compensation_removes_fields_that_depend_on_the_joints(learner, trained_
     assert rms_uT < (1.1 if learner == "ridge" else 3) * NOISE_uT < pads[1].db_uT.std() / 3
 
 
-def test_option_for_external_fields_reduces_false_contacts_but_not_detection():
+def test_option_for_external_fields_removes_false_contacts_and_keeps_true_ones():
     rng = rng_for(0, "moving hand", "contacts")
     cov = external.covariance(np.array(CHIPS_MM), 100.0)
     pairs = [
@@ -103,13 +110,13 @@ def test_option_for_external_fields_reduces_false_contacts_but_not_detection():
     for row in (off, on):
         for part, scale in zip(row["thresholds"], SECTION.touch_scales, strict=True):
             assert part["touch_scale"] == scale
-            # tolerance: four standard errors of a 99 % quantile of 500 values (0.45 % each)
+            # The tolerance is four standard errors of a 99 % quantile of 500 values (0.45 % each).
             assert part["detected_pct"] == pytest.approx(99, abs=1.8)
     still = [(pad_of(np.zeros((300, 15))), pad_of(np.zeros((300, 15))))]
     assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_pct"] == 0
 
 
-def test_groups_must_name_captures_of_pads():
+def test_groups_that_name_unknown_captures_are_refused():
     pads = {"a": pad_of(np.zeros((10, 15)))}
     group = hand.Group(name="one", threshold=("a",), tested=("b",))
     with pytest.raises(ParamsError, match=r"groups: one: no capture b of layout leaphand in the scene \(it has: a\)"):
@@ -131,7 +138,7 @@ def test_settings_that_contradict_each_other_are_refused(change, expected):
         parse(MovingHand, SECTION.model_dump(mode="json") | change, "moving_hand")
 
 
-def test_scene_needs_recordings_of_presses():
+def test_scene_without_recordings_of_presses_is_refused():
     with pytest.raises(ParamsError, match="no recordings of presses.* reskin fetch lab --scene hand"):
         hand.read_boards(read_settings("hand", ROOT), SECTION.presses, [])
 
@@ -149,7 +156,7 @@ def write_pad(folder: Path, pad: int) -> None:
     (folder / HEADER_FILE).write_text(render(header))
 
 
-def test_stage_runs_on_synthetic_recordings(tmp_path):
+def test_whole_stage_runs_on_synthetic_recordings(tmp_path):
     settings = read_settings("hand", ROOT)
     presses = SECTION.presses
     frame = Frame(chip_rotations(presses), presses.labels_middle_mm, presses.labels_mirrored)
@@ -168,9 +175,8 @@ def test_stage_runs_on_synthetic_recordings(tmp_path):
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [row["capture"] for row in numbers["recordings"]] == ["first", "second"]
     assert [row["rows_n"] for row in numbers["recordings"]] == [24, 24]
-    assert (
-        len(numbers["contacts"]) == 2 + 2 * 2
-    )  # values of the option; two learners, each trained on two kinds of data
+    # The option has several values. There are two learners, each trained on two kinds of data.
+    assert len(numbers["contacts"]) == 2 + 2 * 2
     by_field = {
         (row["field"], row["external_uT"], row["labels_n"]): row["mse_xy_mm2"]["mean"]
         for row in numbers["superposed_places"]

@@ -1,4 +1,4 @@
-"""Tests of the errors caused by neglected physical effects: closed forms, scaling, and the table."""
+"""Tests of the errors caused by physical effects that a simulation neglects, against closed forms and scaling laws."""
 
 import numpy as np
 import pytest
@@ -39,31 +39,31 @@ def not_inside(monkeypatch):
     monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
-def test_effects_neglected_by_the_main_protocol(rows, not_inside):
+def test_effects_that_the_main_protocol_neglects_are_marked(rows, not_inside):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
         "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
     }  # fmt: skip
-    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # friction acts only in drags
+    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # Friction acts only if the tip is dragged.
     aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
     assert aged["ageing"].done == "kept"
 
 
-def test_protocols_of_each_effect(rows, not_inside):
+def test_row_of_an_effect_names_the_protocols_that_neglect_and_compute_it(rows, not_inside):
     wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
     found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
     assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
-    assert found["ageing"].done == "left out"  # the main protocol neglects ageing
+    assert found["ageing"].done == "left out"  # The main protocol neglects ageing.
     assert found["ageing"].force_pct == rows["ageing"].force_pct
     assert (found["friction"].left_out_by, found["friction"].computed_by) == (("grid", "wear"), ())
     assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
 
 
-def test_force_errors_of_ageing_and_relaxation(rows):
+def test_force_errors_of_neglected_ageing_and_relaxation_equal_closed_forms(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
     assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / relaxed_share(RELAXATION) - 1), rel=1e-9)
-    # the depth of a press is given, so these effects change only the force
+    # The depth of a press is given, so these effects change only the force, and not the field.
     assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0
 
 
@@ -76,21 +76,22 @@ def test_one_kelvin_changes_the_field_by_0_12_percent(rows):
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
 
 
-def test_no_load_reading_removes_a_steady_field(rows):
-    assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding only
+def test_constant_external_field_is_removed_by_the_no_load_reading(rows):
+    assert 0 < rows["the earth's field"].field_pct < 1e-6  # Only rounding errors remain.
     assert rows["the earth's field"].rest_uT == pytest.approx(45)
 
 
-def test_included_effects_change_the_field(rows):
+def test_neglecting_an_effect_that_is_included_would_change_the_field(rows):
     # Computing the deformation in increments changes the field of a bonded skin at 1.2 mm by 16-23 %. On a sliding
-    # skin, the linear far field dominates.
+    # skin, the change is smaller, because most of the field change is due to the distant motion, which is linear in the
+    # depth.
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_bonded_base_is_an_included_effect(rows, not_inside):
+def test_holding_of_a_skin_on_its_base_is_an_included_effect(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -104,15 +105,16 @@ def test_bonded_base_is_an_included_effect(rows, not_inside):
     assert found["the base's hold"].field_pct > 10
 
 
-def test_self_field_error_is_proportional_to_powder(rows, not_inside):
+def test_error_of_the_neglected_self_field_is_proportional_to_the_powder(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
-    # tolerance of 10 %: the magnetisation is not quite linear in the magnetising field, which is half as strong
+    # The tolerance is 10 %, because the magnetisation is not quite linear in the magnetising field, which is half as
+    # strong.
     assert half["the powder's own field"].field_pct == pytest.approx(
         rows["the powder's own field"].field_pct / 2, rel=0.1
     )
 
 
-def test_rows_describe_how_they_are_computed(rows):
+def test_each_row_describes_how_its_error_is_computed(rows):
     assert all(row.how for row in rows.values())
 
 
@@ -135,7 +137,7 @@ def test_table_lists_the_protocols_of_each_effect():
         "the earth's field": "neglected",
         "temperature": "computed: grid, wear",
     }
-    # effects that the main protocol neglects come first; it includes temperature
+    # The effects that the main protocol neglects come first. It includes temperature, which is therefore last.
     assert table.index[-1] == "temperature"
     assert table.loc["ageing"].tolist()[1:] == ["12", "–", "0.5", "so", "simulated"]
 

@@ -1,4 +1,4 @@
-"""Tests of experiment population (universal model on simulated skins): prior, resumed runs, pools, scores."""
+"""Tests of experiment population, which trains and tests the universal model on simulated skins."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -54,17 +54,18 @@ def skins():
     return simulated_skins(make_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
 
 
-def test_prior_is_centred_on_the_simulated_law():
+def test_prior_of_the_skins_is_centred_on_the_simulated_skin():
     designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
     law = designed.prior.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
     assert (law.modulus_MPa, law.grip_N_mm) == (pytest.approx(1e-3 * DESIGN.modulus_kPa), pytest.approx(8.75))
-    assert designed.forces_N[0] < 0.05 < 5 < designed.forces_N[1]  # forces at depths of 0.2 and 1.2 mm
+    # The range of forces covers those of presses with depths of 0.2 and 1.2 mm.
+    assert designed.forces_N[0] < 0.05 < 5 < designed.forces_N[1]
     with pytest.raises(ValueError, match="hold of section skin is null"):
         designed_skins(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
 
 
-def test_resumed_run_reuses_finished_parts(monkeypatch):
+def test_resumed_run_draws_only_the_parts_that_are_missing(monkeypatch):
     drawn, shelf = [], {}
     all_skins = make_population(7, rng_for(0, "skins"))
 
@@ -80,15 +81,16 @@ def test_resumed_run_reuses_finished_parts(monkeypatch):
     population.draw(designed, 6, lambda line: None)
     drawn.clear()
     found = population.draw(designed, 7, lambda line: None)
-    # the first skin is always drawn, for the cache key
+    # The first skin is always drawn, because it is part of the cache key.
     assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]
     for name in Population.__annotations__:
         np.testing.assert_array_equal(getattr(found, name), getattr(all_skins, name))
 
 
-def test_pool_has_one_press_per_place_and_no_test_press():
+def test_calibration_pool_has_one_press_per_place_and_no_test_press():
     places_n, depths_n, readings_n = 4, 3, 2
-    press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)  # press number of each row in two passes
+    # Two passes. The number of the press of each row.
+    press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)
     target = np.stack([press % places_n, press % places_n, 1 + press], axis=1).astype(np.float32)
     names = (np.full(len(press), name) for name in ("c", "b0", "b0_s0"))
     pass_i = (press // (places_n * depths_n)).astype(np.int32)
@@ -97,13 +99,14 @@ def test_pool_has_one_press_per_place_and_no_test_press():
     data = SimpleNamespace(rows=rows, settings=SimpleNamespace(seed=0))
     (skin,) = scene_skins(data, fold, Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), {"b0_s0": np.zeros(3)})
     assert sorted((skin.pool.place_mm[:, 0] + 8).tolist()) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(skin.pool.db_uT[:, 0] + 1, skin.pool.force_N)  # field and force are of the same press
+    # Field change and force belong to the same press.
+    np.testing.assert_array_equal(skin.pool.db_uT[:, 0] + 1, skin.pool.force_N)
     assert not set(skin.pool.force_N) & set(skin.true[:, 2])
     assert len(skin.true) == len(fold.test)
 
 
-def test_known_weight_is_the_central_press_of_nearest_force():
-    # forces of five presses with two readings each
+def test_known_weight_is_the_press_near_the_middle_with_the_nearest_force():
+    # The forces of five presses, each with two readings.
     force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)
     x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
     target, press = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
@@ -112,12 +115,15 @@ def test_known_weight_is_the_central_press_of_nearest_force():
     data = SimpleNamespace(rows=Rows(*names, db_uT, target, np.zeros(10, np.int32), press, {}))
     weight = find_weight(data, np.arange(10), Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight"))
     np.testing.assert_array_equal(weight.db_uT, [4, 8, 4])
-    assert 3.5 < weight.force_N < 4.5  # the weight of 4 N is known to 2 %
+    assert 3.5 < weight.force_N < 4.5  # The weight of 4 N is known to 2 %, so a random error is added.
     assert weight.force_N != 4.0
 
 
 def weight_of_central_presses(force_N: list[float]):
-    """Return the known weight that is chosen from central presses with these forces and one reading each."""
+    """Return the known weight that is chosen from presses in the middle.
+
+    The presses have these forces and one reading each.
+    """
     force = np.array(force_N, np.float32)
     names = (np.full(len(force), name) for name in ("c", "b0", "b0_s0"))
     target, db_uT = np.full((len(force), 3), 8, np.float32), np.repeat(force[:, None], 3, axis=1)
@@ -128,7 +134,7 @@ def weight_of_central_presses(force_N: list[float]):
 
 
 @pytest.mark.parametrize("zero_N", [0.0, -0.01, -5.0, np.nan])
-def test_press_without_positive_force_is_not_a_known_weight(zero_N):
+def test_press_without_a_positive_force_is_not_used_as_known_weight(zero_N):
     assert weight_of_central_presses([zero_N, 4.0, 1.0]).db_uT[0] == 4
     with pytest.raises(SchemaError, match="skin b0_s0: none of the 2 presses near the middle has a force above 0 N"):
         weight_of_central_presses([zero_N, zero_N])
@@ -146,7 +152,8 @@ def test_tables_and_figure_list_every_method():
     assert len(tables["population"]) == 3
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
-    assert [*tables["population_fresh"]][-4:] == [*held, "n"]  # interval columns of map, map and network, network
+    # The intervals of three methods: map, map with network, and network.
+    assert [*tables["population_fresh"]][-4:] == [*held, "n"]
     earlier = {name: value for name, value in numbers.items() if name != "fresh"}
     assert set(tables) - set(population.tables(earlier, "simulated")) == {"population_fresh"}
     assert set(tables["population_scaling"]["training skins"]) == {"30", "3000"}
@@ -156,24 +163,26 @@ def test_tables_and_figure_list_every_method():
         in population.figures(numbers, {}, "simulated")["population_scaling.svg"]
     )
     one = numbers | {"scaling": [row for row in numbers["scaling"] if row["skins_n"] == 3000]}
-    assert population.figures(one, {}, "simulated") == {}  # one number of skins shows no dependence
+    # A single number of skins shows no dependence, so there is no figure.
+    assert population.figures(one, {}, "simulated") == {}
 
 
-def test_intervals_are_over_boards():
+def test_means_are_taken_over_skins_first_and_then_over_boards():
     keys = {"way": "map", "pokes_n": 0, "labels_n": 0}
     rows = pd.DataFrame(keys | {"board": ["b0", "b0", "b1"], "accuracy_pct": [1.0, 3.0, 6.0]})
     (found,) = over_boards(rows, "way", "pokes_n", "labels_n")
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (4.0, 2)
 
 
-def test_calibration_and_test_presses_are_disjoint(skins):
+def test_presses_for_calibration_and_for_tests_are_different(skins):
     for skin in skins:
         pooled, tested = ({tuple(row) for row in part} for part in (skin.pool.db_uT, skin.test_uT))
         assert not pooled & tested
-        assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)  # one press per place
+        # The pool has one press per place.
+        assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)
 
 
-def test_untrained_network_does_not_change_the_map_and_labels_improve_it(model, skins):
+def test_labels_improve_the_map_which_is_better_than_an_untrained_network(model, skins):
     sizes = CalibrationSize(0, 0), CalibrationSize(65, 40)
     calibration = calibrate_ways(model, skins, sizes[0])
     rows = [row for size in sizes for skin in skins for row in score_skin(model, skin, size, calibration)]
@@ -184,11 +193,11 @@ def test_untrained_network_does_not_change_the_map_and_labels_improve_it(model, 
     }
     assert off_N2["map", 40] < off_N2["map", 0] < off_N2["network", 0]
     for row in rows:
-        # the best possible factor has the smallest error
+        # The best possible factor is fitted to the test presses themselves, so no other factor has a smaller error.
         assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9
 
 
-def test_weight_is_estimated_last(model, skins):
+def test_known_weight_is_the_last_estimate_and_does_not_change_the_others(model, skins):
     skin, once = skins[0], dict.fromkeys(WAYS, 1.0)
     (found,) = estimate(model, skin, CalibrationSize(16, 0), [once])
     assert all(len(one.force_N) == len(skin.true) + 1 for one in found.values())
@@ -201,8 +210,9 @@ def test_weight_is_estimated_last(model, skins):
     assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
-def test_weight_share_is_computed_at_the_calibrated_power(skins, monkeypatch):
-    # In this test, force errors grow with the likelihood power, and only one power has intervals that cover 90 %.
+def test_share_of_the_known_weight_is_computed_at_the_calibrated_likelihood_power(skins, monkeypatch):
+    # The estimates of this test are made up: force errors grow with the likelihood power, and only one power has
+    # intervals that cover 90 %.
     def fake_estimate(model, skin, size, powers):
         found = []
         for one in powers:

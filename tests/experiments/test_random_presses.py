@@ -1,4 +1,4 @@
-"""Tests of experiment random_presses: drawn presses, their distance from tested presses, scores and tables."""
+"""Tests of experiment random_presses: how presses are drawn, their distance from tested presses, scores and tables."""
 
 from dataclasses import replace
 
@@ -39,7 +39,7 @@ POWERS = LikelihoodPowers({12: {0: 0.5, 40: 0.5}, 65: {0: 0.5, 40: 0.5}}, {0: 0.
 
 
 def make_board(seed: int = 0) -> BoardPresses:
-    """Return presses on a synthetic board: three forces at each place of the grid, two readings per press."""
+    """Return presses on a synthetic board: three forces at each place of the grid, with two readings per press."""
     rng = rng_for(seed, "random presses")
     place_mm = np.repeat(grid(), DEPTHS_N, axis=0)
     force_N = np.tile([0.8, 2.0, 5.0], len(grid())) * rng.uniform(0.8, 1.2, len(place_mm))
@@ -48,7 +48,7 @@ def make_board(seed: int = 0) -> BoardPresses:
     return BoardPresses("b1", np.zeros(15), presses, presses[press_i], press_i)
 
 
-def test_force_scores_agree_with_scikit_learn():
+def test_force_scores_equal_those_of_scikit_learn():
     rng = np.random.default_rng(5)
     true_N, force_N = rng.uniform(0, 3, (2, 40))
     scores = force_scores(force_N, true_N)
@@ -64,7 +64,7 @@ def board() -> BoardPresses:
 
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from([CHECKERBOARD, HALVES]), st.integers(0, 11), st.integers(1, 65))
-def test_tested_presses_are_not_drawn_and_far_from_labels(split, draw_i, presses_n):
+def test_tested_presses_are_not_used_for_calibration_and_are_far_from_labels(split, draw_i, presses_n):
     board = make_board()
     draw = draw_presses(board, split, presses_n, 2021, draw_i)
     tested = np.unique(board.press_i[draw.tested])
@@ -72,36 +72,36 @@ def test_tested_presses_are_not_drawn_and_far_from_labels(split, draw_i, presses
     assert len(draw.unlabelled) == presses_n == len(set(draw.unlabelled))
     labelled_mm, tested_mm = board.presses.place_mm[draw.labels], board.presses.place_mm[tested]
     distance_mm = np.linalg.norm(labelled_mm[:, None] - tested_mm, axis=2)
-    assert distance_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # grid places are 2 mm apart
+    assert distance_mm.min() >= (2 if split == CHECKERBOARD else 4) - 1e-9  # Places of the grid are 2 mm apart.
     assert (np.abs(board.presses.place_mm[draw.weight]) < 1).all()
     assert np.linalg.norm(tested_mm - board.presses.place_mm[draw.weight], axis=1).min() >= 2 - 1e-9
 
 
-def test_halves_and_colours_swap_roles_in_every_second_draw(board):
+def test_tested_and_calibrated_parts_are_exchanged_in_every_second_draw(board):
     for split in (CHECKERBOARD, HALVES):
         np.testing.assert_array_equal(board.part(split, 0), -board.part(split, 1))
     assert len({tuple(board.part(HALVES, i)) for i in range(4)}) == 4
 
 
-def test_board_without_a_press_in_the_middle_is_an_error(board):
+def test_board_without_a_press_in_the_middle_is_refused(board):
     outside = np.flatnonzero(~board.middle)
     reduced = replace(board, presses=board.presses[outside])
     with pytest.raises(SchemaError, match="no press within 1 mm of the middle"):
         draw_presses(reduced, CHECKERBOARD, 12, 2021, 0)
 
 
-def test_too_many_labels_are_an_error(board):
+def test_more_labels_than_presses_are_refused(board):
     draw = draw_presses(board, CHECKERBOARD, 12, 2021, 0)
     with pytest.raises(SchemaError, match="presses for labels, but labels_n asks for 500"):
         label_sets(board, draw, (0, 500))
 
 
-def test_nearest_label_is_exact_for_its_own_reading(board):
+def test_nearest_label_predicts_its_own_reading_exactly(board):
     scores = score_nearest(board.presses, board.presses)
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1
     assert scores["mse_f_N2"] == scores["median_error_N"] == 0
-    assert scores["r2_line_f"] == pytest.approx(0)  # score of a constant estimate, the mean force
+    assert scores["r2_line_f"] == pytest.approx(0)  # This is the score of a constant estimate, which is the mean force.
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +113,12 @@ def rows(board) -> list[dict]:
     return score_draw(board, variants, POWERS, section, 2021, 0)
 
 
-def test_each_setting_is_scored(rows):
+def test_each_combination_of_settings_is_scored(rows):
     names = {(row["tested"], row["presses_n"], row["method"], row["labels"]) for row in rows}
     universal = {name for name in names if name[2] != NEAREST}
     assert {name[3] for name in universal} == {"0", WEIGHT, "10"}
-    assert len(universal) == 2 * (3 + 2 + 3)  # both variants: 65 presses, 12 presses, halves
+    # For each of the two variants: three numbers of labels with 65 presses, two with 12 presses, and three for halves.
+    assert len(universal) == 2 * (3 + 2 + 3)
     assert {name[:2] for name in names if name[2] == NEAREST} == {(CHECKERBOARD, 65), (HALVES, 65)}
 
 
@@ -128,13 +129,14 @@ def test_labels_improve_place_and_force(rows):
         return float(np.mean(values))
 
     assert mean("10", "mse_xy_mm2") < mean("0", "mse_xy_mm2")
-    assert mean("10", "r2_f") > 0.8  # the synthetic skin follows its formula; a constant force would have about 0
+    # The synthetic skin follows the formula of the model. A constant force would have a score of about 0.
+    assert mean("10", "r2_f") > 0.8
 
 
-def test_table_has_each_row_and_its_source(rows):
+def test_table_has_a_row_for_each_setting_and_names_its_source(rows):
     summary = summarise_rows(rows)
     (table,) = tables({"rows": summary, "draws_n": 1}, "recorded").values()
     assert len(table) == len(summary)
     assert (table["source"] == "recorded").all()
     best = next(row for row in summary if row["labels"] == "10" and row["method"] != NEAREST)
-    assert best["accuracy_pct"]["n"] == 1  # one board
+    assert best["accuracy_pct"]["n"] == 1  # There is one board, and n counts boards.

@@ -1,4 +1,7 @@
-"""Tests of experiment recorded_limits: registration, estimates of shear, thresholds of detection, tables."""
+"""Tests of experiment recorded_limits, which asks what limits the accuracy on recorded boards.
+
+Tested are the rigid registration of places, estimates of shear, thresholds of detection, and tables.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -49,7 +52,7 @@ def rotation(angle_deg: float) -> np.ndarray:
 
 
 def make_board() -> BoardPresses:
-    """Return presses on a synthetic board: three forces at each place of the grid, two readings per press."""
+    """Return presses on a synthetic board: three forces at each place of the grid, with two readings per press."""
     place_mm = np.repeat(grid(), 3, axis=0)
     force_N = np.tile([0.8, 2.0, 5.0], len(grid()))
     presses = LabelledPresses(place_mm, force_N, poked_uT(place_mm, force_N, np.array([0.5, -0.5, 0.3])))
@@ -57,11 +60,11 @@ def make_board() -> BoardPresses:
     return BoardPresses("b1", np.zeros(15), presses, presses[press_i], press_i)
 
 
-# --- Rigid registration ---
+# --- Rigid registration: places are corrected by a shift and a rotation that are fitted to known presses. ---
 
 
 @given(st.floats(-179, 179), st.floats(-5, 5), st.floats(-5, 5), st.integers(0, 99))
-def test_rigid_motion_is_recovered_without_a_reflection(angle_deg, x_mm, y_mm, seed):
+def test_fitted_rigid_motion_recovers_shift_and_rotation_and_is_never_a_reflection(angle_deg, x_mm, y_mm, seed):
     rng = np.random.default_rng(seed)
     from_mm = rng.uniform(-8, 8, (5, 2))
     to_mm = from_mm @ rotation(angle_deg).T + [x_mm, y_mm]
@@ -73,18 +76,20 @@ def test_rigid_motion_is_recovered_without_a_reflection(angle_deg, x_mm, y_mm, s
     assert np.linalg.det(mirrored.rotation) == pytest.approx(1)
 
 
-def test_fitted_rotation_has_the_smallest_squared_distances():
+def test_fitted_rotation_has_the_smallest_sum_of_squared_distances():
     rng = np.random.default_rng(0)
     from_mm, to_mm = rng.uniform(-8, 8, (2, 5, 2))
 
     def error_mm2(turned: np.ndarray) -> float:
-        moved = turned - turned.mean(axis=0) + to_mm.mean(axis=0)  # for a given rotation, aligned means are best
+        # For any rotation, the best shift makes the means equal.
+        moved = turned - turned.mean(axis=0) + to_mm.mean(axis=0)
         return float(((moved - to_mm) ** 2).sum())
 
     searched = min(error_mm2(from_mm @ rotation(angle_deg).T) for angle_deg in np.arange(0, 360, 0.1))
     fitted = float(((limits.fit_rigid(from_mm, to_mm).apply(from_mm) - to_mm) ** 2).sum())
     assert fitted <= searched
-    assert fitted == pytest.approx(searched, rel=1e-4)  # the grid of angles has steps of 0.1 degrees
+    # The tolerance allows for the steps of 0.1 degrees between the angles that are tried.
+    assert fitted == pytest.approx(searched, rel=1e-4)
 
 
 def test_fitted_shift_is_the_mean_difference():
@@ -95,33 +100,38 @@ def test_fitted_shift_is_the_mean_difference():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 99))
-def test_tested_readings_are_at_other_places_and_unlabelled_presses_are_not_tested(draw_i):
+def test_tested_readings_are_neither_at_known_places_nor_of_unlabelled_presses(draw_i):
     board = make_board()
     draw = limits.draw_presses(board, SECTION, 2021, draw_i)
     tested = np.unique(board.press_i[draw.tested])
     known_mm = board.presses.place_mm[draw.known]
     distance_mm = np.linalg.norm(known_mm[:, None] - board.presses.place_mm[tested], axis=2)
-    assert distance_mm.min() >= 2 - 1e-9  # the spacing of the grid
+    assert distance_mm.min() >= 2 - 1e-9  # Places of the grid are 2 mm apart.
     assert not set(tested) & set(draw.unlabelled)
     between_mm = np.linalg.norm(known_mm[:, None] - known_mm, axis=2)[np.triu_indices(5, 1)]
-    assert between_mm.min() >= 4  # five places drawn at random would often be neighbours, 2 mm apart
+    # The known places are chosen far from each other. Five random places would often be neighbours, 2 mm apart.
+    assert between_mm.min() >= 4
 
 
-def test_too_few_places_are_an_error():
+def test_board_with_too_few_places_is_refused():
     board = make_board()
     with pytest.raises(SchemaError, match="195 presses at 65 places"):
         limits.draw_presses(board, SECTION.model_copy(update={"known_n": 65}), 2021, 0)
 
 
 def make_variant() -> Variant:
-    """Return a model with the map of the synthetic skin, and networks that are not trained."""
+    """Return a variant of the model. It has the map of the synthetic skin, and a network that is not trained."""
     model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "recorded limits"))])
     return Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
 
 
 @pytest.fixture(scope="module")
 def scores() -> list[dict]:
-    """Return scores of a regressor that is wrong by a rigid motion, and of two variants of an untrained model."""
+    """Return scores of several methods on the synthetic board.
+
+    The methods are a regressor whose places are wrong by a rigid motion, and two variants of a model that is not
+    trained.
+    """
     board = make_board()
     variant = make_variant()
     moved_mm = board.readings.place_mm @ rotation(10).T + [2, -1]
@@ -130,12 +140,12 @@ def scores() -> list[dict]:
     return [row for i in range(2) for row in limits.score_draw(board, regressors, variants, SECTION, 2021, i)]
 
 
-def test_registration_removes_a_rigid_error(scores):
+def test_registration_removes_an_error_that_is_a_rigid_motion(scores):
     before, after = (
         [row for row in scores if row["method"] == "moved" and row["known"] == known]
         for known in (limits.UNCHANGED, limits.RIGID)
     )
-    assert len(before) == len(after) == 4  # two draws, two models
+    assert len(before) == len(after) == 4  # There are two draws with two models each.
     for row in before:
         assert row["accuracy_pct"] < 50
         assert row["rigid_limit_mm2"] == pytest.approx(0, abs=1e-12)
@@ -145,8 +155,8 @@ def test_registration_removes_a_rigid_error(scores):
         assert row["shift_mm"] == pytest.approx(np.sqrt(5))
 
 
-def test_registration_fitted_to_tested_readings_has_the_smallest_error(scores):
-    """The rigid motion fitted to the tested readings themselves is a lower bound for the squared error."""
+def test_registration_fitted_to_the_tested_readings_has_the_smallest_error(scores):
+    """A rigid motion that is fitted to the tested readings themselves gives a lower bound for the squared error."""
     for row in scores:
         if row["known"] in (limits.SHIFT, limits.RIGID):
             keys = {name: row[name] for name in ("method", "presses_n", "draw_i")} | {"known": limits.UNCHANGED}
@@ -164,35 +174,38 @@ def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
     def mean_mm2(known: str) -> float:
         return float(np.mean([row["mse_xy_mm2"] for row in scores if row["known"] == known and row["presses_n"]]))
 
-    assert mean_mm2(limits.LABELS) < mean_mm2(limits.UNCHANGED)  # the synthetic skin follows the formula of the map
+    # Labels help, because the synthetic skin follows the formula of the map.
+    assert mean_mm2(limits.LABELS) < mean_mm2(limits.UNCHANGED)
 
 
-# --- Shear ---
+# --- Shear forces ---
 
 
 @given(arrays(float, (12, 2), elements=st.floats(-100, 100)), st.lists(st.integers(0, 3), min_size=8, max_size=8))
-def test_mean_by_group_is_the_mean_of_its_rows(values, numbers):
+def test_mean_by_group_equals_the_mean_of_the_rows_of_each_group(values, numbers):
     group = np.array([0, 1, 2, 3, *numbers])
     expected = [values[group == i].mean(axis=0) for i in range(4)]
     np.testing.assert_allclose(limits.mean_by(group, values), expected, atol=1e-9)
 
 
-def test_explained_fraction_equals_r2():
+def test_explained_fraction_within_groups_equals_r2_of_centred_values():
     rng = np.random.default_rng(1)
     true, predicted = rng.standard_normal((2, 30))
     group = np.repeat([0, 1, 2], 10)
     assert limits.explained(true, predicted, 0 * group) == pytest.approx(r2_score(true, predicted))
     shifted = predicted + np.array([5.0, -3.0, 1.0])[group]
     within = limits.explained(true, predicted, group)
-    assert limits.explained(true, shifted, group) == pytest.approx(within)  # an offset of a whole group has no effect
+    # Adding a constant to all predictions of a group has no effect, because values are centred by group.
+    assert limits.explained(true, shifted, group) == pytest.approx(within)
     centred = [values - np.repeat(values.reshape(3, 10).mean(axis=1), 10) for values in (true, predicted)]
     assert within == pytest.approx(r2_score(*centred))
 
 
 def make_rows(shear_in_field: bool) -> Rows:
-    """Return rows of two boards with 30 places, two depths and two readings per press; 6 channels.
+    """Return rows of two boards with 30 places, two depths, two readings per press and 6 channels.
 
-    The field is linear in place and normal force and, if `shear_in_field`, in the sideways force, which is random.
+    The field is linear in place and normal force. If `shear_in_field`, it is also linear in the sideways force, which
+    is random.
     """
     rng = np.random.default_rng(2)
     place_mm = 2.0 * np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=-1).reshape(-1, 2)
@@ -212,13 +225,13 @@ def make_rows(shear_in_field: bool) -> Rows:
     )  # fmt: skip
 
 
-def test_shear_is_predicted_only_if_the_field_depends_on_it():
+def test_shear_is_predicted_only_if_the_field_depends_on_shear():
     by_field = {}
     for shear_in_field in (True, False):
         rows = limits.evaluate_shear(make_rows(shear_in_field), SECTION, 2021)["rows"]
-        assert (
-            len(rows) == 2 * 3
-        )  # two kinds of training presses; three kinds of inputs: none, the field, and place with normal force
+        # Two kinds of training presses, with three kinds of inputs each: none, the field, and the place with the normal
+        # force.
+        assert len(rows) == 2 * 3
         for row in rows:
             if row["inputs"] == limits.FIELD:
                 by_field[shear_in_field, row["trained_on"]] = row
@@ -230,10 +243,11 @@ def test_shear_is_predicted_only_if_the_field_depends_on_it():
         assert unknown["r2_Fz"]["mean"] > 0.95
 
 
-def test_forces_of_a_recording_are_described():
+def test_table_of_forces_describes_each_recording():
     rows = make_rows(True)
     line = next(line for line in limits.evaluate_shear(rows, SECTION, 2021)["forces"] if line["recording"] == "c1")
-    own = rows.target[rows.capture == "c1"][::2].astype(float)  # both readings of a press have the same force
+    # Both readings of a press have the same force, so one of them is enough.
+    own = rows.target[rows.capture == "c1"][::2].astype(float)
     assert line["presses_n"] == len(own)
     assert line["Fx"]["mean_N"] == pytest.approx(own[:, 2].mean())
     assert line["Fy"]["sd_N"] == pytest.approx(own[:, 3].std())
@@ -241,7 +255,7 @@ def test_forces_of_a_recording_are_described():
     assert line["ratio_max"] == pytest.approx((np.hypot(own[:, 2], own[:, 3]) / own[:, 4]).max())
 
 
-def test_presses_without_a_known_shear_force_are_an_error():
+def test_presses_without_a_known_shear_force_are_refused():
     rows = make_rows(True)
     target = rows.target.copy()
     target[0, 2] = np.nan
@@ -259,7 +273,7 @@ def test_presses_at_one_place_are_in_the_same_fold():
         assert not places[0] & places[1]
 
 
-# --- Detection ---
+# --- Detection of contacts ---
 
 
 @settings(deadline=None)
@@ -277,13 +291,13 @@ def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold
     assert (np.linalg.norm(just_below, axis=2)[needed_uT > 0] <= threshold_uT).all()
 
 
-def test_needed_field_change_without_noise_is_the_threshold():
+def test_needed_field_change_without_noise_equals_the_threshold():
     needed_uT = limits.needed_changes_uT(np.eye(15)[:2], np.zeros((1, 15)), 24.0)
     np.testing.assert_allclose(needed_uT, 24.0)
 
 
 @given(st.floats(0.1, 2), st.lists(st.floats(50, 2000), min_size=3, max_size=3))
-def test_power_law_is_recovered_and_inverted(exponent, factors_uT):
+def test_fitted_power_law_recovers_exponent_and_forces(exponent, factors_uT):
     place_i, force_N = np.repeat([0, 1, 2], 3), np.array([0.6, 1, 3, 0.9, 2, 4, 1.5, 2.5, 8])
     change_uT = np.array(factors_uT)[place_i] * force_N**exponent
     law = limits.fit_power_law(place_i, force_N, change_uT)
@@ -293,13 +307,13 @@ def test_power_law_is_recovered_and_inverted(exponent, factors_uT):
     np.testing.assert_allclose(law.force_N(change_uT[:, None], place_i)[:, 0], force_N)
 
 
-def test_equal_forces_have_no_power_law():
+def test_power_law_cannot_be_fitted_if_all_forces_at_a_place_are_equal():
     with pytest.raises(SchemaError, match="no place has presses with different forces"):
         limits.fit_power_law(np.array([0, 0, 1]), np.array([1.0, 1, 2]), np.array([100.0, 110, 300]))
 
 
 @given(st.lists(st.tuples(st.integers(1, 40), st.booleans()), min_size=1, max_size=30), st.sampled_from([0.5, 0.95]))
-def test_smallest_force_agrees_with_a_search(readings, fraction):
+def test_smallest_detected_force_equals_that_of_a_search(readings, fraction):
     force_N, detected = np.array([n / 4 for n, _ in readings]), np.array([found for _, found in readings])
 
     def enough(least_N: float) -> bool:
@@ -311,7 +325,10 @@ def test_smallest_force_agrees_with_a_search(readings, fraction):
 
 
 def make_recording(board: str = "b1", *, drift_uT: float = 3.0, seed: int = 3) -> Recording:
-    """Return 40 presses at 20 places with |dB| = 300 F^0.3, ten no-load readings each, and a linear drift."""
+    """Return 40 presses at 20 places with |dB| = 300 F^0.3 in uT.
+
+    Each press has ten no-load readings, and the no-load field drifts linearly.
+    """
     rng = np.random.default_rng(seed)
     presses_n = 40
     direction = rng.standard_normal((20, 15))
@@ -328,23 +345,24 @@ def make_recording(board: str = "b1", *, drift_uT: float = 3.0, seed: int = 3) -
     )  # fmt: skip
 
 
-def test_baselines_are_subtracted():
+def test_no_load_readings_of_each_policy_are_subtracted():
     recording = make_recording()
     noload_uT = recording.noload_uT.reshape(40, 10, 15)
     each = limits.changes(recording, limits.EACH)
     expected = noload_uT[1, 3] - np.delete(noload_uT[1], 3, axis=0).mean(axis=0)
-    np.testing.assert_allclose(each.setting[3], expected, atol=1e-9)  # readings of press 1 come first
+    np.testing.assert_allclose(each.setting[3], expected, atol=1e-9)  # The readings of press 1 come first.
     np.testing.assert_allclose(each.contact[4], recording.b_uT[4] - noload_uT[1].mean(axis=0), atol=1e-9)
     previous = limits.changes(recording, limits.PREVIOUS)
     np.testing.assert_allclose(previous.verifying[0], noload_uT[2, 0] - noload_uT[1].mean(axis=0), atol=1e-9)
     start = limits.changes(recording, limits.START)
     np.testing.assert_allclose(start.setting[-1], noload_uT[39, -1] - noload_uT[0].mean(axis=0), atol=1e-9)
     assert len(each.contact) == len(each.force_N) == 160
-    assert len(start.contact) == len(previous.force_N) == 156  # without the first press
+    # The first press is omitted, because it has no previous no-load reading.
+    assert len(start.contact) == len(previous.force_N) == 156
     assert len(start.setting) + len(start.verifying) == 390
 
 
-def test_live_threshold_is_that_of_the_live_code():
+def test_contact_threshold_equals_that_of_the_live_page():
     recording = make_recording(drift_uT=0)
     quiet_uT = recording.noload_uT[recording.noload_press_i == 1]
     threshold_uT = limits.live_threshold(quiet_uT - quiet_uT.mean(axis=0))
@@ -362,7 +380,7 @@ def detection() -> tuple[dict, dict]:
     return limits.evaluate_detection(recordings, SECTION)
 
 
-def test_drift_raises_the_threshold_and_the_smallest_force(detection):
+def test_older_no_load_readings_raise_the_threshold_and_the_smallest_detected_force(detection):
     numbers, _ = detection
     for board in ("b1", "b2"):
         by_rate = [row for row in numbers["rows"] if row["board"] == board and row["rule"] == limits.BY_RATE]
@@ -372,17 +390,19 @@ def test_drift_raises_the_threshold_and_the_smallest_force(detection):
             assert better["needed_uT"] < worse["needed_uT"]
             assert better["power_law_N"] < worse["power_law_N"]
         assert by_rate[0]["detected_pct"] == 100
-        assert by_rate[0]["smallest_N"] == pytest.approx(0.7, rel=0.11)  # the smallest force of all
-        # Extrapolation in proportion gives larger forces than a power law with an exponent below 1.
+        assert by_rate[0]["smallest_N"] == pytest.approx(0.7, rel=0.11)  # Even the smallest of all forces is detected.
+        # Extrapolating in proportion to the force gives larger forces than extrapolating by a power law with an
+        # exponent below 1.
         assert by_rate[0]["power_law_N"] < by_rate[0]["proportional_N"] < 0.7
         live = next(row for row in numbers["rows"] if row["board"] == board and row["rule"] == limits.BY_LIVE)
         assert live["false_alarm_pct"] == 0
-    assert [law["exponent"] for law in numbers["laws"]] == pytest.approx([EXPONENT] * 2, abs=0.02)  # noise: 4 uT
+    # The tolerance allows for noise of 4 uT.
+    assert [law["exponent"] for law in numbers["laws"]] == pytest.approx([EXPONENT] * 2, abs=0.02)
     least, most = (numbers["by_force"][i] for i in (0, -1))
     assert (least["low_N"], most["high_N"]) == (0.5, 4)
 
 
-def test_tables_and_figure_show_all_results(scores, detection):
+def test_tables_and_figure_contain_all_results(scores, detection):
     numbers, drawn = detection
     results = {
         "registration": {"rows": limits.summarise_draws(scores), "seed": 2021}, "detection": numbers,
@@ -392,9 +412,10 @@ def test_tables_and_figure_show_all_results(scores, detection):
     assert set(tables) == {f"limits_{name}" for name in "registration forces shear detection by_force law".split()}
     for table in tables.values():
         assert (table["source"] == "recorded").all()
-        assert not any("|" in str(column) for column in table.columns)  # a column separator of Markdown
+        assert not any("|" in str(column) for column in table.columns)  # The character | separates columns in Markdown.
     registration = tables["limits_registration"]
-    assert len(registration) == 3 + 2 * 2 * 4  # one regressor; two variants, with and without unlabelled presses
+    # Three rows for the regressor. Four rows for each of two variants, with and without unlabelled presses.
+    assert len(registration) == 3 + 2 * 2 * 4
     assert "20 unlabelled presses" in registration.attrs["meaning"]
     forces = tables["limits_detection"]["force by power law, N"]
     assert forces[0].endswith("(extrapolated)")
@@ -408,12 +429,16 @@ COLUMNS += [f"{name}{chip}" for chip in range(5) for name in ("T", "Bx", "By", "
 
 
 def write_capture(folder: Path, frame: Frame, board: str, force_N: float) -> None:
-    """Write a made-up recording of layout lab: one press at each place of the grid, with noise but without drift."""
+    """Write a synthetic recording in the layout `lab`, with one press at each place of the grid.
+
+    It has noise, but no drift.
+    """
     rng, place_mm = rng_for(0, board, force_N), grid()
     number = {"board1": np.array([0.5, -0.5, 0.3]), "board2": np.array([-0.5, 0.2, -0.3])}[board]
     force_N = force_N * rng.uniform(0.8, 1.2, len(place_mm))
     change_uT = poked_uT(place_mm, force_N, number).reshape(-1, 5, 3)
-    change_uT = np.einsum("kji,nkj->nki", frame.turn, change_uT)  # from the board's axes to the chips'
+    # Fields are rotated from the axes of the board to those of the chips.
+    change_uT = np.einsum("kji,nkj->nki", frame.turn, change_uT)
     lines = [",".join(COLUMNS)]
     for i, (label_mm, force) in enumerate(zip(frame.label(place_mm), force_N, strict=True)):
         for phase in ["noload"] * 3 + ["contact"] * 2:
@@ -428,7 +453,7 @@ def write_capture(folder: Path, frame: Frame, board: str, force_N: float) -> Non
     (folder / HEADER_FILE).write_text(render(header))
 
 
-def test_stage_runs_on_two_synthetic_boards(tmp_path, monkeypatch):
+def test_whole_stage_runs_on_two_synthetic_boards(tmp_path, monkeypatch):
     settings = read_settings("lab", ROOT)
     content = {name: settings.of_scene[name] for name in ("seed", "selection", "compare", "recorded_limits")}
     changed = {"draws_n": 2, "presses_n": 12, "methods": "tiny", "false_alarm_fraction": 0.01}
@@ -447,7 +472,8 @@ def test_stage_runs_on_two_synthetic_boards(tmp_path, monkeypatch):
     variant = make_variant()
     variants = Variants(variant, {"board1": variant, "board2": variant})
     monkeypatch.setattr(limits, "read_variants", lambda known, models: variants)
-    middle = [lambda db_uT: np.full((len(db_uT), 3), 8, np.float32)]  # "networks" that always predict the middle
+    # These "networks" always predict the middle of the skin.
+    middle = [lambda db_uT: np.full((len(db_uT), 3), 8, np.float32)]
     monkeypatch.setattr(limits, "networks_held_out", lambda networks, board: middle)
     limits.recorded_limits(
         settings, settings.section(RecordedLimits, "recorded_limits"), tmp_path / "indentations", tmp_path / "raw",
@@ -459,10 +485,11 @@ def test_stage_runs_on_two_synthetic_boards(tmp_path, monkeypatch):
     assert limits.figures(numbers, results["drawn"], "recorded")["recorded_limits.svg"].startswith("<?xml")
     registration = {(row["method"], row["presses_n"], row["known"]): row for row in numbers["registration"]["rows"]}
     constant = registration[limits.NETWORK, 0, limits.UNCHANGED]
-    assert constant["accuracy_pct"]["mean"] < 5  # only presses in the middle
+    assert constant["accuracy_pct"]["mean"] < 5  # A constant prediction is right only for presses in the middle.
     labelled = registration["universal, simulated alone", 12, limits.LABELS]
-    assert labelled["accuracy_pct"]["mean"] > 90  # the made-up skins follow the formula of the map
+    assert labelled["accuracy_pct"]["mean"] > 90  # The synthetic skins follow the formula of the map.
     (each, *_) = [row for row in numbers["detection"]["rows"] if row["board"] == "board2"]
     assert each["detected_pct"] == 100
     forces = {line["recording"]: line for line in numbers["shear"]["forces"]}
-    assert forces["board1_4N"]["Fx"]["mean_N"] == pytest.approx(-0.8, abs=1e-3)  # -0.1 N per mm, mean of x: 8 mm
+    # The force along x falls by 0.1 N per mm, and the mean of x is 8 mm.
+    assert forces["board1_4N"]["Fx"]["mean_N"] == pytest.approx(-0.8, abs=1e-3)

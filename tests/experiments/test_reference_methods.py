@@ -1,4 +1,7 @@
-"""Tests of the reference methods: paired presses, foreign boards, controls (closed forms), and tables."""
+"""Tests of the reference methods, with which the universal model is compared.
+
+Tested are pairs of presses on two boards, readings of foreign boards, controls (against closed forms), and tables.
+"""
 
 from typing import Any
 
@@ -50,7 +53,10 @@ def old_uT(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
 
 
 def make_rows() -> Rows:
-    """Return rows of two boards with the same pokes, two readings each; `MAP` converts fields of b1 to those of b0."""
+    """Return rows of two boards with the same presses, and two readings each.
+
+    The matrix `MAP` converts fields of board b1 to those of board b0.
+    """
     place_mm = np.tile(np.repeat(PLACES_MM, 2, axis=0), (2, 1))
     force_N = np.tile(FORCES_N, 10)
     board = np.repeat(["b0", "b1"], 10)
@@ -70,11 +76,11 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), make_ro
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_paired_presses_have_the_same_place_and_force():
+def test_presses_are_paired_with_those_of_equal_place_and_force_on_the_known_board():
     rows = make_rows()
-    rows.target[20:22, 2] = 2.0  # a force between the two forces of b0
-    rows.target[22:24, 2] = 9.0  # a force above the largest force of b0
-    rows.target[24:26, :2] = 50.0  # a place that b0 does not have
+    rows.target[20:22, 2] = 2.0  # This force is between the two forces of board b0.
+    rows.target[22:24, 2] = 9.0  # This force is above the largest force of board b0.
+    rows.target[24:26, :2] = 50.0  # Board b0 has no press at this place.
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
     np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)
@@ -82,15 +88,16 @@ def test_paired_presses_have_the_same_place_and_force():
     np.testing.assert_allclose(found[3], rows.db_uT[6], rtol=1e-5)
 
 
-def test_map_from_many_pairs_recovers_fields_of_the_known_board():
+def test_linear_map_fitted_to_pairs_recovers_fields_of_the_known_board():
     back_uT = standardised_uT(DATA, FOLD, pool_rows(DATA, FOLD))
-    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the ridge penalty is above 0
+    # The tolerance is due to the ridge penalty, which is above 0.
+    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="no labelled poke is within"):
         standardised_uT(DATA, nowhere, pool_rows(DATA, nowhere))
 
 
-def test_collapsed_network_is_retrained(monkeypatch):
+def test_network_that_collapsed_is_trained_again(monkeypatch):
     good = draw_weights(paper_layers(15), rng_for(0, "good"))
     known = rng_for(0, "known").normal(size=(20, 15)).astype(np.float32)
     target = Predictor(good, "paper", "cpu")(known)
@@ -102,13 +109,13 @@ def test_collapsed_network_is_retrained(monkeypatch):
     assert record == {"collapsed": False, "collapsed_before_n": 1}
 
 
-def test_control_is_calibrated_with_pokes_of_the_next_board():
+def test_control_is_calibrated_with_presses_of_another_board():
     names = "b0-draw0", "b0-draw1", "b1-draw0", "b1-draw1"
     folds = [fold(name, range(1), range(1), range(1)) for name in names]
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_changes_of_a_board_turn_its_fields_and_keep_their_length():
+def test_changes_that_make_a_board_foreign_keep_the_length_of_fields():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
@@ -124,18 +131,20 @@ def test_readings_above_the_limit_of_their_board_are_flagged():
     foreign = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
     found = alarm_statistics(foreign, right, {"b0": 0.35, "b1": 0.15})
     assert found["alarm_pct"]["mean"] == pytest.approx((100 + 50) / 2)
-    assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # equal scores count half
+    # The ROC area counts equal scores as one half.
+    assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)
     assert found["left_median"]["mean"] == pytest.approx((0.9 + 0.5) / 2)
     assert alarm_statistics(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
 
 
-def test_flagged_readings_are_scored_by_board():
+def test_accuracy_of_flagged_and_other_readings_is_averaged_over_boards():
     value = {"b0": np.array([0.0, 1.0, 2.0, 9.0]), "b1": np.array([0.0, 1.0, 2.0, 3.0])}
     off_mm = {board: np.array([[0.0, 0.5], [0.5, 0.0], [0.0, 0.5], [2.0, 0.0]]) for board in value}
     assert limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
     found = score_flagged(value, off_mm, 0.0)
     assert found["flagged_pct"]["mean"] == pytest.approx((25 + 0) / 2)
-    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # no reading of b1 is flagged
+    # No reading of board b1 is flagged, so only one board has this score.
+    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}
     assert found["mse_xy_mm2_flagged"]["mean"] == pytest.approx(2.0)
     assert found["accuracy_pct_others"]["mean"] == pytest.approx((100 + 75) / 2)
     assert found["mse_xy_mm2_others"]["n"] == 2
@@ -167,7 +176,7 @@ def numbers() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_control_is_paired_by_board():
+def test_difference_from_the_control_is_paired_by_board():
     rows = {(row["method"], row["pokes"]): row for row in numbers()["methods"]}
     over = rows[INVERSION, FOREIGN]["over"]
     assert over["by_board"]["b0"]["accuracy_pct"] == pytest.approx(-50.0)
@@ -176,13 +185,14 @@ def test_control_is_paired_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_tables_list_gains_reasons_and_sources():
+def test_tables_list_gains_omitted_methods_and_sources():
     tables_by_name = tables(numbers(), "recorded")
     assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
     assert tables_by_name["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
     assert tables_by_name["rivals"]["paired, accuracy, points"][1].startswith("+25")
     assert tables_by_name["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
     assert tables_by_name["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
-    assert tables_by_name["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]  # no reading was flagged
+    # No reading was flagged, so there is no error of flagged readings.
+    assert tables_by_name["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]
     assert tables_by_name["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
     assert all(set(table["source"]) == {"recorded"} for table in tables_by_name.values())

@@ -1,4 +1,8 @@
-"""Tests of experiment runtime (error against run time): quadratures and integrators, compared with closed forms."""
+"""Tests of experiment runtime, which compares errors and run times of numerical methods.
+
+These are quadratures (over the nodes of a skin) and integrators (of the relaxation over time). References are closed
+forms.
+"""
 
 from dataclasses import replace
 from itertools import accumulate
@@ -93,13 +97,13 @@ def test_skin_built_with_a_quadrature_equals_the_simulated_skin():
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
     np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)
-    # without spreads, all amplitude factors are 1
+    # Without spreads, all factors of the amplitude are 1.
     np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)
     assert (ours.seat_m == drawn.seat_m).all()
     assert ours.depth_zero_m == drawn.depth_zero_m
 
 
-def test_pokes_are_placed_relative_to_the_magnet_pattern():
+def test_places_of_pokes_are_relative_to_the_pattern_of_magnets():
     one = trial(skin_seat_mm=1.0)
     assert np.abs(one.skin.seat_m).min() > 0
     places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
@@ -107,13 +111,14 @@ def test_pokes_are_placed_relative_to_the_magnet_pattern():
     np.testing.assert_allclose(1e3 * one.pokes_m[:, 2], [0.6, 0.6, 1.2, 1.2])
 
 
-def test_poke_without_contact_is_an_error():
+def test_poke_that_does_not_touch_the_skin_is_refused():
     with pytest.raises(ParamsError, match="skin s0: true depth of every poke must be above 0 m"):
         trial(pokes=Indentations.model_construct(places_mm=((0.0, 0.0),), depths_mm=(0.0,)), skin_depth_zero_mm=0.0)
 
 
 @pytest.mark.parametrize(("cell_mm", "layers_n"), [(0.5, 4), (3.0, 1)])
-def test_midpoint_error_is_quadratic_in_the_box_size(cell_mm, layers_n):
+def test_error_of_the_midpoint_rule_is_quadratic_in_the_box_size(cell_mm, layers_n):
+    """The integral of x^2 over the skin is known. The midpoint rule misses it by the fraction 1 / n^2 for n boxes."""
     rest = midpoints(2e-3, Quadrature(1e-3 * cell_mm, layers_n))
     volume_m3, boxes_n = SKIN_SIDE_M**2 * 2e-3, np.ceil(1e3 * SKIN_SIDE_M / cell_mm)
     assert rest.volumes_m3.sum() == pytest.approx(volume_m3, rel=1e-12)
@@ -123,7 +128,7 @@ def test_midpoint_error_is_quadratic_in_the_box_size(cell_mm, layers_n):
         assert mean_m2 == pytest.approx(size_m**2 / 12 * (1 - 1 / parts_n**2), rel=1e-9, abs=1e-18)
 
 
-def test_boxes_fill_the_volume_of_the_lattice():
+def test_boxes_around_midpoints_fill_the_skin_without_gaps():
     rule = Quadrature(0.7e-3, 5)
     rest, sides_m = midpoints(2e-3, rule), box_m(2e-3, rule)
     for places_m, side_m in zip(rest.nodes_m.T, sides_m, strict=True):
@@ -131,9 +136,9 @@ def test_boxes_fill_the_volume_of_the_lattice():
     np.testing.assert_allclose(rest.volumes_m3, np.prod(sides_m))
 
 
-def test_lifted_box_equals_charged_faces(monkeypatch):
-    # The skin is a single box, for which the dipole approximation would be wrong. The box is between equal poles, so
-    # its magnetisation is along z.
+def test_field_change_of_a_lifted_box_equals_that_of_its_charged_faces(monkeypatch):
+    # The skin is a single box, for which the dipole approximation would be wrong. It was magnetised between equal
+    # poles, so its magnetisation is along z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -165,7 +170,7 @@ def test_gauss_nodes_integrate_polynomials_exactly():
         assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
 
 
-def test_path_of_material_follows_the_flow():
+def test_tabulated_path_of_material_equals_the_computed_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
     path, poke_m, material = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
@@ -179,17 +184,17 @@ def test_path_of_material_follows_the_flow():
     followed = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
     outward_m = (path.nodes_m[3, material, :2] - poke_m[:2]) * away_m / r_m[:, None]
     assert np.abs(followed.r_m - r_m).max() > 20e-6
-    # 2 um: error of the spline between the nodes of the flow, while the material moves by up to 1 mm
+    # The tolerance of 2 um is the error of the spline between the nodes of the flow, while the material moves by up to
+    # 1 mm.
     np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
     np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
-    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[
-        :, :2
-    ]  # components of the rotation from z towards r
+    # The horizontal components of the rotation from z towards r.
+    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 
 
-def test_error_is_the_largest_error_of_any_skin():
+def test_error_of_a_rule_is_the_largest_over_skins_and_depths():
     trials = [trial(), trial(name="s1")]
     truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
     factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]
@@ -202,15 +207,16 @@ def test_error_is_the_largest_error_of_any_skin():
     }
 
 
-def test_midpoint_layers_have_the_specified_error(quadratures):
+def test_error_of_the_midpoint_rule_is_within_the_specified_range(quadratures):
     rows, _ = quadratures
-    # The error is 9-74 % with boxes of 0.5 mm in 4 layers, and about 1 % with six Gauss nodes.
+    # The specified error is 9 to 74 % with boxes of 0.5 mm in 4 layers, and about 1 % with six Gauss nodes over the
+    # height.
     assert 0.09 < error_of(rows, "midpoint", 0.5, 4) < 0.74
     assert error_of(rows, "Gauss in z", 0.5, 6) < 0.02
     assert error_of(rows, "midpoint", 0.5, 8) > 2 * error_of(rows, "Gauss in z", 0.5, 4)
 
 
-def test_refinement_reduces_the_error(quadratures):
+def test_finer_quadratures_have_smaller_errors(quadratures):
     rows, _ = quadratures
     widths = [error_of(rows, "Gauss in z", cell_mm, 6) for cell_mm in (2, 1, 0.5)]
     assert widths[0] > 2 * widths[1] > 4 * widths[2]
@@ -220,25 +226,27 @@ def test_refinement_reduces_the_error(quadratures):
     assert error_of(rows, "magpylib cuboids", 2, 2) > error_of(rows, "magpylib cuboids", 1, 4)
 
 
-def test_reference_is_ten_times_better_than_the_limit(quadratures):
+def test_error_of_the_reference_is_a_tenth_of_the_error_limit(quadratures):
     rows, _ = quadratures
     assert rows[0].method == REFERENCE
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
 
 
-def test_fields_of_magpylib_and_of_the_kernel_are_equal(quadratures):
+def test_fields_of_magpylib_equal_those_of_our_kernel(quadratures):
     _, calls = quadratures
     calls = {one.key[1]: one.call for one in calls if one.key[2] == rule_name(COARSE)}
     kernel_T = calls["kernel alone"]()
     for name in ("magpylib.core dipoles", "magpylib dipoles"):
-        # The field changes of magpylib are differences of two sums, and magpylib uses mu_0 of another CODATA year.
+        # Tolerance: magpylib's field changes are differences of two sums, and magpylib uses the value of mu_0 of
+        # another CODATA year.
         np.testing.assert_allclose(calls[name](), kernel_T, atol=1e-7 * np.abs(kernel_T).max())
 
 
-def test_field_by_flow_equals_field_by_paths():
+def test_field_computed_by_the_flow_equals_that_computed_by_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
-    # 0.5 %: both methods interpolate, between different nodes. Without the rotation, the error would exceed dB.
+    # The tolerance is 0.5 %, because the two methods interpolate between different nodes. If moments were not rotated,
+    # the error would be larger than dB itself.
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 
@@ -247,11 +255,12 @@ def test_field_of_distant_boxes_equals_that_of_dipoles():
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
     dipoles_T = prepare(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
-    # 1 %: (cell / distance)^2 is 0.2 %, and the two flows are interpolated between different nodes.
+    # The tolerance is 1 %: the dipole approximation of boxes has an error of (cell / distance)^2 = 0.2 %, and the two
+    # flows are interpolated between different nodes.
     assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
 
 
-def test_each_rule_is_timed_in_one_row(quadratures):
+def test_each_rule_has_one_row_and_is_timed_once(quadratures):
     rows, calls = quadratures
     expected = {(method, rule_name(rule)) for method, rules_of_method in TRIED.items() for rule in rules_of_method}
     assert {(row.method, row.setting) for row in rows[1:]} == expected
@@ -276,11 +285,11 @@ ROWS = [
     row(CANDIDATES, 1, 4, 1936, 0.08),
     BETTER,
     GOOD,
-    row("midpoint", 2, 9, 900, 0.001),  # not a candidate: a midpoint rule
+    row("midpoint", 2, 9, 900, 0.001),  # A midpoint rule is not a candidate.
 ]
 
 
-def test_cheapest_rule_below_the_limit_is_chosen():
+def test_cheapest_rule_with_an_error_below_the_limit_is_chosen():
     choice = choose(ROWS, used=DEFAULT_QUADRATURE)
     assert (choice.setting, choice.nodes_n, choice.error) == ("0.5 mm x 5", 8820, 0.015)
     assert (choice.used_setting, choice.used_nodes_n, choice.used_error) == ("0.5 mm x 6", 10584, 0.004)
@@ -288,13 +297,13 @@ def test_cheapest_rule_below_the_limit_is_chosen():
     assert not choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.01).differs
 
 
-def test_no_rule_is_chosen_above_the_limit():
+def test_no_rule_is_chosen_if_all_errors_are_above_the_limit():
     choice = choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.001)
     assert choice.setting is None
     assert choice.differs
 
 
-def test_rule_in_use_that_was_not_tried_has_no_error():
+def test_rule_in_use_has_no_error_if_it_was_not_tried():
     assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
 
 
@@ -303,7 +312,7 @@ def test_rule_in_use_that_was_not_tried_has_no_error():
     st.floats(0, 1),
     st.floats(0, 1),
 )
-def test_looser_error_limit_never_chooses_a_slower_rule(points, strict, extra):
+def test_larger_error_limit_never_leads_to_a_slower_rule(points, strict, extra):
     rows = [row(CANDIDATES, i, 1, nodes_n, error) for i, (nodes_n, error) in enumerate(points)]
     strictly, loosely = (choose(rows, used=DEFAULT_QUADRATURE, error_max=most) for most in (strict, strict + extra))
     if strictly.nodes_n is not None:
@@ -311,15 +320,16 @@ def test_looser_error_limit_never_chooses_a_slower_rule(points, strict, extra):
         assert loosely.nodes_n <= strictly.nodes_n
 
 
-def test_timing_alternates_the_order_of_methods():
+def test_methods_are_timed_in_alternating_order():
     ran = []
     calls = [TimedCall(("study", name, ""), lambda name=name: ran.append(name), 1) for name in "abc"]
     assert [one.method for one in time_calls(calls, 3)] == ["a", "b", "c"]
     assert "".join(ran) == "abc" + "cba" + "abc"
 
 
-def test_times_are_medians_per_indentation(monkeypatch):
-    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # clock readings before and after each of three calls
+def test_times_are_medians_divided_by_the_number_of_indentations(monkeypatch):
+    # Readings of the clock before and after each of three calls.
+    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)
     assert slow.key == ("study", "naps", "x")
@@ -327,7 +337,7 @@ def test_times_are_medians_per_indentation(monkeypatch):
     assert slow.repeats_n == 3
 
 
-def test_timing_without_rounds_is_an_error():
+def test_timing_with_zero_rounds_is_refused():
     with pytest.raises(ParamsError, match="repeats_n must be 1 or more"):
         time_calls([], 0)
 
@@ -350,20 +360,20 @@ def select(rows, ratio, method) -> list[Precision]:
     return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
-def test_skin_has_a_stiffness_ratio_of_1e7():
+def test_relaxation_times_of_the_skin_have_a_ratio_of_1e7():
     np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_stiffness_is_the_ratio_of_relaxation_times(ratio):
+def test_stiffness_ratio_is_the_ratio_of_the_longest_and_shortest_relaxation_time(ratio):
     prony = runtime.stiff(ratio)
     assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
     assert prony.tau_s.max() == SKIN_RELAXATION.tau_s.max()
     assert (prony.share == SKIN_RELAXATION.share).all()
 
 
-def test_exact_force_equals_a_convolution():
-    # Reference: the convolution integral of Lee & Radok (1960), by adaptive quadrature.
+def test_exact_force_equals_a_convolution_integral():
+    # Reference: the convolution of the force with the relaxation function (Lee & Radok, 1960), by adaptive quadrature.
     prony, (time_s, elastic) = runtime.stiff(1e5), repeated_presses(2)
     speeds = np.diff(elastic) / np.diff(time_s)
 
@@ -386,13 +396,13 @@ def test_twenty_simulated_pokes_last_thirty_seconds():
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_exact_update_has_no_error_at_any_stiffness(relaxations, ratio):
+def test_exact_update_has_only_rounding_errors_at_any_stiffness(relaxations, ratio):
     (exact,) = select(relaxations[0], ratio, EXACT)
     assert exact.error < 1e-14
     assert exact.work_n == 0
 
 
-def test_every_method_has_a_row_per_stiffness_and_setting(relaxations):
+def test_every_integrator_has_a_row_per_stiffness_and_setting(relaxations):
     rows, calls = relaxations
     expected = [(EXACT, 1), *((name, 2) for name in SOLVERS), (EULER, 2)]
     for ratio in RATIOS:
@@ -404,21 +414,22 @@ def test_every_method_has_a_row_per_stiffness_and_setting(relaxations):
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_smaller_tolerance_costs_calls_and_reduces_the_error(relaxations, method):
-    for ratio in RATIOS[1:5]:  # excludes 1e3, at which even the loose tolerance reaches rounding error
+def test_smaller_tolerance_needs_more_calls_and_reduces_the_error(relaxations, method):
+    # The ratio 1e3 is excluded, because the loose tolerance already reaches the rounding error there.
+    for ratio in RATIOS[1:5]:
         loose, tight = select(relaxations[0], ratio, method)
         assert tight.error < loose.error
         assert tight.work_n > loose.work_n
 
 
-def test_euler_is_of_first_order(relaxations):
-    # Tolerance 20 %: the term of second order.
+def test_euler_method_converges_with_first_order(relaxations):
+    # The tolerance of 20 % allows for the term of second order.
     wide, narrow = select(relaxations[0], 1e3, EULER)
     assert wide.error / narrow.error == pytest.approx(10, rel=0.2)
 
 
 @pytest.mark.parametrize(("step_over_fastest", "stable"), [(1.9, True), (2.1, False)])
-def test_euler_diverges_above_the_stability_limit(step_over_fastest, stable):
+def test_euler_method_diverges_if_steps_exceed_twice_the_shortest_relaxation_time(step_over_fastest, stable):
     sweep = settings(ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
     rows, calls = study_integrators(sweep)
     (euler,) = select(rows, 1e7, EULER)
@@ -430,24 +441,24 @@ def test_euler_diverges_above_the_stability_limit(step_over_fastest, stable):
         assert euler.key not in {one.key for one in calls}
 
 
-def test_euler_overflow_is_reported_as_divergence(relaxations):
+def test_overflow_of_the_euler_method_is_reported_as_divergence(relaxations):
     assert select(relaxations[0], 1e8, EULER)[0].failure.startswith("diverged")
 
 
 @pytest.mark.parametrize("method", [*SOLVERS, EULER])
-def test_long_running_solver_is_stopped(method):
+def test_solver_that_needs_too_many_calls_is_stopped(method):
     rows, _ = study_integrators(settings(ratios=(1e6,), calls_per_poke_max_n=20))
     for stopped in select(rows, 1e6, method):
         assert (stopped.error, stopped.work_n) == (None, 20)
         assert stopped.failure == "stopped after 20 right-hand sides"
 
 
-def test_only_explicit_solvers_are_stopped(relaxations):
+def test_at_high_stiffness_only_the_explicit_solver_is_stopped(relaxations):
     failed = {name for name in SOLVERS for one in select(relaxations[0], 1e8, name) if one.failure}
     assert failed == {"RK45"}
 
 
-def test_solver_failure_is_reported(monkeypatch):
+def test_message_of_a_failed_solver_is_reported(monkeypatch):
     class Failed:
         success, message = False, "Required step size is less than spacing between numbers."
 
@@ -456,8 +467,8 @@ def test_solver_failure_is_reported(monkeypatch):
     assert {one.failure for one in select(rows, 1e7, "BDF")} == {Failed.message}
 
 
-def test_error_hardly_depends_on_the_number_of_pokes():
-    # The tolerance is a factor of two, which suffices because the errors of the methods span ten decades.
+def test_errors_of_integrators_hardly_depend_on_the_number_of_pokes():
+    # The tolerance is a factor of two. This is strict enough, because the errors of the methods span ten powers of ten.
     once, thrice = (
         study_integrators(settings(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
     )
@@ -467,6 +478,6 @@ def test_error_hardly_depends_on_the_number_of_pokes():
             assert 0.8 < other.work_n / one.work_n / 3 < 1.25
 
 
-def test_relaxation_sweep_is_reproducible(relaxations):
+def test_study_of_integrators_is_reproducible(relaxations):
     again, study = study_integrators(settings(ratios=(1e6,)))[0], runtime.study_name(1e6)
     assert again == [row for row in relaxations[0] if row.study == study]

@@ -1,4 +1,7 @@
-"""Tests of experiment sensitivity (smallest resolved weight) against loops, the normal distribution and SciPy."""
+"""Tests of experiment sensitivity, which finds the smallest weight whose addition the readings show.
+
+References are loops, the normal distribution and SciPy.
+"""
 
 from itertools import pairwise
 
@@ -28,7 +31,10 @@ ALONG = np.array([0.6, 0.0, -0.8])
 
 
 def fillings(fillings_n=40, readings_n=5, noise_uT=NOISE_uT, name="glass"):
-    """Return readings [filling, level, reading, channel] of a linear skin under a glass that is filled in steps."""
+    """Return readings [filling, level, reading, channel] under a glass that is filled in steps.
+
+    The field of the skin is linear in the weight.
+    """
     noise = noise_uT * rng_for(0, name).standard_normal((fillings_n, len(WEIGHT_N), readings_n, 3))
     return (GAIN_uT_PER_N * WEIGHT_N[:, None, None] * ALONG + noise).astype(np.float32)
 
@@ -49,47 +55,50 @@ def test_fractions_of_correctly_ordered_pairs_equal_a_loop():
 def test_fractions_of_correctly_ordered_pairs_follow_the_normal_distribution():
     shares = analyse_levels(fillings(), WEIGHT_N)[1]["by_direction"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
-    # sampling error of 12,500 dependent pairs
+    # The tolerance is the sampling error of 12,500 pairs, which are not independent.
     np.testing.assert_allclose(shares["one_reading"][:3], norm.cdf(z), atol=0.015)
-    # sampling error of 500 pairs
+    # The tolerance is the sampling error of 500 pairs.
     np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)
 
 
 def test_gain_and_noise_are_recovered():
     numbers, figure_data = analyse_levels(fillings(), WEIGHT_N)
-    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # 0.5 uT in 150 uT
-    assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: standard error of 1.6 %
-    # The smallest resolved weight is 1.645 sqrt(2) noise / gain, rounded up to the next level.
+    # The tolerance is about three standard errors: 0.5 uT in 150 uT.
+    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)
+    # The noise has 2080 degrees of freedom, so its standard error is 1.6 %.
+    assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)
+    # The smallest resolved step of weight is 1.645 sqrt(2) noise / gain, rounded up to a whole number of levels.
     assert numbers["smallest_step_N"]["one_reading"] == pytest.approx(0.04)
     assert numbers["smallest_step_N"]["five_readings"] == pytest.approx(0.02)
-    assert numbers["smallest_step_mL"]["five_readings"] == pytest.approx(
-        2.04, abs=0.01
-    )  # 0.02 N / 9.81 m/s^2 is 2.04 g
+    # A weight of 0.02 N is 2.04 g of water, because 0.02 N / 9.81 m/s^2 = 2.04 g.
+    assert numbers["smallest_step_mL"]["five_readings"] == pytest.approx(2.04, abs=0.01)
     assert len(figure_data["response_uT"]) == numbers["levels_n"] == 26
 
 
-def test_direction_is_fitted_to_the_first_half_of_fillings():
+def test_direction_of_the_response_is_fitted_to_the_first_half_of_fillings():
     uT = fillings(noise_uT=0.0)
-    np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # rounding to float32
+    # The tolerance is rounding to single precision.
+    np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)
     swapped_uT = uT.copy()
-    swapped_uT[20:] = swapped_uT[20:, :, :, [1, 0, 2]]  # in the second half, the field changes in another direction
+    # In the second half of the fillings, the field changes in another direction.
+    swapped_uT[20:] = swapped_uT[20:, :, :, [1, 0, 2]]
     assert analyse_levels(swapped_uT, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
 @given(st.floats(0.1, 10.0))
-def test_fractions_do_not_depend_on_the_scale_of_fields(factor):
+def test_smallest_resolved_step_does_not_depend_on_the_scale_of_fields(factor):
     uT = fillings(4)
     one, other = (analyse_levels((scale * uT).astype(np.float32), WEIGHT_N)[0] for scale in (1.0, factor))
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
-def test_smallest_resolved_step_follows_the_last_unresolved_one():
+def test_all_steps_from_the_smallest_resolved_one_on_are_resolved():
     assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
     assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
     assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
 
 
-def test_skin_without_signal_resolves_no_step():
+def test_with_large_noise_no_step_is_resolved():
     numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
@@ -97,7 +106,10 @@ def test_skin_without_signal_resolves_no_step():
 
 
 def two_fillings(values, spread):
-    """Return two fillings with mean field `values` at levels 0.1 N apart; the rises of the two differ by `spread`."""
+    """Return two fillings, whose mean field is `values` at levels 0.1 N apart.
+
+    From one level to the next, the rises of the two fillings differ by `spread`.
+    """
     wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
     return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
 
@@ -106,10 +118,10 @@ def two_fillings(values, spread):
     st.lists(st.integers(-5, 5), min_size=4, max_size=20).filter(lambda values: values[-1] > values[0]),
     st.floats(0.1, 5.0),
 )
-def test_falls_and_rank_correlation(values, spread):
+def test_number_of_falls_and_rank_correlation_equal_loops_and_scipy(values, spread):
     found = monotonic(*two_fillings(np.array(values, float), spread))
-    gain = linregress(np.arange(len(values)), values).slope  # uT per level
-    noise = spread / np.sqrt(2)  # standard deviation of two values that differ by `spread`
+    gain = linregress(np.arange(len(values)), values).slope  # The gain is in uT per level.
+    noise = spread / np.sqrt(2)  # This is the standard deviation of two values that differ by `spread`.
     steps_n = int(np.ceil(1.6448536 * noise / gain)) if gain > 0 else len(values)
     if steps_n < len(values):
         pairs = list(zip(values, values[steps_n:], strict=False))
@@ -123,39 +135,41 @@ def test_falls_and_rank_correlation(values, spread):
     assert found["spearman"] == pytest.approx(spearmanr(np.arange(len(values)), values).statistic)
 
 
-def test_monotonicity_does_not_depend_on_the_step_of_filling():
-    fine_N = 0.002 * np.arange(251)  # the range of WEIGHT_N, with steps a tenth as large
+def test_verdict_on_monotonicity_does_not_depend_on_the_size_of_filling_steps():
+    fine_N = 0.002 * np.arange(251)  # The same range of weights as WEIGHT_N, with steps a tenth as large.
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
     found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
-    # the mean rise per level is 0.6 uT; its noise is 5 sqrt(2 / 100) = 0.7 uT
+    # With the small steps, the mean rise per level is 0.6 uT, and its noise is 5 sqrt(2 / 100) = 0.7 uT. Some falls
+    # between neighbouring levels are therefore due to noise.
     assert found["neighbours"]["falls_n"] > 0
     assert found["holds"]
     assert coarse["holds"]
     assert found["step_N"] <= coarse["step_N"] == pytest.approx(0.02)
 
 
-def test_significant_fall_is_not_monotonic():
+def test_response_with_a_significant_fall_is_not_monotonic():
     uT = fillings()
-    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # the field drops by half at level 13
+    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # The field drops by half at level 13.
     assert not analyse_levels(uT, WEIGHT_N)[0]["monotonic"]["holds"]
 
 
-def test_expected_number_of_falls_by_noise():
+def test_number_of_falls_caused_by_noise_equals_the_expected_number():
     rng = rng_for(0, "falls")
     rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
     response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
     found = monotonic(response_uT, 0.01 * np.arange(2001))["neighbours"]
-    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # expected: 576 falls
-    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)  # the noise is estimated to 1 %
+    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # This is 576 falls.
+    # The tolerance allows for the estimate of the noise, which has an error of 1 %.
+    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)
     assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 
 
 def test_readings_are_sorted_by_filling_and_weight():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
-    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # two fillings, mixed
+    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # Two fillings, whose levels are mixed.
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
@@ -174,30 +188,30 @@ def glass(noise_uT):
     return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
 
 
-def test_finest_tried_step_is_an_upper_limit():
+def test_if_even_the_finest_step_is_resolved_it_is_an_upper_limit():
     table = tables(glass(0.0)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "at most 0.1"
-    assert table["ours"][1] == "at most 10"  # 0.1 N is 10.2 mL
+    assert table["ours"][1] == "at most 10"  # A weight of 0.1 N is 10.2 mL of water.
     assert set(table["source"]) == {"simulated"}
     assert table["paper"][0] == "< 0.2"
 
 
-def test_unresolved_steps_are_stated():
+def test_table_states_that_no_step_is_resolved():
     table = tables(glass(1e3)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "none up to 1"
     assert table["ours"][1] == "none"
     assert "undecided: no step is above the noise" in table.set_index("what")["ours"][RISES]
 
 
-def test_monotonicity_is_judged_at_a_stated_step():
+def test_table_states_the_step_at_which_monotonicity_is_judged():
     table = tables(glass(0.0)[0], "simulated")["sensitivity"]
     found = table.set_index("what")["ours"]
     assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this one: 10 of 10 pairs 0.1 N apart")
-    assert found["falls from level to level, 0.1 N apart"] == "0 of 10"  # no noise, no error
+    assert found["falls from level to level, 0.1 N apart"] == "0 of 10"  # Without noise, there are no falls.
     assert "at least 95 % of the pairs" in table.attrs["meaning"]
 
 
-def test_figure_has_its_source_and_is_reproducible():
+def test_figure_names_its_source_and_is_reproducible():
     numbers, figure_data = glass(0.0)
     figure = figures(numbers, figure_data, "simulated")["sensitivity.svg"]
     assert "(simulated)" in figure

@@ -1,4 +1,7 @@
-"""Tests of experiment sleeve (a large skin over several boards): held-out indentations, borders, rate, scores, map."""
+"""Tests of experiment sleeve, in which one large skin covers several boards.
+
+Tested are held-out indentations, borders between boards, the frame rate, scores and the map of errors.
+"""
 
 import re
 from xml.etree import ElementTree
@@ -33,7 +36,10 @@ SIDES_MM = np.array(AREA.sides_mm)
 
 
 def rows_of(*pokes_n, readings_n=3):
-    """Return rows of captures c0, c1, ...; arguments are the numbers of indentations of the captures."""
+    """Return rows of captures c0, c1, and so on.
+
+    The arguments are the numbers of indentations of these captures.
+    """
     capture = np.repeat([f"c{i}" for i in range(len(pokes_n))], [readings_n * n for n in pokes_n])
     f = len(capture)
     empty, who = np.zeros((f, 3), np.float32), np.array(["b0"] * f)
@@ -42,7 +48,7 @@ def rows_of(*pokes_n, readings_n=3):
 
 
 def predictions(seed=0, n=60, wrong_mm=1.0):
-    """Return true values, predictions (x, y, F) and indentation numbers of n indentations with three readings each."""
+    """Return true values (x, y, F), predictions, and the numbers of `n` indentations with three readings each."""
     rng = rng_for(seed, "answers")
     true = np.repeat(np.column_stack([rng.uniform((4, 4), SIDES_MM - 4, (n, 2)), rng.uniform(0, 3, n)]), 3, axis=0)
     return true, true + wrong_mm * rng.standard_normal(true.shape), np.repeat(np.arange(n), 3)
@@ -59,10 +65,10 @@ def readings_of(t_s, indentation, reading_i):
     )  # fmt: skip
 
 
-def test_borders_of_two_rows_of_four_boards():
+def test_borders_and_chips_of_two_by_four_boards_are_at_the_designed_places():
     assert AREA.borders_mm[0] == pytest.approx((25.4,))
     assert AREA.borders_mm[1] == pytest.approx((25.4, 50.8, 76.2))
-    # the centre chip and the right chip of board 0
+    # These are the centre chip and the right chip of board 0.
     np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])
     np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
 
@@ -72,13 +78,13 @@ def test_single_board_has_no_border():
 
 
 @given(st.floats(0, 50.8), st.floats(0, 101.6))
-def test_border_band_equals_distance_to_any_border(x_mm, y_mm):
+def test_place_is_near_a_border_if_any_border_is_near(x_mm, y_mm):
     to_border_mm = min(abs(x_mm - 25.4), *(abs(y_mm - border_mm) for border_mm in AREA.borders_mm[1]))
     assert AREA.near_border(np.array([[x_mm, y_mm]]))[0] == (to_border_mm < NEAR_MM)
 
 
 @given(st.lists(st.integers(6, 40), min_size=1, max_size=3), st.floats(0.1, 0.9))
-def test_last_indentations_are_held_out(pokes_n, test_fraction):
+def test_last_indentations_of_each_capture_are_held_out(pokes_n, test_fraction):
     rows = rows_of(*pokes_n)
     train, test = hold_out_last(rows, test_fraction)
     np.testing.assert_array_equal(np.sort(np.concatenate([train, test])), np.arange(len(rows)))
@@ -89,20 +95,21 @@ def test_last_indentations_are_held_out(pokes_n, test_fraction):
 
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
-def test_split_with_an_empty_side_is_an_error(test_fraction):
+def test_split_without_training_or_test_rows_is_refused(test_fraction):
     with pytest.raises(ParamsError, match="would be held out: one side is empty"):
         hold_out_last(rows_of(9), test_fraction)
 
 
 @given(st.floats(10, 400), st.floats(0, 1e3))
-def test_rate_is_measured_within_indentations(rate, pause_s):
+def test_frame_rate_is_measured_within_indentations(rate, pause_s):
     t_s = np.concatenate([np.arange(5), 5 + rate * pause_s + np.arange(5)]) / rate
     reading_i = [0, 1, 2, 3, 4] * 2
     found_hz = rate_hz([readings_of(t_s, [0] * 5 + [1] * 5, reading_i)])
-    assert found_hz == pytest.approx(rate, rel=1e-6)  # rounding of times of 1e3 s: 1e-10 of a step of 2.5 ms
+    # Tolerance: times of up to 1e3 s are rounded by 1e-10 of a frame of 2.5 ms.
+    assert found_hz == pytest.approx(rate, rel=1e-6)
 
 
-def test_rate_of_single_readings_is_an_error():
+def test_frame_rate_cannot_be_measured_from_single_readings():
     with pytest.raises(ParamsError, match="needs successive readings of the same indentation"):
         rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
@@ -113,7 +120,8 @@ def test_scores_equal_scikit_learn_and_loops():
     far_mm = [np.hypot(p[0] - t[0], p[1] - t[1]) for t, p in zip(true, predicted, strict=True)]
     assert scored["mse_xy_mm2"]["mean"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
     assert scored["mse_f_N2"]["mean"] == pytest.approx(mean_squared_error(true[:, 2], predicted[:, 2]))
-    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())  # median of 180
+    # The median of 180 values is the mean of the two in the middle.
+    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())
     assert scored["p95_error_mm"]["mean"] == pytest.approx(np.quantile(far_mm, 0.95))
     near = [far for far, one in zip(far_mm, true, strict=True) if AREA.near_border(one[None, :2])[0]]
     assert scored["near_seam"]["median_error_mm"]["mean"] == pytest.approx(np.median(near))
@@ -122,7 +130,7 @@ def test_scores_equal_scikit_learn_and_loops():
 
 
 @given(st.floats(0, 20), st.integers(0, 100))
-def test_all_place_errors_of_a_constant_offset_equal_the_offset(off_mm, seed):
+def test_if_all_predictions_have_the_same_offset_all_errors_equal_it(off_mm, seed):
     true, _, indentation = predictions(seed)
     scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
     for part in (scored, scored["near_seam"], scored["inside"]):
@@ -130,7 +138,7 @@ def test_all_place_errors_of_a_constant_offset_equal_the_offset(off_mm, seed):
     assert scored["p95_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
 
 
-def test_no_border_scores_without_pokes_near_a_border():
+def test_without_presses_near_a_border_there_are_no_border_scores():
     alone = lay_out((50.8, 101.6), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0)
     true, predicted, indentation = predictions()
     scored = score_places(true, [predicted], indentation, alone)
@@ -148,7 +156,7 @@ def test_each_tested_indentation_is_plotted_once():
     true, predicted, indentation = predictions(n=20)
     order = rng_for(0, "order").permutation(60)
     plotted = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
-    np.testing.assert_allclose(plotted["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
+    np.testing.assert_allclose(plotted["x_mm"], true[::3, 0], atol=0.0051)  # Plotted places are rounded to 0.01 mm.
     np.testing.assert_allclose(plotted["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
     assert len(plotted["chips_x_mm"]) == len(CROSS_MM)
     assert (plotted["borders_x_mm"], plotted["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
@@ -169,7 +177,7 @@ def numbers_and_figure_data(n=40):
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
 
-def test_table_lists_methods_and_source_without_a_paper_number():
+def test_table_lists_methods_and_source_and_has_no_number_of_the_paper():
     numbers, _ = numbers_and_figure_data()
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
@@ -178,14 +186,14 @@ def test_table_lists_methods_and_source_without_a_paper_number():
     assert table["seeds"].tolist() == ["1", "2", "1"]
     assert "±" in table["accuracy, %"][1]
     assert "column `seeds` gives their number" in table.attrs["spread"]
-    # the table has three digits
+    # The table gives three digits.
     assert float(table["median error, mm"][0]) == pytest.approx(numbers["median_error_mm"]["mean"], rel=5e-3)
     near = numbers["near_seam"]["median_error_mm"]["mean"]
     assert float(table["median near a border between boards, mm"][0]) == pytest.approx(near, rel=5e-3)
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
-def test_score_of_an_area_without_pokes_is_a_dash():
+def test_score_of_an_area_without_presses_is_a_dash():
     numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]
@@ -193,13 +201,13 @@ def test_score_of_an_area_without_pokes_is_a_dash():
     assert "0 of them less than" in table.attrs["meaning"]
 
 
-def test_table_compares_our_setup_with_that_of_the_paper():
+def test_table_compares_our_skin_and_boards_with_those_of_the_paper():
     table = tables(numbers_and_figure_data()[0], "simulated")["sleeve_set_up"].set_index("what")
     assert table.loc["chips", ["ours", "paper"]].tolist() == ["16", "40"]
     assert table.loc["rate, Hz", ["ours", "paper"]].tolist() == ["133.0", "133"]
 
 
-def test_map_shows_tested_pokes_chips_and_source():
+def test_map_shows_tested_presses_chips_and_source():
     numbers, figure_data = numbers_and_figure_data()
     texts = figures(numbers, figure_data, "simulated")
     assert list(texts) == ["sleeve.svg"]
@@ -214,7 +222,7 @@ def test_map_shows_tested_pokes_chips_and_source():
         assert label in text
 
 
-def test_figure_bytes_depend_only_on_predictions_and_source():
+def test_equal_predictions_and_source_give_an_equal_figure():
     numbers, figure_data = numbers_and_figure_data()
     once, again, other = (
         figures(numbers, figure_data, source)["sleeve.svg"] for source in ("simulated", "simulated", "x")

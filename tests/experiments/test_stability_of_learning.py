@@ -1,4 +1,4 @@
-"""Tests that extreme cases of training pass, and that they detect planted faults of the training code."""
+"""Tests that the training code passes extreme cases, and that these cases detect planted faults."""
 
 from dataclasses import replace
 
@@ -24,38 +24,39 @@ def cases():
     return learning_cases(SEED)
 
 
-def test_every_case_passes(cases):
+def test_training_code_passes_every_case(cases):
     assert failed(cases) == set()
 
 
-def test_rows_are_unique_and_describe_the_outcome(cases):
+def test_each_case_has_one_row_that_describes_its_outcome(cases):
     assert len({case.case for case in cases}) == len(cases)
     assert {case.area for case in cases} == {"learning"}
     assert all(case.should and case.happened for case in cases)
     assert all((case.error is None) == (case.limit is None) for case in cases)
 
 
-def test_cases_are_reproducible(cases):
+def test_outcomes_of_cases_are_reproducible(cases):
     assert set(triplet_cases(SEED)) <= set(cases)
 
 
-# Each of the following tests disables one guard of the training code. A case must detect the missing guard.
+# Each of the following tests disables one guard of the training code, such as a check or a lower limit. One of the
+# cases must then fail.
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
 @pytest.mark.filterwarnings("ignore:divide by zero encountered")
-def test_scale_without_floor_is_detected(monkeypatch):
+def test_scaler_without_a_minimum_scale_is_detected(monkeypatch):
     monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(0))
     constant = {"a channel that never moves", "no channel ever moves, as without a magnet"}
     assert failed(scaling_cases(SEED)) == constant
 
 
-def test_too_high_scale_floor_is_detected(monkeypatch):
+def test_scaler_with_a_too_large_minimum_scale_is_detected(monkeypatch):
     monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(1e-3))
     assert failed(scaling_cases(SEED)) == {"labels times 2^-20"}
 
 
-def test_triplet_loss_with_square_roots_is_detected(monkeypatch):
+def test_triplet_loss_of_distances_that_are_not_squared_is_detected(monkeypatch):
     def triplet_loss_of_roots(anchor, positive, negative):
         nearer, farther = ((anchor - one).pow(2).sum(-1).sqrt() for one in (positive, negative))
         return torch.relu(nearer - farther + 1e-3).mean(-1)
@@ -64,13 +65,13 @@ def test_triplet_loss_with_square_roots_is_detected(monkeypatch):
     assert failed(triplet_cases(SEED)) == {"triplets of identical readings, weighed 1000"}
 
 
-def test_sampler_that_accepts_ties_is_detected(monkeypatch):
+def test_triplets_with_equal_distances_are_detected(monkeypatch):
     monkeypatch.setattr(losses, "_find_anchors", lambda place: np.ones(len(place), bool))
     monkeypatch.setattr(batches, "draw_triplets", lambda points, anchor, rng: (anchor, anchor))
     assert failed(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
 
 
-def test_unchecked_loss_is_detected(monkeypatch):
+def test_training_that_does_not_check_the_loss_is_detected(monkeypatch):
     def unchecked(self, errors, step):
         self.errors.append(errors)
         for i in range(errors.shape[1]):
@@ -83,12 +84,12 @@ def test_unchecked_loss_is_detected(monkeypatch):
     assert failed(cases) == {case.case for case in cases}
 
 
-def test_unnoticed_collapse_is_detected(monkeypatch):
+def test_training_that_does_not_notice_a_collapse_is_detected(monkeypatch):
     monkeypatch.setattr(job, "COLLAPSED", -np.inf)
     assert not learning._collapsed(JOB, ROWS).holds
 
 
-def test_coupled_networks_are_detected(monkeypatch):
+def test_networks_of_a_stack_that_influence_each_other_are_detected(monkeypatch):
     original = network.Stack.features
 
     def mixed(self, inputs):

@@ -1,4 +1,7 @@
-"""Tests of experiment touches (one or two numbered places are touched), on a simulated pad whose fields add up."""
+"""Tests of experiment touches, in which one or two numbered places of a pad are touched.
+
+The pad is simulated: field changes of two touches add up.
+"""
 
 from dataclasses import replace
 from itertools import combinations
@@ -32,7 +35,11 @@ NOISE_uT = 2.0
 
 
 def pad(rows_n=40):
-    """Return recordings of each place and pair of places: field change = force x direction of the place, plus noise."""
+    """Return recordings of touches at each place and at each pair of places.
+
+    The field change is the sum, over the touched places, of the force times a direction that belongs to the place.
+    Noise is added.
+    """
     rng = rng_for(0, "touches", "pad")
     directions = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
     result = []
@@ -50,7 +57,7 @@ def split_pad():
     return [split_by_time(one, SECTION) for one in single], double
 
 
-def test_every_row_is_on_one_side_in_time_order():
+def test_rows_are_split_into_training_threshold_and_test_rows_in_order_of_time():
     recording = pad()[0][0]
     blocks = split_by_time(recording, SECTION)
     parts = [blocks.train, blocks.aside, blocks.test]
@@ -58,27 +65,29 @@ def test_every_row_is_on_one_side_in_time_order():
     np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
 
 
-def test_residual_equals_bounded_least_squares():
+def test_residual_equals_that_of_bounded_least_squares():
     rng = rng_for(0, "touches", "left over")
     known = {place: rng.normal(size=15) for place in PLACES}
     db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)
     basis = np.stack([known[2], known[4]], axis=1)
     costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
     naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
-    np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)  # two least-squares solvers
+    # The relative tolerance is for the difference between two solvers of least squares.
+    np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)
 
 
-def test_residual_of_the_touched_pair_is_noise(split_pad):
+def test_residual_is_small_only_for_the_pair_of_places_that_is_touched(split_pad):
     blocks, double = split_pad
     numbers = evaluate_superposition(blocks, double)
     assert len(numbers["pairs"]) == 6
     for pair in numbers["pairs"]:
         assert pair["rank"] == 1
-        assert pair["left_over_pct"] < 2  # noise: 8 uT over 15 channels, of about 4000 uT
+        # The noise is 8 uT in each of 15 channels, and the field changes are about 4000 uT.
+        assert pair["left_over_pct"] < 2
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_an_unknown_place_is_mistaken_for_two(split_pad):
+def test_single_touch_at_a_place_without_training_rows_is_mistaken_for_two(split_pad):
     result = evaluate_detection(*split_pad, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
@@ -94,7 +103,7 @@ def test_places_and_forces_are_predicted(split_pad):
     assert force["by_time"]["mean"] < 0.02 * force["variance"]["mean"]
 
 
-def test_recordings_without_numbered_places_are_an_error():
+def test_recordings_without_the_number_of_a_place_are_refused():
     readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
     result = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
     assert result.places == (7,)
@@ -103,7 +112,7 @@ def test_recordings_without_numbered_places_are_an_error():
         touched_rows(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
 
 
-def test_unusable_recordings_are_skipped_with_a_reason():
+def test_unusable_recordings_are_omitted_with_a_reason():
     single, double = pad()
     short = replace(single[0][:19], name="short")
     again = replace(single[1], name="second of place 2")
@@ -117,7 +126,7 @@ def test_unusable_recordings_are_skipped_with_a_reason():
     assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
 
 
-def test_recordings_of_only_pairs_are_skipped_with_a_reason():
+def test_if_all_recordings_are_of_pairs_the_reason_is_reported():
     _, double = pad()
     result = sort_recordings(double)
     assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
@@ -131,12 +140,12 @@ def test_recordings_of_only_pairs_are_skipped_with_a_reason():
     assert len(shown["touches"]) == 1 + len(double)
 
 
-def test_fractions_that_leave_no_test_rows_are_an_error():
+def test_fractions_that_leave_no_test_rows_are_refused():
     with pytest.raises(ValidationError, match="the rest are the test rows"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 
-def test_table_shows_only_touched_pairs(split_pad):
+def test_table_of_pairs_shows_only_touched_pairs(split_pad):
     blocks, double = split_pad
     for pairs in (double, []):
         numbers = {

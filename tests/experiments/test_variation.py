@@ -1,4 +1,4 @@
-"""Tests of experiment variation: changes over time and between skins, table and figures."""
+"""Tests of experiment variation, which shows how readings at one place change over time and between skins."""
 
 import xml.etree.ElementTree as ET
 
@@ -24,7 +24,10 @@ from tests.data.tables import readings
 
 
 def capture(passes_n: int = 4):
-    """Return readings with random fields: passes over three places at two depths, two readings per contact."""
+    """Return readings with random fields.
+
+    Each pass visits three places at two depths, with two readings per contact.
+    """
     stops = [(x_mm, depth_mm) for _ in range(passes_n) for depth_mm in (0.6, 1.2) for x_mm in (0, 2, 4)]
     x_mm, depth_mm = np.repeat(np.array(stops, np.float32), 2, axis=0).T
     f = len(x_mm)
@@ -41,7 +44,7 @@ def visits(b_uT: list, db_uT: list, contacts_n: list | None = None) -> Visits:
     return Visits(counted, np.array(b_uT, float), np.array(db_uT, float))
 
 
-def test_visits_equal_a_loop_over_readings():
+def test_visits_to_a_place_equal_a_loop_over_readings():
     one = capture()
     found = find_visits(one, (2.0, 2.0), 1.2)
     naive: dict[int, list[np.ndarray]] = {}
@@ -50,7 +53,7 @@ def test_visits_equal_a_loop_over_readings():
             naive.setdefault(int(one.n_contacts[i]), []).append(np.stack([one.b_uT[i], one.b_uT[i] - one.noload_uT[i]]))
     assert found.contacts_n.tolist() == list(naive) == [4, 10, 16, 22]
     expected = np.array([np.mean(pair, axis=0) for pair in naive.values()])
-    # rounding of fields of 100 uT to float32 is 1e-5 uT
+    # Tolerance: fields of 100 uT are rounded by 1e-5 uT in single precision.
     np.testing.assert_allclose(found.b_uT, expected[:, 0], atol=1e-4)
     np.testing.assert_allclose(found.db_uT, expected[:, 1], atol=1e-4)
 
@@ -62,13 +65,13 @@ def test_visits_equal_a_loop_over_readings():
         ((3.0, 2.0), 1.2, "3 places, among them 0, 2; 2, 2; 4, 2"),
     ],
 )
-def test_unvisited_place_is_an_error(place_mm, depth_mm, listed):
+def test_place_or_depth_that_was_not_visited_is_refused(place_mm, depth_mm, listed):
     with pytest.raises(ParamsError, match=listed) as caught:
         find_visits(capture(), place_mm, depth_mm)
     assert "\n" not in str(caught.value)
 
 
-def test_change_over_time_uses_the_last_visit():
+def test_change_over_time_is_between_the_first_and_the_last_visit_within_the_limit():
     visited = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
     numbers, plotted = over_time(visited, 10)
     assert numbers == {
@@ -86,7 +89,7 @@ def test_plotted_visits_include_the_first_and_the_last():
 
 
 @given(st.floats(-500, 500), st.floats(0.5, 3))
-def test_no_load_drift_changes_only_raw_readings(drift_uT, scale):
+def test_drift_of_the_no_load_field_changes_only_raw_readings(drift_uT, scale):
     db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
     rest_uT = drift_uT * np.arange(5)[:, None]
     numbers, _ = over_time(Visits(np.arange(5), db_uT + rest_uT, scale * db_uT), 100)
@@ -94,7 +97,7 @@ def test_no_load_drift_changes_only_raw_readings(drift_uT, scale):
     assert numbers["db_change_uT"] == 0
 
 
-def test_spread_between_skins_is_the_rms_over_pairs():
+def test_spread_between_skins_is_the_rms_difference_over_pairs():
     lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
     numbers, plotted = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
     pairs = [(one, other) for one in lines for other in lines if one < other]
@@ -105,13 +108,13 @@ def test_spread_between_skins_is_the_rms_over_pairs():
     assert plotted == lines
 
 
-def test_plotted_line_is_the_mean_over_visits():
+def test_plotted_line_of_a_skin_is_the_mean_over_visits():
     numbers, plotted = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
     assert plotted == {"s0": [2, 4]}
     assert "spread_uT" not in numbers
 
 
-def test_skins_of_different_boards_alternate():
+def test_skins_are_chosen_from_different_boards_in_turn():
     boards = {"b0_s0": "b0", "b0_s1": "b0", "b1_s0": "b1", "b2_s0": "b2", "b2_s1": "b2"}
     assert first_of_each_board(boards, 4) == ["b0_s0", "b1_s0", "b2_s0", "b0_s1"]
     with pytest.raises(ParamsError, match="at most the 5 skins of the main captures; got 6"):
@@ -138,7 +141,7 @@ def figure_data(last_uT: float = 40.0) -> dict:
     return {"places": [place | {"x_mm": x_mm, "y_mm": 8.0} for x_mm in (8.0, 4.0)]}
 
 
-def test_places_have_changes_and_spread():
+def test_table_has_the_change_over_time_and_the_spread_of_each_place():
     table = tables(numbers(), "simulated")["variation"]
     assert table["place, mm"].tolist() == ["8, 8"] * 3 + ["4, 8"] * 3
     assert table["difference, µT"].tolist() == ["23.7", "5.21", "241"] * 2
@@ -147,7 +150,7 @@ def test_places_have_changes_and_spread():
     assert "obvious variation across the samples" in to_markdown(table)
 
 
-def test_notes_state_time_per_contact_and_temperature():
+def test_notes_state_the_time_per_contact_and_the_warming():
     text = to_markdown(tables(numbers(), "simulated")["variation"])
     assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
     assert "A real rig takes seconds per contact" in text
@@ -156,11 +159,11 @@ def test_notes_state_time_per_contact_and_temperature():
     assert "temperature changes" not in to_markdown(tables(cold, "recorded")["variation"])
 
 
-def test_single_skin_has_no_spread():
+def test_single_skin_has_no_spread_between_skins():
     assert tables(numbers(("s0",)), "simulated")["variation"]["difference, µT"].tolist() == ["23.7", "5.21"] * 2
 
 
-def test_figures_name_channels_places_and_skins():
+def test_figures_name_their_channels_places_and_skins():
     texts = figures(numbers(), figure_data(), "simulated")
     assert sorted(texts) == ["variation_skins.svg", "variation_time.svg"]
     for text in texts.values():
@@ -177,7 +180,7 @@ def test_figures_name_channels_places_and_skins():
     assert ">s1<" in texts["variation_skins.svg"]
 
 
-def test_figures_are_reproducible():
+def test_equal_numbers_give_equal_figures():
     first, again, other = (
         figures(numbers(), lines, "simulated") for lines in (figure_data(), figure_data(), figure_data(99.0))
     )

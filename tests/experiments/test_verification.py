@@ -37,11 +37,11 @@ def checks():
     return verify(DESIGN, depths_m=DEPTHS_M, seed=SEED)
 
 
-def test_every_check_passes(checks):
+def test_simulator_passes_every_check(checks):
     assert failed(checks) == set()
 
 
-def test_rows_describe_the_checks(checks):
+def test_each_row_describes_its_check(checks):
     for check in checks:
         assert all((check.subject, check.law, check.against, check.unit, check.reason))
         assert np.isfinite(check.error)
@@ -49,34 +49,34 @@ def test_rows_describe_the_checks(checks):
     assert len({(check.subject, check.law, check.against) for check in checks}) == len(checks)
 
 
-def test_specified_references_are_present(checks):
+def test_checks_against_the_specified_references_exist(checks):
     against = " ".join(check.against for check in checks)
     names = "magpylib Cuboid", "magpylib Dipole", "Hertz", "Dimitriadis", "Long", "mpmath", "struct", "data sheet"
     assert [name for name in names if name not in against] == []
 
 
-def test_checks_are_reproducible():
+def test_results_of_checks_are_reproducible():
     for check_all in (check_relaxation, lambda: check_field(DESIGN.skin, SEED), lambda: check_contact(DESIGN.skin)):
         assert check_all() == check_all()
 
 
-def test_nan_and_exceeded_tolerance_fail():
+def test_check_fails_if_its_error_is_nan_or_above_the_tolerance():
     check = Check("a", "b", "c", error=1.0, unit="1", tolerance=1.0, reason="d")
     assert check.holds
     assert not replace(check, error=1.0 + 1e-12).holds
     assert not replace(check, error=np.nan).holds
 
 
-def test_no_spread_gives_no_difference():
+def test_settings_without_spreads_are_all_zero():
     exact = no_spread(DESIGN.spreads).model_dump()
     assert exact.pop("skin_filler_length_mm") == DESIGN.spreads.skin_filler_length_mm
     assert not any(exact.values())
 
 
-# Each of the following tests plants one fault in the simulator; a check must detect the fault.
+# Each of the following tests plants one fault in the simulator. One of the checks must then fail.
 
 
-def test_wrong_sign_inside_magnets_is_detected(monkeypatch):
+def test_field_with_the_wrong_sign_inside_magnets_is_detected(monkeypatch):
     original = magnet._corner
     monkeypatch.setattr(magnet, "_corner", lambda from_m: -original(from_m))
     wrong = failed(check_field(DESIGN.skin, SEED))
@@ -84,15 +84,15 @@ def test_wrong_sign_inside_magnets_is_detected(monkeypatch):
     assert f"magnetising array, {DESIGN.skin.polarity}: field in the skin" in wrong
 
 
-def test_wrong_array_field_violates_maxwell(monkeypatch):
+def test_wrong_field_of_the_magnet_array_violates_maxwells_equations(monkeypatch):
     original = magnet.array_field
     monkeypatch.setattr(magnet, "array_field", lambda at_m, h_m, polarity: original(at_m, h_m, polarity) * (1, 1, 1.01))
     assert f"magnetising array, {DESIGN.skin.polarity}: div B = 0" in failed(check_field(DESIGN.skin, SEED))
 
 
-def test_wrong_field_constant_is_detected_beyond_its_tolerance(monkeypatch):
+def test_magnetic_constant_with_a_relative_error_of_1e_minus_10_is_detected(monkeypatch):
     monkeypatch.setattr(change, "MU0_4PI", 1e-7)
-    # relative error 1.3e-10: less than the difference of mu_0 between two CODATA years
+    # The relative error is 1.3e-10. This is less than the difference between the values of mu_0 of two CODATA years.
     assert failed(check_field(DESIGN.skin, SEED)) == set()
     monkeypatch.setattr(change, "MU0_4PI", 1.001e-7)
     assert failed(check_field(DESIGN.skin, SEED)) == {
@@ -102,8 +102,8 @@ def test_wrong_field_constant_is_detected_beyond_its_tolerance(monkeypatch):
     }
 
 
-def test_unbonded_layer_is_detected_by_every_reference(monkeypatch):
-    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # the compliance of a half-space
+def test_layer_that_is_not_bonded_is_detected_by_every_reference(monkeypatch):
+    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # This is the compliance of a half-space.
     layer._force_curve.cache_clear()
     layer.contact_of_depth.cache_clear()
     try:
@@ -114,7 +114,7 @@ def test_unbonded_layer_is_detected_by_every_reference(monkeypatch):
     assert {"Dimitriadis et al. 2002, bonded", "Long et al. 2011", "1.770"} <= wrong
 
 
-def test_stretch_without_narrowing_loses_volume(monkeypatch):
+def test_stretch_that_does_not_conserve_volume_is_detected(monkeypatch):
     original = layer.displacement
 
     def stretched(r_m, z_m, of):
@@ -127,7 +127,7 @@ def test_stretch_without_narrowing_loses_volume(monkeypatch):
     assert "one small step: the surface lies on the tip" in wrong
 
 
-def test_moments_without_rotation_are_detected(monkeypatch):
+def test_moments_that_do_not_rotate_are_detected(monkeypatch):
     original = deformation.move_dipoles
 
     def without_rotation(table, rest, poke_m):
@@ -141,7 +141,7 @@ def test_moments_without_rotation_are_detected(monkeypatch):
     assert not mechanics.approximations(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
 
 
-def test_naive_small_step_quotient_is_detected(monkeypatch):
+def test_inaccurate_quotient_in_small_time_steps_is_detected(monkeypatch):
     def naive(x):
         return np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
 
@@ -149,20 +149,20 @@ def test_naive_small_step_quotient_is_detected(monkeypatch):
     assert any("one step" in law for law in failed(check_relaxation()))
 
 
-def test_wrong_chip_step_is_detected(monkeypatch):
-    # steps of another HALLCONF setting in the data sheet
+def test_wrong_step_of_chip_readings_is_detected(monkeypatch):
+    # These are the steps for another value of HALLCONF in the data sheet.
     monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))
     wrong = failed(check_electronics(DESIGN.chip, SEED))
     assert "chip: uT a count, GAIN_SEL 6 and 7" in wrong
     assert "chip: past its range, GAIN_SEL 7, to 50 mT" in wrong
 
 
-def test_unrecorded_noise_is_detected():
+def test_noise_that_differs_from_recorded_noise_is_detected():
     quiet = DESIGN.chip.model_copy(update={"noise_xy_uT": 1.0})
     assert any("outside the recorded" in law for law in failed(check_electronics(quiet, SEED)))
 
 
-def test_wrong_frame_order_is_detected(monkeypatch):
+def test_wrong_order_of_channels_in_frames_is_detected(monkeypatch):
     encode, original = wire.encode, stream.FrameStream.feed
     monkeypatch.setattr(wire, "encode", lambda frames, layout: encode(rotate_chips(frames), layout))
     assert {law.split(": ")[1] for law in failed(check_frames(DESIGN.chip.gain_sel, 5, SEED))} == {

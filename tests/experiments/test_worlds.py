@@ -1,4 +1,7 @@
-"""Tests of experiment worlds: simulated variants of scene decide that show which settings determine table 2."""
+"""Tests of experiment worlds, which varies the settings of scene decide to find those that determine table 2.
+
+A world is one of these simulated variants.
+"""
 
 from pathlib import Path
 
@@ -26,13 +29,13 @@ def law_error(skin: str = "b0_s0", residual: Residual = RESIDUAL, size: float = 
     return with_residual(CHANGE_uT, PRESSES, size, residual, 1, skin) - CHANGE_uT
 
 
-def test_law_error_has_size_and_smoothness_and_is_reproducible():
+def test_error_of_the_law_has_the_given_size_is_smooth_and_is_reproducible():
     relative_errors = [
         np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)
     ]
     assert np.sqrt(np.mean(np.square(relative_errors))) == pytest.approx(0.4, rel=0.1)
     relative_error = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    # differences between places 0.5 mm apart
+    # Differences between places that are 0.5 mm apart.
     step = np.linalg.norm(np.diff(relative_error.reshape(33, 33, 15), axis=1), axis=2)
     assert step.mean() < 0.25 * np.linalg.norm(relative_error, axis=1).mean()
     np.testing.assert_array_equal(law_error(), law_error())
@@ -40,7 +43,7 @@ def test_law_error_has_size_and_smoothness_and_is_reproducible():
     assert with_residual(CHANGE_uT, PRESSES, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
 
 
-def test_part_of_the_law_error_is_common_to_all_skins():
+def test_part_of_the_error_of_the_law_is_common_to_all_skins():
     fully_shared = RESIDUAL.model_copy(update={"own_share": 0.0})
     np.testing.assert_array_equal(law_error("b0_s0", fully_shared), law_error("b1_s0", fully_shared))
     pairs = [np.corrcoef(law_error(f"b{i}_s0").ravel(), law_error(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
@@ -49,7 +52,7 @@ def test_part_of_the_law_error_is_common_to_all_skins():
 
 @pytest.fixture(scope="module")
 def decide_settings() -> Settings:
-    """Return the settings of scene decide, reduced to three boards with one skin each and few training steps."""
+    """Return the settings of scene decide, reduced to three boards with one skin each, and to few training steps."""
     scene = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
     scene["simulate"]["boards"]["rigid"] |= {
         "boards_n": 3, "skins_per_board_n": 1, "quadrature": {"cell_mm": 3.0, "layers_n": 2},
@@ -64,7 +67,7 @@ def decide_settings() -> Settings:
     return Settings("decide", "decide.yaml", scene, read_shared_files(ROOT))
 
 
-def test_worlds_have_the_rows_of_table_2(decide_settings, tmp_path):
+def test_each_world_has_the_rows_of_table_2(decide_settings, tmp_path):
     worlds(decide_settings, decide_settings.section(Worlds, "worlds"), results=tmp_path / "results.json")
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
@@ -81,7 +84,7 @@ def test_worlds_have_the_rows_of_table_2(decide_settings, tmp_path):
         assert scene in texts_of(svg)
 
 
-def test_worlds_differ_in_one_setting(decide_settings):
+def test_each_world_differs_from_the_default_in_one_setting(decide_settings):
     settings = decide_settings
     section = parse(Worlds, read_yaml(ROOT / "pipeline/scenes/decide.yaml")["worlds"], "worlds")
     listed = worlds_of(simulation_settings(settings), section)
@@ -90,7 +93,7 @@ def test_worlds_differ_in_one_setting(decide_settings):
         "amplitude_and_gap-2", "friction-0.35", "friction-1.7",
     ]  # fmt: skip
     default, with_error, slippery = (rows_of(listed[i], section, 1) for i in (0, 2, 7))
-    np.testing.assert_array_equal(default.target, with_error.target)  # the worlds have equal places and forces
+    np.testing.assert_array_equal(default.target, with_error.target)  # All worlds have the same places and forces.
     assert not np.allclose(default.db_uT, with_error.db_uT, rtol=0.05)
     np.testing.assert_array_equal(default.target, slippery.target)
     assert np.linalg.norm(default.db_uT - slippery.db_uT) > 0.01 * np.linalg.norm(default.db_uT)

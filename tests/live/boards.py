@@ -1,4 +1,8 @@
-"""Helpers for tests of live boards: scripts with two alternating pokes, a model of these pokes, and readers."""
+"""Helpers for tests of live boards.
+
+They are scripts (the bytes and times of an emulated board) in which two pokes alternate, a model of these pokes, and
+readers.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -20,14 +24,18 @@ from tests.recordings.headers import make_header
 RATE_HZ = 400.0
 QUIET_S, POKE_S = 1.5, 1.0
 PAUSE_S = 2.0
-PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x (mm), y (mm), force (N) of the two pokes that alternate
+# The place x and y (mm) and the force (N) of the two pokes, which alternate.
+PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])
 INPUT_SCALE_uT = 300.0
 
 
 def make_script(
     *, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ, quiet_s: float = QUIET_S
 ) -> Script:
-    """Return a script: no contact at first, then pokes with pauses; noise 3 uT, LSB 0.15 (x, y) and 0.242 uT (z)."""
+    """Return a script: no contact at first, then pokes with pauses.
+
+    The noise is 3 uT, and the steps of readings are 0.15 uT (x, y) and 0.242 uT (z).
+    """
     frames_n = round((quiet_s + pokes_n * (POKE_S + PAUSE_S)) * rate_hz)
     t_s, rng = np.arange(frames_n) / rate_hz, rng_for(0, "board")
     poke_i, since_s = np.divmod(t_s - quiet_s, POKE_S + PAUSE_S)
@@ -42,16 +50,23 @@ def make_script(
 
 
 def changes_uT(chips_n: int) -> np.ndarray:
-    """Return the field changes of the two pokes [2 ch]: different at each chip, unlike those of a distant magnet."""
+    """Return the field changes of the two pokes [2 ch].
+
+    They differ from chip to chip, unlike those of a distant magnet.
+    """
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 
 
 def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips_n: int = 5) -> Path:
-    """Write a linear network. Its predictions for the two pokes are exact, except for an offset of `off_mm` along x."""
-    # weights of the linear model [3 ch]
+    """Write a linear network.
+
+    For the two pokes, its predictions are exact, except for an offset of `off_mm` along x.
+    """
+    # The weights of a linear model from channels to place and force [3 ch].
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # ReLUs pass either a value or its negative
+    # ReLUs set negative values to 0. Therefore each value is passed twice, as it is and negated.
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
     weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])
@@ -69,7 +84,7 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
 
 
 def write_script(script: Script, folder: Path) -> Path:
-    """Write the bytes of a script to a folder as `reskin record` does."""
+    """Write the bytes of a script to a folder, as `reskin record` does."""
     ends = np.cumsum([len(piece) for piece in script.pieces])
     files = {
         STREAM_FILE: b"".join(script.pieces),
@@ -83,7 +98,7 @@ def write_script(script: Script, folder: Path) -> Path:
 
 
 class ScriptReader:
-    """A reader that returns the bytes of a script, with the times of the script, without a port or a thread.
+    """A reader that returns the bytes of a script, with the times of the script. It needs no port and no thread.
 
     Results therefore do not depend on the load of the machine.
     """
@@ -113,7 +128,7 @@ class ScriptReader:
 
 
 def play_to_skin(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimates]]:
-    """Play a script to a skin as fast as possible; return the skin and all its estimates."""
+    """Play a script to a skin as fast as possible. Return the skin and all its estimates."""
     skin, estimates = LiveSkin("played", models), []
     skin.reader = reader = ScriptReader(script)
     while not reader.at_end:
@@ -125,7 +140,7 @@ def play_to_skin(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Es
 def zero_requests(monkeypatch) -> list[LiveSkin]:
     """Return a list to which each call of `LiveSkin.zero` appends its skin.
 
-    Tests use it because the page may show "zeroing" too briefly to be seen.
+    Tests use the list, because the page may show "zeroing" too briefly to be seen.
     """
     zeroed, zero = [], LiveSkin.zero
     monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), zeroed.append(skin)))
@@ -146,7 +161,7 @@ class FailingModel:
 
 @contextmanager
 def plugged_in(script: Script, port: str = "pty", **options: object) -> Iterator[str]:
-    """Play a script on a pseudo-terminal; yield the name of its port."""
+    """Play a script on a pseudo-terminal, and yield the name of its port."""
     end, stop = make_port(port), threading.Event()
     player = threading.Thread(target=play, args=[script, end, stop], kwargs=options)
     player.start()

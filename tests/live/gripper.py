@@ -19,7 +19,9 @@ from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1
-PERIOD_S, SETTLED_S = 6.0, 1.0  # period of the object's stiffness; time from which the force is evaluated
+# PERIOD_S is the period with which the stiffness of the object changes. SETTLED_S is the time from which on the force
+# is evaluated.
+PERIOD_S, SETTLED_S = 6.0, 1.0
 SOFT_N_MM, HARD_N_MM = 0.3, 3.0
 NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
 DEPTHS_MM = np.linspace(0.02, 1.5, 60)
@@ -27,7 +29,7 @@ DEPTHS_MM = np.linspace(0.02, 1.5, 60)
 
 @dataclass(frozen=True)
 class FittedNetwork(Network):
-    """A network trained on labelled pokes of one skin (paper section 5)."""
+    """A network that is trained on labelled pokes of a single skin (section 5 of the paper)."""
 
     regressor: MLPRegressor = field(default_factory=MLPRegressor)
 
@@ -37,7 +39,7 @@ class FittedNetwork(Network):
 
 
 def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
-    """Train a network on simulated pokes of the skin with this seed, with one reading per poke."""
+    """Train a network on simulated pokes of the skin with this seed. Each poke has one reading."""
     rng = rng_for(seed, "gripper")
     pokes = np.column_stack([rng.uniform(2, 14, (pokes_n, 2)), rng.uniform(DEPTHS_MM[0], DEPTHS_MM[-1], pokes_n)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed)
@@ -47,25 +49,29 @@ def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
         hidden_layer_sizes=(64, 64), solver="lbfgs", alpha=1e-3, max_iter=1500, max_fun=10**6, random_state=seed
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # scikit-learn warns that the training has not converged
+        warnings.simplefilter("ignore")  # scikit-learn warns that the training has not converged.
         net.fit(scaler.encode(db_uT), scaler.encode_target(target))
     card = {"input": {"channels_n": 15}, "recipe": {"inputs": "raw"}}
     return FittedNetwork(card, scaler.arrays(), net)
 
 
 class Finger:
-    """The readings of a skin pressed at `at_mm` as a function of the force, interpolated between simulated forces."""
+    """A skin that is pressed at the place `at_mm`. Its readings depend on the force.
+
+    They are interpolated between readings at simulated forces.
+    """
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
         pokes = np.column_stack([np.tile(at_mm, (len(DEPTHS_MM), 1)), DEPTHS_MM])
-        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}  # simulated without noise, which is added to each frame later
+        # These readings are simulated without noise. Noise is added to each frame later.
+        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}
         noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed, chip=quiet)
         self.noload_uT = noload_uT.mean(axis=0)
         self._change_uT = np.vstack([np.zeros(15), b_uT - self.noload_uT])
         self._force_N, self._depth_mm = np.append(0, force_N), np.append(0, DEPTHS_MM)
 
     def force_at(self, closed_mm: float, stiffness_N_mm: float) -> float:
-        """Return the force in N at which skin and spring, in series, are in equilibrium at this closure."""
+        """Return the force in N at which skin and spring are in equilibrium after closing by this distance."""
         total_mm = self._depth_mm + self._force_N / stiffness_N_mm
         return float(np.interp(max(closed_mm, 0.0), total_mm, self._force_N))
 
@@ -74,7 +80,7 @@ class Finger:
 
 
 class FingerReader:
-    """A reader that returns one frame at a time, for the current force on the finger."""
+    """A reader that returns one frame at a time, for the force that is on the finger at this time."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 
@@ -100,7 +106,10 @@ class FingerReader:
 def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
-    """Hold an object whose stiffness varies tenfold. Return true and estimated force in N at each time step: [f 2]."""
+    """Hold an object whose stiffness varies by a factor of ten.
+
+    Returns the true and the estimated force in N at each time step: [f 2].
+    """
     skin, wire, closed_mm, forces_N = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
     skin.reader = wire
     while len(forces_N) < seconds * RATE_HZ:
@@ -109,7 +118,8 @@ def grip(
             continue
         estimate_N = float(estimates.target[-1, 2])
         forces_N.append((wire.force_N, estimate_N))
-        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # proportional controller
+        # The controller is proportional: it closes in proportion to the missing force.
+        closed_mm += GAIN_MM_N * (aim_N - estimate_N)
         share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)
     return np.array(forces_N)

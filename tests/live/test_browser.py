@@ -1,4 +1,4 @@
-"""Tests of the live page in Chromium: what is drawn, and what buttons, keys and forms do.
+"""Tests of the live page in the browser Chromium: what is drawn, and what buttons, keys and forms do.
 
 The environment variable RESKIN_BROWSER is the path of the browser; by default, Chromium is searched on PATH. Without a
 browser, the tests are skipped. The tests use the browser's debugging protocol and need no additional package. If
@@ -41,12 +41,13 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
-# JavaScript: the colour of the pixel at a place in mm, and the colour of the contact's force in the legend.
+# This JavaScript returns the colour of the pixel at a place in mm, and the colour of the contact's force in the legend.
 DOT = """((x, y) => { const {last, frame, parts: {board}} = boards[0], [px, py] = frame.at(x, y),
   ratio = devicePixelRatio;
   return last.contact ? [...board.getContext("2d").getImageData(ratio * px, ratio * py, 1, 1).data].slice(0, 3).concat(
     strengthColour(last.force).match(/[0-9]+/g).map(Number)) : []; })"""
-# JavaScript: two numbers of pixels: those in which a trace differs from the same trace redrawn at once, and drawn ones.
+# This JavaScript redraws a trace at once. It returns the number of pixels that differ from the trace before, and the
+# number of drawn pixels.
 COMPARE_TRACES = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
   const anew = new Trace(shown.canvas, shown.first, shown.least, shown.below);
@@ -65,7 +66,7 @@ pytestmark = [
 
 
 class Tab:
-    """A page in a browser, controlled by the browser's debugging protocol."""
+    """A page in a browser, which is controlled by the browser's debugging protocol."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket, self._numbers, self.errors = socket, count(1), []
@@ -99,7 +100,7 @@ class Tab:
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
-        """Check that nothing is cut off at the widths of a phone and of a desktop; save screenshots if requested."""
+        """Check that nothing is cut off at the widths of a phone and of a desktop. Save screenshots if requested."""
         for wide in WIDTHS_PX:
             await self.call(
                 "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False
@@ -141,7 +142,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
     return act_in_browser
 
 
-def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
+def test_page_draws_contacts_and_its_buttons_zero_and_record_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
 
@@ -152,16 +153,18 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
                 f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
             )
             colours = np.array(await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []"))
-            assert np.abs(colours[:3] - colours[3:]).max() < 3  # the dot has the colour of its force
+            # The dot on the page has the colour that the legend gives for its force.
+            assert np.abs(colours[:3] - colours[3:]).max() < 3
             await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         await tab.until(
             "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
         )
         await tab.look("network")
-        for trace_i in range(2):  # a scrolled and rescaled trace looks like one that is drawn at once
+        for trace_i in range(2):  # A trace that was scrolled and rescaled must look like one that is drawn at once.
             differ_n, inked_n = await tab.value(f"{COMPARE_TRACES}(boards[0], {trace_i})")
-            assert differ_n < 0.01 * inked_n  # 1 %: Chromium smooths short and long paths differently
+            # The tolerance is 1 % of the pixels, because Chromium smooths short and long paths differently.
+            assert differ_n < 0.01 * inked_n
             assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
         await tab.until("boards[0].state.recording")
@@ -172,9 +175,9 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
             await asyncio.sleep(0.02)
         await tab.until("boards[0].state.zeroed")
         await tab.until("boards[0].parts.zeroed.innerText.startsWith('2 times')")
-        assert await tab.value("boards[0].parts.adapt.disabled")  # only the universal model can adapt
-        # The true place on a real board is unknown, so there is no switch, and nothing is drawn even if the switch were
-        # on.
+        assert await tab.value("boards[0].parts.adapt.disabled")  # Only the universal model can be adapted.
+        # The true place on a real board is unknown, so there is no switch to show it. Nothing would be drawn even if
+        # the switch were on.
         await tab.value("boards[0].parts.truth.checked = true")
         assert await tab.value("boards[0].parts.emulated.offsetHeight") == 0
         assert not await tab.value("boards[0].truthShown()")
@@ -185,7 +188,7 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
     assert (folder / HEADER_FILE).is_file()
 
 
-# JavaScript: click on a place in mm.
+# This JavaScript clicks on a place in mm.
 CLICK = """((x, y) => { const {frame, parts: {board}} = boards[0], [px, py] = frame.at(x, y),
   at = board.getBoundingClientRect();
   board.dispatchEvent(new MouseEvent("click", {clientX: at.left + px, clientY: at.top + py, bubbles: true})); })"""
@@ -199,7 +202,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     true[np.linalg.norm(quiet.frames.b_uT - quiet.frames.b_uT[0], axis=1) < 100] = np.nan
 
     async def act(tab: Tab) -> None:
-        assert not await tab.value("boards[0].truthShown()")  # the true place is shown only on demand
+        assert not await tab.value("boards[0].truthShown()")  # The true place is shown only on demand.
         await tab.value("boards[0].parts.truth.click()")
         await tab.until("boards[0].parts.off.innerText.includes('the estimate is off by')")
         await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
@@ -208,15 +211,14 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
         await tab.value(f"{CLICK}(3.5, 12)")
         typed = "[boards[0].parts.x.value, boards[0].parts.y.value].map(Number)"
         found_mm = await tab.until(typed, lambda values: values != [0, 0])
-        assert (
-            np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
-        )  # mm; a pixel is 0.05 mm, and values have one decimal
+        # The tolerance in mm: a pixel is 0.05 mm, and values have one decimal.
+        assert np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
         await tab.value("boards[0].parts.label.click()")
         await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
         assert await tab.text("learnt") == "1 press labelled by you"
 
         await tab.value("boards[0].parts.skinbox.open = true; boards[0].parts.name.focus()")
-        for key in "zap1":  # typed text must not press the buttons Zero, Adapt and Places
+        for key in "zap1":  # Text that is typed into a field must not press the buttons Zero, Adapt and Places.
             await tab.press_key(key)
         assert await tab.value("boards[0].parts.name.value") == "zap1"
         assert await tab.value("boards[0].state.adapting === '' && boards[0].state.zeroings_n === 1")
@@ -255,12 +257,12 @@ def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  
 
 def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
     quiet = make_poke_script(guided_pokes)
-    # pause before the first place, in which the test presses the button
+    # A pause before the first place, in which the test presses the button.
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)
     script = replace(quiet, t_s=quiet.t_s + late_s)
 
     async def act(tab: Tab) -> None:
-        # 30 rows without contact: longer than the pause between two places
+        # The 30 rows without contact are longer than the pause between two places.
         no_contact = "rows.slice(-30).every(({high}) => high[0] === 0)"
         await tab.until(
             f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {no_contact})(boards[0])"
@@ -281,13 +283,15 @@ def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):
 def test_page_draws_several_boards(tmp_path):
     async def act(tab: Tab) -> None:
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
-        for i in range(1, 8):  # the model is for five chips, so the sleeve of forty chips has no estimate
+        # The model is for five chips, so there is no estimate for the sleeve, which has forty chips.
+        for i in range(1, 8):
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
         for i, rate_hz in enumerate(RATES_HZ[:UNPLUGGED_I]):
             await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")
         await asyncio.to_thread(unplugged.close)
         await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
-        lost = ",".join(["0"] * UNPLUGGED_I + ["NaN"])  # a board without data shows no rate and no further loss
+        # A board that sends no data shows no rate, and loses no further frames.
+        lost = ",".join(["0"] * UNPLUGGED_I + ["NaN"])
         await tab.until("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()", lost.__eq__)
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")

@@ -1,4 +1,4 @@
-"""Tests with random faults: every byte sent by a board is in a frame or counted as lost, with the right reason."""
+"""Tests with random faults: every byte sent by a board is in a frame, or is counted as lost with the right reason."""
 
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +11,7 @@ from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encod
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
-# a script has 8 slots of 12 frames at 400 Hz; one fault per slot, none in the last slot
+# A script has 8 slots of 12 frames at 400 Hz. There is one fault in each slot except the last one.
 SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0
 NOT_FINITE_SHARE = 0.02
 SEEDS_N = 200
@@ -20,20 +20,24 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Return a random script with faults, its undamaged frames, the mask of finite frames, and the random generator."""
+    """Draw a random script with faults.
+
+    Returns the script, its undamaged frames, the mask of finite frames, and the random generator.
+    """
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
     faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
-    # Frames near damage must be finite, because the decoder counts non-finite frames after damage as damaged.
+    # Frames near damage must contain finite numbers, because the decoder counts other frames after damage as damaged.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
     finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
-    for slot_i, name in enumerate(faults):  # faults of chips come first; faults of the wire are injected below
+    for slot_i, name in enumerate(faults):  # Faults of chips are injected first. Faults of the wire are injected below.
         if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
             script = inject(script, make_fault(name, slot_i, rng))
     pieces = list(script.pieces)
-    # Frames with a terminator in the payload must be finite, because otherwise the decoder does not recognise them.
+    # Frames whose numbers contain the bytes of a terminator must be finite, because otherwise the decoder does not
+    # recognise them.
     finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])
     for i in np.flatnonzero(~finite):
         pieces[i] = with_nan(pieces[i], wire)
@@ -57,10 +61,10 @@ def with_nan(piece: bytes, wire: str) -> bytes:
 
 
 def expected_account(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
-    """Return the expected counts of frames and bytes, derived from the injected faults instead of the bytes.
+    """Return the expected counts of frames and bytes.
 
-    The frame after a damaged frame is lost too, because the decoder cannot know where it starts, unless the damaged
-    frame is text and still ends with a line feed.
+    They are derived from the injected faults, and not from the bytes. The frame after a damaged frame is lost too,
+    because the decoder cannot know where it starts, unless the damaged frame is text and still ends with a line feed.
     """
     count: Counter[str] = Counter()
     in_step = True
@@ -84,16 +88,16 @@ def split_randomly(data: bytes, rng: np.random.Generator) -> list[bytes]:
     return [data[first:last] for first, last in pairwise([0, *cuts, len(data)])]
 
 
-def test_every_byte_is_in_a_frame_or_counted_by_reason():
+def test_every_byte_is_in_a_frame_or_counted_as_lost_with_its_reason():
     total: Counter[str] = Counter()
     for seed in range(SEEDS_N):
         script, clean, finite, rng = draw(seed)
         count, data = expected_account(script, clean, finite), b"".join(script.pieces)
-        if seed % 2 and finite[-1]:  # the board is unplugged within the last frame
+        if seed % 2 and finite[-1]:  # The board is unplugged while it sends the last frame.
             left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
             data = data[: len(data) - len(clean[-1]) + left_n]
             count.update(frames_n=-1, frame_bytes_n=-len(clean[-1]), skipped_truncated_bytes_n=left_n)
         _, account = decode_portions(split_randomly(data, rng), script.wire, script.frames.temperature_degC.shape[1])
         assert account == {"bytes_n": len(data)} | {name: count[name] for name in REASONS}, f"seed {seed}"
         total += count
-    assert all(total[name] > 100 for name in REASONS)  # every reason occurred
+    assert all(total[name] > 100 for name in REASONS)  # Every reason for a loss has occurred.

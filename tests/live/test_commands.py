@@ -19,7 +19,10 @@ RATE_BYTES_S = 82 * 400
 
 @pytest.fixture(autouse=True)
 def clock(tmp_path, monkeypatch):
-    """Replace the recorder's clock by one that advances with received bytes, independent of the machine's load."""
+    """Replace the clock of the recorder by one that advances with received bytes.
+
+    Results therefore do not depend on the load of the machine.
+    """
 
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
@@ -39,7 +42,7 @@ def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, caps
     assert (header.wire, header.chips_n, header.capture) == ("text-txyz", 4, folder.name)
 
 
-def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
+def test_record_command_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
         commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **NO_OPTIONS)
@@ -52,20 +55,20 @@ def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
     rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
     assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
     assert rate.method == "arrivals"
-    assert rate.repeated_frames < 0.01  # when the script begins again, a whole frame may repeat
+    assert rate.repeated_frames < 0.01  # When the script begins again, a whole frame may be repeated.
     assert rate.repeated_readings == pytest.approx(2 / 3, abs=0.01)
     output = capsys.readouterr().out
     assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output
 
 
-def test_recording_of_an_emulated_board_is_marked_as_simulated_on_request(tmp_path):
+def test_recording_of_an_emulated_board_can_be_marked_as_simulated(tmp_path):
     for simulated, source in ((True, "simulated"), (False, "recorded")):
         with plugged_in(make_script(), loop=True) as name:
             commands.record(port=name, seconds=0.5, out=tmp_path / source, simulated=simulated, **NO_OPTIONS)
         assert parse((tmp_path / source / HEADER_FILE).read_text(), "header").source == source
 
 
-def test_wire_and_chips_need_a_port(tmp_path):
+def test_options_for_wire_format_and_chips_need_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
             commands.record(None, seconds=0.5, out=tmp_path / "run1", **(NO_OPTIONS | options))

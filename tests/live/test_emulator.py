@@ -1,4 +1,4 @@
-"""Tests of emulated boards: scripts, the times at which bytes are sent, and injected faults."""
+"""Tests of emulated boards: their scripts, the times at which bytes are sent, and injected faults."""
 
 import math
 import threading
@@ -37,7 +37,7 @@ SCRIPT, POKE_SCRIPT = make_script(pokes_n=0), make_script(pokes_n=1)
 
 
 class SimulatedClock:
-    """A clock whose time advances only by waiting; also serves as a stop event that is never set."""
+    """A clock whose time advances only by waiting. It also serves as a stop event that is never set."""
 
     def __init__(self):
         self.s = 0.0
@@ -49,11 +49,11 @@ class SimulatedClock:
         return False
 
     def wait(self, seconds):
-        self.s += max(seconds, 1e-9)  # a smaller step would vanish by rounding
+        self.s += max(seconds, 1e-9)  # A smaller step would vanish by rounding.
 
 
 class FakeReader:
-    """A reader that records the arrival time of each frame. After frame `late_i`, it pauses once, for `late_s`."""
+    """A reader that records when each frame arrives. After frame `late_i`, it pauses once, for `late_s`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
@@ -76,13 +76,13 @@ def times(monkeypatch):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_no_byte_is_lost_while_nobody_reads(port):
+def test_no_byte_is_lost_while_nobody_reads_from_the_open_port(port):
     sent = b"".join(SCRIPT.pieces)
     end, stop, sent_bytes_n = make_port(port), threading.Event(), []
     player = threading.Thread(target=lambda: sent_bytes_n.append(play(SCRIPT, end, stop, speed=math.inf)))
-    with open_port(end.name, 115200) as device:  # opening a port discards bytes that wait there
+    with open_port(end.name, 115200) as device:  # When a port is opened, bytes that wait there are discarded.
         player.start()
-        time.sleep(0.5)  # nobody reads from the port meanwhile
+        time.sleep(0.5)  # During this pause, nobody reads from the port.
         data = b""
         while len(data) < len(sent):
             data += read_waiting(device)
@@ -93,8 +93,8 @@ def test_no_byte_is_lost_while_nobody_reads(port):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_script_restarts_when_the_port_is_reopened(port):
-    # Opening a port discards bytes that wait there, so some of the first frames may be missing.
+def test_script_begins_again_when_the_port_is_reopened(port):
+    # When a port is opened, bytes that wait there are discarded, so some of the first frames may be missing.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
     player = threading.Thread(target=play, args=[script, end, stop], kwargs={"loop": True})
@@ -103,7 +103,8 @@ def test_script_restarts_when_the_port_is_reopened(port):
     for _ in range(2):
         with open_port(end.name, 115200) as device:
             data = b""
-            while len(data) < 8 * len(early):  # long enough to distinguish a restarted stream from one that continues
+            # The loop reads enough bytes to distinguish a stream that begins again from one that continues.
+            while len(data) < 8 * len(early):
                 data += read_waiting(device)
         restarted.append(early in data)
     stop.set()
@@ -114,13 +115,13 @@ def test_script_restarts_when_the_port_is_reopened(port):
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
-def test_speed_multiplies_the_rate_of_the_script(times, speed):
+def test_option_speed_multiplies_the_frame_rate_of_the_script(times, speed):
     reader = FakeReader(times)
     assert play(SCRIPT, reader, times, speed=speed) == len(b"".join(SCRIPT.pieces))
     np.testing.assert_allclose(reader.arrival_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
-def test_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
+def test_reader_that_is_late_gets_at_most_a_tenth_of_a_second_at_once(times):
     reader = FakeReader(times, late_i=100, late_s=2.0)
     play(SCRIPT, reader, times)
     late_s = np.array(reader.arrival_s) - SCRIPT.t_s
@@ -139,13 +140,13 @@ def test_link_has_the_same_name_after_unplugging(tmp_path):
             read_waiting(device)
     assert not link.is_symlink()
     assert not link.exists()
-    stop.set()  # ends the time for which the board is unplugged
+    stop.set()  # This ends the time for which the board is unplugged.
     player.join()
     assert link.is_symlink()
     end.unplug()
 
 
-def test_link_in_use_is_an_error_and_is_not_removed(tmp_path):
+def test_link_that_is_in_use_is_an_error_and_is_not_removed(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     leads_to = link.readlink()
@@ -154,26 +155,26 @@ def test_link_in_use_is_an_error_and_is_not_removed(tmp_path):
     assert link.readlink() == leads_to
     first.unplug()
     assert not link.is_symlink()
-    link.symlink_to(leads_to.with_name("999999"))  # a link left by an emulator that was killed
+    link.symlink_to(leads_to.with_name("999999"))  # A link that was left by an emulator that was killed.
     second = make_port(str(link))
     assert link.exists()
     second.unplug()
 
 
-def test_link_taken_by_another_emulator_is_not_removed(tmp_path):
+def test_link_that_another_emulator_has_taken_over_is_not_removed(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     first.unplug()
     second = make_port(str(link))
     with pytest.raises(ParamsError, match="which is in use"):
         first.plug_in()
-    first.unplug()  # as `reskin emulate` does at its end
+    first.unplug()  # `reskin emulate` does the same at its end.
     assert link.exists()
     second.unplug()
     assert not link.is_symlink()
 
 
-def test_invalid_ports_raise(tmp_path):
+def test_invalid_names_of_ports_are_refused(tmp_path):
     (tmp_path / "file").touch()
     for port in ("usb", "tcp:x", "tcp:99999", str(tmp_path / "file")):
         with pytest.raises(ParamsError, match="--port: "):
@@ -186,7 +187,7 @@ def test_invalid_ports_raise(tmp_path):
 
 
 class TestFaults:
-    def test_value_faults_change_only_frames_within_their_time(self):
+    def test_faults_of_values_change_only_frames_within_their_time(self):
         for name in (
             "failed-read",
             "chip-reset",
@@ -205,7 +206,7 @@ class TestFaults:
             assert differs[inside].mean() > 0.4, name
             assert [len(piece) for piece in changed.pieces] == [len(piece) for piece in SCRIPT.pieces]
 
-    def test_byte_faults_change_the_number_of_frames(self):
+    def test_faults_of_bytes_change_the_number_of_frames(self):
         def frames_n(name: str) -> int:
             return len(
                 decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
@@ -213,7 +214,7 @@ class TestFaults:
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
-        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # a torn frame also costs the next frame
+        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # Each torn frame also costs the frame after it.
 
     def test_clock_jump_needs_frames_with_a_clock(self):
         with pytest.raises(ParamsError, match="needs a capture with a clock"):
@@ -224,13 +225,13 @@ class TestFaults:
         assert len(inject(make_script(pokes_n=0, wire="binary-clock"), parse_fault("clock-jump@0.5"))) == len(SCRIPT)
 
     @pytest.mark.parametrize("text", ["", "stick", "stuck@", "stuck@-1", "stuck@1+", "stuck@99", "stuck@1e9"])
-    def test_invalid_faults_raise(self, text):
+    def test_invalid_faults_are_refused(self, text):
         with pytest.raises(ParamsError, match="--fault: "):
             inject(SCRIPT, parse_fault(text))
 
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
-def test_script_of_a_capture_has_its_bytes_and_times(tmp_path, wire):
+def test_script_of_a_capture_has_the_bytes_and_times_of_the_capture(tmp_path, wire):
     sent = make_script(pokes_n=1, wire=wire)
     write_script(sent, tmp_path / "c0")
     script = read_script(str(tmp_path / "c0"))
@@ -239,13 +240,13 @@ def test_script_of_a_capture_has_its_bytes_and_times(tmp_path, wire):
     assert script.duration_s == pytest.approx(len(script) / 400)
 
 
-def test_script_of_an_sd_card_log_has_its_frames(tmp_path):
+def test_script_of_an_sd_card_log_has_the_frames_of_the_log(tmp_path):
     frames = POKE_SCRIPT.frames
     log = render(1 + POKE_SCRIPT.t_s, frames.b_uT, frames.temperature_degC)
     header = make_header(capture="c0", layout="sd-card", clock=Clock(kind="recording", rate_hz=None, marks=()))
     write_capture(tmp_path / "c0", header, {LOG_FILE: log.encode()})
     script = read_script(str(tmp_path / "c0"))
-    np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # the log has two decimals
+    np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # Tolerance: the log has two decimals.
     np.testing.assert_allclose(script.t_s, POKE_SCRIPT.t_s, atol=1e-4)
 
 
@@ -254,13 +255,15 @@ def test_script_of_a_simulation_has_contacts(source):
     script = read_script(source)
     assert script.frames.b_uT.shape == (len(script), 15)
     assert np.all(np.diff(script.t_s) >= 0)
-    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # contacts change the field by more than 100 uT
+    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # Contacts change the field by more than 100 uT.
     true = script.true_contacts
     contact = np.isfinite(true[:, 0])
     np.testing.assert_array_equal(np.isfinite(true), np.repeat(contact[:, None], 3, axis=1))
     change_uT = np.linalg.norm(script.frames.b_uT - script.frames.b_uT[~contact].mean(axis=0), axis=1)
-    assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])  # uT; the noise of 15 channels is about 15 uT
-    # True forces and field changes are simultaneous, so a shift by a frame or more reduces their correlation.
+    # In uT. The noise of 15 channels together is about 15 uT.
+    assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])
+    # The true forces belong to the same times as the field changes, so a shift by a frame or more reduces their
+    # correlation.
     force_N = np.nan_to_num(true[:, 2])
     correlation = [np.corrcoef(np.roll(force_N, lag), change_uT)[0, 1] for lag in range(-5, 6)]
     assert np.argmax(correlation) == 5
@@ -270,7 +273,7 @@ def test_true_contacts_of_a_capture_are_unknown(tmp_path):
     assert read_script(str(write_script(POKE_SCRIPT, tmp_path / "c0"))).true_contacts is None
 
 
-def test_true_contact_belongs_to_the_last_frame_sent(times):
+def test_true_contact_is_that_of_the_last_frame_that_was_sent(times):
     true = np.arange(3.0 * len(SCRIPT)).reshape(-1, 3)
     script, found = replace(SCRIPT, true_contacts=true), []
     board = EmulatedBoard(script, SimpleNamespace(name="port"))
@@ -285,7 +288,7 @@ def test_true_contact_belongs_to_the_last_frame_sent(times):
     assert found[-1][0] == len(script)
 
 
-def test_true_places_are_printed_when_a_touch_begins(times):
+def test_true_place_is_printed_when_a_touch_begins(times):
     true, printed = np.full((len(SCRIPT), 3), np.nan), []
     true[100:150], true[300:400] = (4.0, 12.0, 0.5), (12.0, 4.0, 1.5)
     true[320, 2] = 1.75
@@ -303,7 +306,7 @@ def test_true_places_are_printed_when_a_touch_begins(times):
         TouchPrinter(SCRIPT, "captures/run1", print)
 
 
-def test_invalid_sources_raise(tmp_path):
+def test_invalid_sources_are_refused(tmp_path):
     for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
         with pytest.raises(ReskinError, match="must be the folder of a capture|recorded, not simulated") as error:
             read_script(source)
@@ -317,32 +320,33 @@ def robot_script():
 
 class TestRobot:
     @pytest.mark.parametrize("batch_n", [1, 7])
-    def test_log_of_the_robot_gives_one_labelled_touch_per_place_and_pass(
+    def test_log_of_the_emulated_robot_gives_one_labelled_touch_per_place_and_pass(
         self, robot_script, tmp_path, monkeypatch, batch_n
     ):
         clock = SimpleNamespace(s=0.0, time=lambda: clock.s)
         monkeypatch.setattr("reskin.live.emulator.time", clock)
         log = RobotLog(robot_script, tmp_path / "robot.csv")
-        for i in range(batch_n - 1, len(robot_script), batch_n):  # late frames are sent in batches
+        for i in range(batch_n - 1, len(robot_script), batch_n):  # Frames that are late are sent in batches.
             clock.s = 1e9 + robot_script.t_s[i]
             log(i)
         log.close()
         dwells = list(DwellBuilder().feed(SampleTable("log").feed((tmp_path / "robot.csv").read_bytes())))
         touches = [dwell for dwell in dwells if dwell.label.contact]
-        assert len(dwells) == 2 * len(touches)  # the rows after the last touch are not closed
+        # The rows after the last touch are not ended by another phase, so they become no dwell.
+        assert len(dwells) == 2 * len(touches)
         for pass_i in range(2):
             places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
             assert sorted(places) == sorted(map(tuple, points_mm().tolist()))
-        for touch in touches:  # at any time of the dwell, the label is the true contact
+        for touch in touches:  # At any time of a dwell, its label is the true contact.
             inside = (robot_script.t_s >= touch.t_start_s - 1e9) & (robot_script.t_s <= touch.t_end_s - 1e9)
             true = robot_script.true_contacts[inside]
             assert np.isfinite(true).all()
             np.testing.assert_allclose(true[:, 2], touch.label.Fz_N, rtol=2e-3)
 
-    def test_boards_with_other_names_have_other_skins(self, robot_script):
+    def test_boards_with_different_names_have_different_skins(self, robot_script):
         other = read_script("nominal", board="b2", robot=True)
         untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
-        assert np.abs(untouched[0] - untouched[1]).max() > 50  # uT
+        assert np.abs(untouched[0] - untouched[1]).max() > 50  # The difference is in uT.
 
     def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")

@@ -1,4 +1,4 @@
-"""Tests of the models of a live board: estimates, calibration from the page, unknown skins."""
+"""Tests of the models of a live board: estimates, calibration from the page, and unknown skins."""
 
 import re
 import time
@@ -30,7 +30,10 @@ def random_pokes():
 
 
 def make_poke_script(pokes, rotated_n: int = 0):
-    """Return a script: no contact, then all pokes with pauses. The order of chips is rotated by `rotated_n`."""
+    """Return a script: no contact at first, then all pokes with pauses.
+
+    The numbers of the chips are shifted by `rotated_n`, as if chips were exchanged.
+    """
     noload_uT, b_uT, _, _ = pokes
     script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
@@ -51,24 +54,28 @@ def test_universal_model_estimates_places_and_their_standard_deviation(random_po
     assert 0.2 < np.median(error_mm) / np.median(sd_mm) < 2.0
     sd_F_N = np.concatenate([batch.sd_F_N[batch.contact] for batch in readings])
     force_N = estimates[:, 2]
-    np.testing.assert_allclose(sd_F_N, force_N * prior_line().apply(np.log(force_N))[1])  # no force is known
+    # The forces are not calibrated, because no force of a press is known.
+    np.testing.assert_allclose(sd_F_N, force_N * prior_line().apply(np.log(force_N))[1])
     assert skin.health.alarms == {}
 
 
-def test_board_with_swapped_chips_raises_the_alarm_unknown_skin(random_pokes):
+def test_board_with_exchanged_chips_raises_the_alarm_unknown_skin(random_pokes):
     skin, _ = play_to_skin(make_poke_script(random_pokes, rotated_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 
 
 def turn_in_uniform_field(script: Script, size_uT: float) -> Script:
-    """Add the change of a uniform field while the board turns about its x axis, once in two seconds after the start."""
+    """Add the change of a uniform field that is seen by a turning board.
+
+    After the start, the board turns about its x axis, once in two seconds.
+    """
     angle = np.where(script.t_s < QUIET_N / 400, 0.0, np.pi * (script.t_s - QUIET_N / 400))
     change_uT = size_uT * np.column_stack([np.zeros(len(script)), np.sin(angle), np.cos(angle) - 1])
     script.frames.b_uT[:] += to_chips(np.tile(change_uT, 5)).astype(np.float32)
     return Script("simulated", "binary", script.frames, encode_pieces(script.frames, "binary"), script.t_s)
 
 
-def test_turning_board_has_only_true_contacts_if_external_fields_are_expected(random_pokes):
+def test_turning_board_has_no_false_contacts_if_external_fields_are_expected(random_pokes):
     poked = (np.arange(QUIET_N + 2 * POKED_N * PRESSES_N) - QUIET_N) % (2 * POKED_N) < POKED_N
     poked[:QUIET_N] = False
     true_mm = np.repeat(random_pokes[2], POKED_N, axis=0)
@@ -89,30 +96,30 @@ def test_turning_board_has_only_true_contacts_if_external_fields_are_expected(ra
             assert "external field" in alarms
 
 
-def test_stronger_external_fields_than_expected_raise_the_alarm(random_pokes):
+def test_external_fields_that_are_stronger_than_expected_raise_an_alarm(random_pokes):
     script = turn_in_uniform_field(make_poke_script(random_pokes), 300.0)
     skin, _ = play_to_skin(script, load_universal(external_uT=50.0))
     assert "external field" in {name.split(":")[0] for name in skin.health.alarms}
 
 
-def test_model_adapts_to_collected_presses(random_pokes):
+def test_model_is_adapted_to_collected_presses(random_pokes):
     _, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     pokes = Presses()
     for batch in readings:
         pokes.add(batch)
     assert pokes.complete
     change_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
-    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # tolerance in uT: readings have noise of 3 uT
+    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # The tolerance in uT allows for noise of 3 uT.
     estimator = UniversalEstimator(load_universal())
     estimator.set_noload(random_pokes[0])
     assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
     before = estimator(pokes.db_uT.astype(np.float32))
-    estimator.set_noload(random_pokes[0])  # a new no-load reading keeps the adaptation
+    estimator.set_noload(random_pokes[0])  # A new no-load reading keeps the adaptation.
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
 class PressedWhileAdapting(UniversalEstimator):
-    """An estimator that is adapted again, by the button Adapt, while an adaptation runs."""
+    """An estimator on which the button Adapt is pressed again while an adaptation runs."""
 
     session: Session
     times_n: int
@@ -124,7 +131,7 @@ class PressedWhileAdapting(UniversalEstimator):
 
 
 @pytest.mark.parametrize(("times_n", "instruction"), [(0, ""), (1, ""), (2, f"press 1 of {PRESSES_N}, anywhere")])
-def test_button_during_adaptation_keeps_the_presses(random_pokes, times_n, instruction):
+def test_button_adapt_pressed_during_an_adaptation_keeps_the_presses(random_pokes, times_n, instruction):
     session = Session("played", load_universal(), "a board")
     session.skin.reader = reader = ScriptReader(make_poke_script(random_pokes))
     session.skin.estimator = estimator = PressedWhileAdapting(load_universal())
@@ -153,7 +160,7 @@ def test_presses_within_the_noise_are_refused(random_pokes):
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
 
 
-def test_new_presses_replace_earlier_ones(random_pokes):
+def test_new_presses_replace_the_earlier_ones(random_pokes):
     db_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
     corrected, adapted_once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for estimator in (corrected, adapted_once):
@@ -175,7 +182,7 @@ def guided_pokes():
     return noload_uT, b_uT, places[:, :2], force_N
 
 
-def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
+def test_presses_guided_by_the_page_calibrate_and_test_the_model(guided_pokes):
     _, readings = play_to_skin(make_poke_script(guided_pokes), load_universal())
     pokes, crosses = GuidedPresses(), []
     for batch in readings:
@@ -192,17 +199,17 @@ def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
     held_out_mm = np.linalg.norm(found - guided_pokes[2][pokes.held_out], axis=1)
     assert after_mm == pytest.approx(np.median(held_out_mm), abs=0.006)
     assert after_mm < before_mm
-    estimator.set_noload(guided_pokes[0])  # a new no-load reading keeps the calibration
+    estimator.set_noload(guided_pokes[0])  # A new no-load reading keeps the calibration.
     np.testing.assert_allclose(
         estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6
     )
 
 
-def test_guided_presses_add_to_the_labels_of_a_calibration(guided_pokes):
+def test_presses_guided_by_the_page_are_added_to_the_labels_of_a_calibration(guided_pokes):
     noload_uT, b_uT, place_mm, force_N = guided_pokes
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     calibrated = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
-    # Presses at places shown by the page have no measured force.
+    # The page shows only places, so these presses have no measured force.
     model = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
     expected = model.label(place_mm[~kept], None, b_uT[~kept], keep=True).predict(b_uT)
     estimator = UniversalEstimator(calibrated)
@@ -219,19 +226,20 @@ def test_short_contact_is_not_a_press():
     assert len(pokes) == 0
 
 
-def test_universal_model_is_refused_for_other_chips():
+def test_universal_model_is_refused_for_boards_with_another_number_of_chips():
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place or force: the universal model is for 5 chips. Use a model for this board." in skin.alarms()
     assert all(np.isnan(batch.target).all() for batch in readings)
 
 
-def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
+def test_board_opened_with_a_saved_calibration_uses_it(random_pokes, tmp_path):
     noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
     before, mean = calibrated.predict(b_uT), calibrated.skin.mean
-    (tmp_path / "s3.json").write_text("{}")  # a user's file of this name, which is not the card of the model s3
+    # This is a user's file. It has the name of the card of model s3, but is not a card.
+    (tmp_path / "s3.json").write_text("{}")
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)
         estimates = np.concatenate([batch.target[batch.contact] for batch in readings])
@@ -240,7 +248,7 @@ def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
             [batch.target[batch.contact] for batch in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
         )
         assert np.abs(estimates[:, :2] - true_mm).mean() < 0.6 * np.abs(uncalibrated[:, :2] - true_mm).mean()
-    # opening a board does not change the model passed by the user
+    # Opening a board does not change the model that the user has passed.
     np.testing.assert_array_equal(calibrated.predict(b_uT), before)
     np.testing.assert_array_equal(calibrated.skin.mean, mean)
 

@@ -1,4 +1,4 @@
-"""Tests that the example in docs/add-a-skin.md runs, with a fake of a robot."""
+"""Tests that the example in docs/add-a-skin.md runs, with a substitute for the robot."""
 
 import re
 from types import SimpleNamespace
@@ -10,7 +10,7 @@ PAGE = (ROOT / "docs/add-a-skin.md").read_text()
 EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGE, re.DOTALL))
 
 
-def test_robot_example(monkeypatch):
+def test_example_of_a_robot_in_the_docs_runs(monkeypatch):
     moved, recorded = [], []
     robot = SimpleNamespace(
         places_in_random_order=lambda: [(4.0, 8.0), (0.0, 2.0)], lift_and_go_to=lambda *place: moved.append(place),

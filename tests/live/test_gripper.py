@@ -1,23 +1,23 @@
-"""Test that a proportional controller keeps the estimated force at half a newton while the object stiffens."""
+"""Test that a proportional controller keeps the estimated force at half a newton while the object becomes stiffer."""
 
 import numpy as np
 
 from reskin.seeds import rng_for
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
-SEEDS = range(3)  # seeds; each draws a skin and trains a network
+SEEDS = range(3)  # For each seed, a skin is drawn and a network is trained.
 
 
-def test_controller_holds_half_a_newton():
-    """Measured over 12 seeds (mean +- standard deviation): the estimated force is held at 0.512 +- 0.002 N.
+def test_controller_holds_the_estimated_force_at_half_a_newton():
+    """Over 12 seeds, the estimated force was held at 0.512 N, with a standard deviation of 0.002 N.
 
-    The true force differs from the aim by 15 +- 9 % (mean of three seeds: 15 +- 5 %). The maximum force is 0.7 N.
+    The true force differed from the aim by 15 +- 9 % (mean of three seeds: 15 +- 5 %). The maximum force was 0.7 N.
     """
     errors = []
     for seed in SEEDS:
         held = grip(Finger(seed), [fit(seed, pokes_n=300)], rng_for(seed, "grip"), seconds=PERIOD_S / 2)
         true_N, estimate_N = held[round(SETTLED_S * RATE_HZ) :].T
         assert abs(estimate_N.mean() / AIM_N - 1) < 0.05
-        assert held[:, 0].max() < 2 * AIM_N  # no overshoot at the first touch
+        assert held[:, 0].max() < 2 * AIM_N  # There is no overshoot at the first touch.
         errors.append(abs(true_N.mean() / AIM_N - 1))
     assert np.mean(errors) < 0.35

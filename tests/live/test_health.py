@@ -1,4 +1,4 @@
-"""Tests that every fault raises an alarm with the number of the chip, and that a healthy board raises no alarm."""
+"""Tests that every fault raises an alarm with the number of the chip, and that a healthy board raises none."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ ALARMS = {
 
 
 def feed(script, frames_n=7):
-    """Feed the frames of a script in batches of `frames_n`; return the health monitor."""
+    """Feed the frames of a script to a health monitor, in batches of `frames_n`. Return the monitor."""
     health, frames = Health(script.frames.temperature_degC.shape[1]), script.frames
     for first in range(0, len(frames), frames_n):
         rows = (np.arange(len(frames)) >= first) & (np.arange(len(frames)) < first + frames_n)
@@ -33,11 +33,11 @@ def feed(script, frames_n=7):
 
 
 def inject_fault(name, wire="binary"):
-    """Return a script with a fault at 1.5 s; its frames are decoded from the damaged bytes."""
+    """Return a script with a fault at 1.5 s. Its frames are decoded from the damaged bytes."""
     from reskin.board.stream import decode_all
     from reskin.live.emulator import Script
 
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset lasts until the end
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # A reset of a chip lasts until the end of the script.
     script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{duration_s}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))
@@ -55,7 +55,7 @@ def test_fault_is_named_and_counted(name):
     health = feed(inject_fault(name))
     assert set(health.alarms) == {ALARMS[name]}
     alarm = health.alarms[ALARMS[name]]
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset is found only after 400 frames
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # A reset of a chip is found only after 400 frames.
     assert 1.4 <= alarm.first_s <= 1.5 + duration_s
     assert alarm.last_s <= 1.6 + duration_s
     assert alarm.count_n >= 100
@@ -64,7 +64,7 @@ def test_fault_is_named_and_counted(name):
 
 
 def fail_reads_of_chip_0(script, every_n):
-    """Return the script with failed reads of chip 0, one in `every_n` frames."""
+    """Return the script with failed reads of chip 0. One in `every_n` frames has a failed read."""
     b_uT, temperature_degC = script.frames.b_uT.copy(), script.frames.temperature_degC.copy()
     b_uT[every_n - 1 :: every_n, :3], temperature_degC[every_n - 1 :: every_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     return replace(script, frames=replace(script.frames, b_uT=b_uT, temperature_degC=temperature_degC))
@@ -78,21 +78,22 @@ def test_failed_reads_of_another_chip_do_not_hide_a_fault(name, every_n):
 
 
 @pytest.mark.parametrize("every_n", [3, 30, BATCH_FRAMES_N])
-def test_stuck_chip_is_invalid_despite_failed_reads(every_n):
-    script = fail_reads_of_chip_0(inject_fault("stuck"), every_n)  # chip 1 is stuck from 1.5 to 3.0 s
+def test_frames_with_a_stuck_chip_are_invalid_even_if_another_chip_has_failed_reads(every_n):
+    script = fail_reads_of_chip_0(inject_fault("stuck"), every_n)  # Chip 1 is stuck from 1.5 to 3.0 s.
     health, used = Health(5), np.zeros(len(script), bool)
     for i in range(len(script)):
         used[i : i + 1] = health.feed(script.frames.where(np.arange(len(script)) == i), float(script.t_s[i]))
-    # A stuck chip is detected within two batches of frames without failed reads. Up to a third of the frames have a
-    # failed read.
+    # A stuck chip is detected within two batches of frames without failed reads. Here, up to a third of the frames have
+    # a failed read, so detection takes longer.
     found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400
     assert not used[(script.t_s > found_s) & (script.t_s < 2.95)].any()
     assert used[script.t_s < 1.5].any()
 
 
-def test_reset_is_found_on_a_quiet_board():
+def test_reset_chip_is_found_on_a_board_without_contact():
     rng, step_uT = np.random.default_rng(0), np.tile([0.15, 0.15, 0.242], 5)
-    step_uT[3:6] = RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT  # steps of chip 1 at its power-on settings
+    # These are the steps of chip 1 at the settings that it has after power-on.
+    step_uT[3:6] = RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT
     b_uT = np.round(rng.normal(0, 1.0, (1200, 15)) / step_uT) * step_uT
     script = make_script(pokes_n=2)
     frames = replace(script.frames.where(np.arange(len(script)) < 1200), b_uT=b_uT.astype(np.float32))
@@ -107,21 +108,21 @@ def test_chip_that_reads_zeros_is_named():
     }
 
 
-def test_repeated_frames_and_clock_jumps_raise_alarms():
+def test_repeated_frames_and_jumps_of_the_clock_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
 
-def test_readings_of_slow_chips_raise_an_alarm():
+def test_chips_that_are_slower_than_the_frames_raise_an_alarm():
     health = feed(inject_fault("slow-chips"))
     assert set(health.alarms) == {READINGS_REPEAT}
     alarm = health.alarms[READINGS_REPEAT]
-    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # two thirds of the readings in 1.5 s
+    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # These are two thirds of the readings in 1.5 s.
     assert 1.5 < alarm.first_s <= 1.5 + REPEATS_FRAMES_N / 400
     assert alarm.action == "flag"
 
 
-def test_missing_frames_raise_the_alarm_slower_than_before():
+def test_missing_frames_raise_the_alarm_that_the_board_is_slower_than_before():
     half = (np.arange(len(SCRIPT)) < 1000) | (np.arange(len(SCRIPT)) % 2 == 0)
     health = Health(5)
     for i in np.flatnonzero(half):
@@ -150,10 +151,10 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_equal_change_on_all_chips_is_an_external_field():
+def test_equal_change_on_all_chips_is_reported_as_an_external_field():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
-    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to be judged
+    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # This change is too weak to be judged.
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)
@@ -171,7 +172,7 @@ def test_fault_policy_decides_which_frames_are_valid():
             assert (alarm.action, alarm.count_n) == (action, 20)
 
 
-def test_stuck_chip_is_invalid_unless_flagged():
+def test_frames_with_a_stuck_chip_are_invalid_unless_the_policy_flags_them():
     for action, unused_n in (("drop", 500), ("flag", 0)):
         health, script, lost_n = Health(5, override(LIVE_POLICY, [f"stuck={action}"], "test")), inject_fault("stuck"), 0
         for first in range(0, len(script.frames), 10):
@@ -193,7 +194,7 @@ RESET, FAILED = "resolution differs from the other chips: reset", "failed I2C re
         ("faults/b20_artillery_piezo.head400.txt", [f"chip {i}: {RESET}" for i in range(5)]),
     ],
 )
-def test_alarms_of_real_recordings(shared_data, name, alarms):
+def test_real_recordings_raise_the_expected_alarms(shared_data, name, alarms):
     chips = np.loadtxt(shared_data / "ini" / name, dtype=np.float32).reshape(-1, 5, 4)
     b_uT, temperature_degC = chips[..., :3].reshape(len(chips), -1), chips[..., 3]
     health = Health(5)

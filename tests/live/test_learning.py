@@ -31,9 +31,9 @@ LONG_S = 20.0
 
 
 class PausingReader(ScriptReader):
-    """A reader that pauses at given times of the script until `resume` is called, and can write a recording.
+    """A reader that pauses at given times of the script until `resume` is called, and that can write a recording.
 
-    As in a real reader, the time is a unix time: that of the start plus the time in the script.
+    As in a real reader, the time is a unix time. It is the time of the start plus the time in the script.
     """
 
     def __init__(self, script, pauses_s=()):
@@ -46,7 +46,7 @@ class PausingReader(ScriptReader):
 
     def resume(self):
         self._pauses_s.pop(0)
-        self.waiting.clear()  # `take` sets it again at the next pause
+        self.waiting.clear()  # `take` sets the event again at the next pause.
 
     def write_to(self, writer):
         if self._writer is not None:
@@ -65,7 +65,7 @@ class PausingReader(ScriptReader):
 
 
 def until(condition, session=None):
-    """Wait until a condition is true; fail if the session's thread ends."""
+    """Wait until a condition is true. Fail if the thread of the session ends."""
     end_s = time.monotonic() + LONG_S
     while not condition():
         assert session is None or session._thread.is_alive(), session.state()["alarms"]
@@ -74,7 +74,7 @@ def until(condition, session=None):
 
 
 def running(script, models, *, pauses_s=(), **options):
-    """Start a session that plays a script; return the session and its reader."""
+    """Start a session that plays a script. Return the session and its reader."""
     session = Session("played", models, "a board", **options)
     session.skin.reader = reader = PausingReader(script, pauses_s)
     session.start()
@@ -82,7 +82,7 @@ def running(script, models, *, pauses_s=(), **options):
 
 
 def text_after(session, message, key="adapted"):
-    """Send a message as the page does. Return the text that appears under `key` in the state as a result."""
+    """Send a message as the page does. Return the text that then appears under `key` in the state of the page."""
     setattr(session, f"_{key}", "")
     receive(session, json.dumps(message))
     until(lambda: session.state()[key], session)
@@ -133,7 +133,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         assert "loaded" in text_after(session, {"load": "s1"})
         off_skin = {"label": {"x_mm": 1, "y_mm": 99, "force_N": 1, "learn": True}}
         assert "y must be a number above -2 and below 18 mm; got 99" in text_after(session, off_skin, "labelled")
-        # tolerance in mm and N: the file stores presses in single precision
+        # The tolerance in mm and N is due to the file, which stores presses in single precision.
         np.testing.assert_allclose(session.skin.estimator(db_uT).target, adapted, atol=0.02)
         state = session.state()
         assert state["model"] == "universal model, shipped with reskin, with the saved skin s1"
@@ -145,7 +145,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
     assert sorted(file.name for file in folder.iterdir()) == ["s1.safetensors", "s3.safetensors"]
 
 
-def test_skin_folder_must_not_be_a_file(tmp_path):
+def test_folder_of_skins_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "skins").touch()
     with pytest.raises(ParamsError, match="--skins: .*skins is a file, not a folder"):
         SkinFolder(tmp_path / "skins")
@@ -165,7 +165,7 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     model = load_universal().zero(noload_uT).label(place_mm[labelled], force_N[labelled], b_uT[labelled])
     expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
     found = estimator(db_uT.astype(np.float32)).target
-    np.testing.assert_allclose(found, expected, atol=0.02)  # mm and N; single precision
+    np.testing.assert_allclose(found, expected, atol=0.02)  # The tolerance in mm and N is that of single precision.
     for wrong_mm, wrong_N, message in (((99.0, 8.0), 1.0, "on the skin"), ((8.0, 8.0), 900.0, "the model's range")):
         with pytest.raises(SchemaError, match=message):
             estimator.add_label(wrong_mm, wrong_N, db_uT[3])
@@ -176,7 +176,7 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
 
 def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    second_s = QUIET_S + POKE_S + 1.0  # in the pause before the script's second press
+    second_s = QUIET_S + POKE_S + 1.0  # The label is sent in the pause before the second press of the script.
     script = make_script(pokes_n=3)
     session, reader = running(script, [], pauses_s=[QUIET_S - 0.2, second_s])
     try:
@@ -196,7 +196,7 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
         assert session.state()["labelling"] == "press at x 4 mm, y 12 mm with 0.8 N."
         assert session.state()["label_mm"] == [4.0, 12.0]
         reader.resume()
-        # The pause before the first press was too short, so that press is not used for the label.
+        # The pause before the first press was too short for a no-load reading, so this press is not used for the label.
         until(reader.waiting.is_set, session)
         until(lambda: session.state()["labelling"].endswith("lift for a second, then press again"), session)
         receive(session, json.dumps({"label": place | {"force_N": None, "x_mm": 12, "y_mm": 4}}))
@@ -213,20 +213,22 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     blocks, account = read(folder)
     assert places_of(blocks) == {(12.0, 4.0)}
     assert account["clock_residual_us"] == 0
-    # The second press of the script lasts one second: nearly all of its frames, and no frame without contact.
+    # The second press of the script lasts one second. Nearly all of its frames are labelled, and no frame without
+    # contact.
     assert 0.9 * 400 * POKE_S < account["frames_contact_n"] <= 400 * POKE_S
     log = probe.parse(folder / PROBE_FILE, "log")
     assert np.isnan(log.Fz_N).all()
     changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
-    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # in uT; each press changes the field by more than 600 uT
+    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # In uT. Each press changes the field by more than 600 uT.
 
 
 def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
     monkeypatch.chdir(tmp_path)
     script = make_poke_script(guided_pokes)
-    step_uT = np.tile([0.15, 0.15, 0.242], 5)  # `reskin add` checks the steps of the chips
+    # The readings are multiples of the steps of the chips, because `reskin add` checks this.
+    step_uT = np.tile([0.15, 0.15, 0.242], 5)
     script.frames.b_uT[:] = np.rint(script.frames.b_uT / step_uT) * step_uT
-    # with pauses of 1.25 s between the presses
+    # There are pauses of 1.25 s between the presses.
     slow = replace(script, pieces=encode_pieces(script.frames, "binary"), t_s=5 * script.t_s)
     session, reader = running(slow, load_universal(), pauses_s=[5 * (QUIET_N - 80) / 400])
     try:
@@ -250,11 +252,11 @@ def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, m
     changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
     place_mm = np.concatenate([np.column_stack([block.x_mm, block.y_mm]) for block in blocks])
     press_i = np.linalg.norm(place_mm[:, None] - guided_pokes[2], axis=2).argmin(axis=1)
-    # tolerance in uT: the noise is 3 uT, and each reading must be of the press at its label
+    # The tolerance in uT allows for noise of 3 uT. Each reading must be of the press at the place of its label.
     np.testing.assert_allclose(changes_uT, poked_uT[press_i], atol=30)
 
 
-def test_press_without_recorded_no_load_readings_is_refused(tmp_path, monkeypatch):
+def test_label_of_a_press_is_refused_if_no_no_load_readings_were_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     press, reader = LabelledPress(Label(True, 1.0, 2.0), learn=False), PausingReader(make_script(pokes_n=0))
     recording = PageRecording(find.DetectedBoard("/dev/board", None, "binary", 5), reader, port_in_name=True)
@@ -270,7 +272,7 @@ def test_press_without_recorded_no_load_readings_is_refused(tmp_path, monkeypatc
 
 
 def feed(press, contact, seconds, rate_hz=100.0):
-    """Add readings with or without contact to a press; in contact, every channel changes by 100 uT."""
+    """Add readings with or without contact to a press. In contact, every channel changes by 100 uT."""
     start_s = feed.t_s
     t_s = start_s + np.arange(round(seconds * rate_hz)) / rate_hz
     feed.t_s = start_s + seconds
@@ -303,7 +305,7 @@ def test_page_describes_the_model_and_its_expected_accuracy(random_pokes, tmp_pa
     shipped = UniversalEstimator(load_universal())
     texts = describe(shipped, load_universal(), "")
     assert texts["model"] == "universal model, shipped with reskin"
-    for each in measured.places[0].median_mm:  # one value per recorded board
+    for each in measured.places[0].median_mm:  # There is one value for each recorded board.
         assert f"{each:.1f}" in texts["expected"]
     assert all(f"{each:.2g}" in texts["least_force"] for each in measured.detection.lightest_N)
     assert f"{shipped.model.tables.force_N[0]:.2g} N" in texts["least_force"]
@@ -325,7 +327,7 @@ def test_page_describes_the_model_and_its_expected_accuracy(random_pokes, tmp_pa
     assert texts["least_force"].startswith("not measured; trained with simulated forces from ")
 
 
-def test_page_describes_networks_by_the_scores_in_their_cards(tmp_path):
+def test_page_describes_networks_by_the_scores_in_their_model_cards(tmp_path):
     network = read_network(write_model(tmp_path))
     scores = {"all": {"accuracy_pct": 71.4, "mse_xy_mm2": 0.512}}
     scored = replace(network, card=network.card | {"scores": scores, "test_boards": ["b0", "b1"]})

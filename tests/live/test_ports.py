@@ -16,11 +16,14 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # frames per chunk; chunks start in the middle of a frame
+CHUNK_N = 3  # The number of frames per chunk. Chunks start in the middle of a frame.
 
 
 def chunks_of(script, cut_n=31):
-    """Return the script's bytes in chunks, without the first `cut_n` bytes (the port is opened within a frame)."""
+    """Return the bytes of the script in chunks.
+
+    The first `cut_n` bytes are missing, because the port is opened while a frame is being sent.
+    """
     data = b"".join(script.pieces)[cut_n:]
     size = CHUNK_N * len(script.pieces[0])
     every_s = CHUNK_N * script.duration_s / len(script)
@@ -29,17 +32,18 @@ def chunks_of(script, cut_n=31):
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
 @pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
-def test_wire_chips_rate_and_lsb_are_detected(wire, chips_n, rate_hz):
+def test_wire_format_number_of_chips_rate_and_steps_are_detected(wire, chips_n, rate_hz):
     script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
     found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
     assert found.rate_hz == pytest.approx(rate_hz, rel=0.03)
-    np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)  # text frames have two decimals
+    # The relative tolerance is for text frames, which have two decimals.
+    np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)
     assert found.gain_sel == 7
     assert f"{chips_n} chips" in str(found)
 
 
-def test_other_devices_are_not_boards():
+def test_devices_that_send_other_bytes_are_not_taken_for_boards():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "wrong baud rate" in str(find.recognise("port", wrong_baud))
@@ -48,7 +52,7 @@ def test_other_devices_are_not_boards():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_arbitrary_bytes_are_described_without_error(data, size):
+def test_arbitrary_bytes_are_described_without_an_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     found = find.recognise("port", chunks)
     assert str(found).startswith("port: ")
@@ -56,7 +60,7 @@ def test_arbitrary_bytes_are_described_without_error(data, size):
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
-def test_frames_of_random_values_are_described(seed, chips_n):
+def test_frames_with_random_values_are_described_without_an_error(seed, chips_n):
     rng = rng_for(seed, "numbers")
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
@@ -66,7 +70,7 @@ def test_frames_of_random_values_are_described(seed, chips_n):
     assert found.describe_rate().startswith("port: ")
 
 
-def test_chips_without_noise_have_no_lsb():
+def test_chips_without_noise_have_no_detectable_step():
     script = make_script(pokes_n=0)
     without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
     assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
@@ -85,7 +89,7 @@ def test_chips_without_noise_have_no_lsb():
     ],
     ids=["live", "record", "gauge", "emulated port", "emulated source", "live --emulate", "skins"],
 )
-def test_file_instead_of_a_port_is_an_error_of_one_sentence(tmp_path, monkeypatch, command):
+def test_file_given_as_a_port_is_an_error_of_one_sentence(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "notes.txt"
     file.write_text("not a port")
@@ -110,11 +114,12 @@ def test_other_device_is_not_a_serial_port():
         find.open_port(os.devnull, find.BAUD)
 
 
-def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):
+def test_single_board_is_found_and_two_boards_are_ambiguous(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
-    with monkeypatch.context() as listened:  # reuse the scan above, because listening to a port takes 1.5 s
+    # The result of the scan above is used again, because listening to a port takes 1.5 s.
+    with monkeypatch.context() as listened:
         listened.setattr(find, "detect_board", lambda port, _: found[port])
         assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
@@ -126,7 +131,10 @@ def test_only_board_is_found_and_two_are_ambiguous(monkeypatch):
 
 class TestReplugging:
     def find(self, *port_lists):
-        """Find the port of a replugged board; each poll sees the next list of ports, and later polls the last list."""
+        """Find the port of a board that was plugged in again.
+
+        Each poll sees the next list of ports, and polls after the last list see the last list again.
+        """
         polls, printed = iter(port_lists), []
         last = [set(port_lists[-1])]
 
@@ -136,11 +144,11 @@ class TestReplugging:
 
         return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, timeout_s=1.0), printed
 
-    def test_replugged_port_is_found(self):
+    def test_port_of_a_board_that_is_plugged_in_again_is_found(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
-        assert found == "c"  # a replugged board may have another port
+        assert found == "c"  # The board may then have another port.
         assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]
 
-    def test_waiting_for_replugging_ends_at_the_time_limit(self):
+    def test_waiting_for_a_board_ends_at_the_time_limit(self):
         with pytest.raises(CaptureError, match="no port disappeared within 1 s"):
             self.find("ab")

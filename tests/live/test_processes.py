@@ -1,4 +1,7 @@
-"""Tests of the commands emulate, ports, record, decode and live, each in a process, with an emulated board."""
+"""Tests of the commands emulate, ports, record, decode and live, each in a process of its own.
+
+The board is emulated.
+"""
 
 import asyncio
 import os
@@ -26,17 +29,20 @@ from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 
-LONG_S = 120.0  # time limit: enough to import PyTorch on a busy machine
+LONG_S = 120.0  # A time limit, which is enough to import PyTorch on a busy machine.
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
 def restore_ctrl_c() -> None:
-    """Let Ctrl-C end this process, even if a shell started the tests in the background, where Ctrl-C is ignored."""
+    """Let Ctrl-C end this process.
+
+    If a shell has started the tests in the background, Ctrl-C would otherwise be ignored.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Shell:
-    """Runs `reskin` commands in a folder; `close` stops those that still run."""
+    """An object that runs `reskin` commands in a folder. `close` stops those that still run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []
@@ -97,7 +103,7 @@ def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_
     with socket.create_server(("127.0.0.1", 0)) as free:
         http_port = free.getsockname()[1]
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
-    assert "open http://localhost" in page.stdout.readline()  # the page waits for the board
+    assert "open http://localhost" in page.stdout.readline()  # The page waits for the board.
     assert f"skins are saved in {tmp_path / 'skins'}" in page.stdout.readline()
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
     asyncio.run(watch_page(f"http://localhost:{http_port}/live"))
@@ -106,7 +112,7 @@ def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_
 
 
 async def watch_page(address: str) -> None:
-    """Wait until the page has received contacts at the right places and the expected alarms."""
+    """Wait until the page has received the expected alarms, and contacts at the right places."""
     async with aiohttp.ClientSession() as client, connect(client, address) as page:
         await until(page, lambda message: message.get("zeroed") is True)
         alarms, near_n = "", 0
@@ -122,7 +128,7 @@ async def watch_page(address: str) -> None:
 
 
 class connect:
-    """Context manager: a websocket to a server, which may still be starting."""
+    """Connect to a server, which may still be starting. This is a context manager that yields a websocket."""
 
     def __init__(self, client: aiohttp.ClientSession, address: str) -> None:
         self._client, self._address = client, address
@@ -156,7 +162,7 @@ def test_killed_recording_can_be_added(shell, tmp_path):
     assert files["stream.bin"].stat().st_size > 8200
 
 
-def test_unplugging_ends_a_complete_recording(shell, tmp_path):
+def test_recording_is_complete_if_the_board_is_unplugged(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop", "--fault", "unplug@3+99")
     wait_until(link.is_symlink)

@@ -1,4 +1,4 @@
-"""Tests that labelled recordings can be added to a scene, however the recording ends."""
+"""Tests that labelled recordings can be added to a scene, however the recording has ended."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ FRAME_BYTES_N, DWELL_FRAMES_N, LONG_S = 82, 40, 120.0
 
 
 def frames_written_n(part):
-    """Return the number of frames that a recorder has written."""
+    """Return the number of frames that a recorder has written so far."""
     stream = part / STREAM_FILE
     return stream.stat().st_size // FRAME_BYTES_N if stream.exists() else 0
 
@@ -55,7 +55,7 @@ def pokes():
 
 
 def read(folder):
-    """Read a capture folder as `reskin add` does."""
+    """Read the folder of a capture as `reskin add` does."""
     from reskin.recordings.header import write_capture
 
     header, files = native(folder, CaptureNames("b0", "s0", None), None, ())
@@ -68,7 +68,7 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_program_labels_a_recording(tmp_path, hold_until_frames, capsys):
+def test_recording_labelled_by_a_program_can_be_added(tmp_path, hold_until_frames, capsys):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
     assert "2 touches labelled" in capsys.readouterr().err
@@ -87,10 +87,10 @@ def test_program_labels_a_recording(tmp_path, hold_until_frames, capsys):
     assert account["frames_contact_n"] == pytest.approx(arrived_n, abs=2)
 
 
-# Python 3.12 warns about forks of programs with threads
+# Python 3.12 warns if a program with threads forks.
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_killed_recording_keeps_its_labels(tmp_path):
-    """The recorder runs in a fork, which starts faster than a new interpreter."""
+    """The recorder runs in a forked process, which starts faster than a new interpreter."""
     robot = tmp_path / "robot.csv"
     with plugged_in(make_script(pokes_n=1), loop=True) as port:
         source = label_source(str(robot), None, None, dwell_s=1.0, say=print)
@@ -107,13 +107,16 @@ def test_killed_recording_keeps_its_labels(tmp_path):
 
 
 def write_robot_log(robot, part):
-    """Write a robot's log of touches at (4, 8) mm until two are recorded; each touch lasts until frames arrive."""
+    """Write the log of a robot that touches the skin at (4, 8) mm, until two touches are recorded.
+
+    Each touch lasts until frames arrive.
+    """
     end_s = time.monotonic() + LONG_S
     with robot.open("w", buffering=1) as stream:
         stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
         for phase in cycle(["noload", "contact"]):
             before_n, holds = frames_written_n(part), True
-            while holds:  # the row that ends a phase is written after the frames have arrived
+            while holds:  # The row that ends a phase is written after the frames have arrived.
                 holds = frames_written_n(part) < before_n + DWELL_FRAMES_N
                 stream.write(f"{time.time():.4f},{phase},4,8,0.5\n")
                 time.sleep(0.02)
@@ -131,11 +134,11 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
 
     def append(file, data):
         taken.append(data)
-        if len(taken) > 2:  # the disk is full after the log's header and one touch
+        if len(taken) > 2:  # After the header of the log and one touch, the disk is full.
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
-    # Only the label log meets a full disk; the stream is still written.
+    # Only writing the labels fails. The stream is still written.
     monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))
     with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
         reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)
@@ -150,7 +153,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
     [("robot.txt", None, None, "--labels: robot.txt is not grid"), ("grid:2x2:4", None, "spiral", "--scan: the order"),
      (None, "/dev/x@fast", None, "--gauge: /dev/x@fast is not PORT"), ("robot.csv", "/dev/x", None, "--labels")],
 )  # fmt: skip
-def test_invalid_label_sources_raise(labels, gauge, scan, message):
+def test_invalid_label_sources_are_refused(labels, gauge, scan, message):
     with pytest.raises(ParamsError, match=message):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 

@@ -1,4 +1,4 @@
-"""Tests of the server of the live page: estimates, buttons, access control, limits."""
+"""Tests of the server of the live page: estimates, buttons, access control, and limits."""
 
 import asyncio
 import json
@@ -27,7 +27,8 @@ from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, POKE_S, QUIET_S, RATE_HZ, make_script, plugged_in, write_model, zero_requests
 
 LONG_S = 120.0
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # warnings about unclosed sockets of refused clients
+# The sockets of clients that are refused are not closed, which causes warnings.
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 
 def serve(
@@ -72,10 +73,10 @@ def unpack(data: bytes) -> dict:
 
 
 async def until(socket, wanted: Callable[[dict], bool]) -> dict:
-    """Receive messages until `wanted` accepts one; return this message."""
+    """Receive messages until `wanted` accepts one. Return this message."""
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
-        # not aiohttp's time limit, which restarts with every ping
+        # aiohttp's own time limit is not used, because it begins again with every ping.
         received = await asyncio.wait_for(socket.receive(), LONG_S)
         message = unpack(received.data) if received.type == aiohttp.WSMsgType.BINARY else json.loads(received.data)
         if wanted(message):
@@ -83,7 +84,7 @@ async def until(socket, wanted: Callable[[dict], bool]) -> dict:
     raise AssertionError("the message was never received")
 
 
-def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monkeypatch):
+def test_page_receives_estimates_and_the_buttons_zero_and_record_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
     models = [read_network(write_model(tmp_path))]
@@ -98,7 +99,7 @@ def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monke
             assert np.abs(np.array([poke["x_mm"], poke["y_mm"], poke["F_N"]]) - PLACES).max(axis=1).min() < 0.5
             assert poke["bins_n"] <= BINS_N
             assert poke["dropped"] == 0
-            # The true place of a real board is unknown, and the page offers no switch to show it.
+            # The true place of a contact on a real board is unknown, so the page offers no switch to show it.
             assert not state["true_places"]
             assert math.isnan(poke["true_x_mm"])
             assert (state["zeroings_n"], len(state["zero_bins"])) == (1, 1)
@@ -147,19 +148,21 @@ def test_page_of_an_emulated_board_receives_the_true_contact(tmp_path, monkeypat
             await socket.send_json({"press": "record"})
             recording = await until(socket, lambda message: bool(message.get("recording")))
             header = parse(Path(f"{recording['recording']}.part", HEADER_FILE).read_text(), "header")
-            assert header.source == "simulated"  # so that it is not added to a recorded scene
+            # The recording is marked as simulated, so that it is not added to a recorded scene.
+            assert header.source == "simulated"
 
     with playing(replace(script, source="simulated", true_contacts=true)) as board:
         serve(board.port, [], act, emulated=board)
 
 
-def test_unusable_address_is_an_error_and_is_not_printed():
+def test_address_that_cannot_be_used_is_an_error_and_is_not_printed():
     printed: list[str] = []
     with socketlib.create_server(("127.0.0.1", 0)) as busy:
         number = busy.getsockname()[1]
         for host, message in {
             "127.0.0.1": f"--http-port: cannot listen on {number}: another program uses it",
-            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # an address reserved for documentation
+            # This address is reserved for documentation.
+            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",
             "no such host": "--host: no such host is not an address of this machine",
         }.items():
             with pytest.raises(ParamsError, match=message):
@@ -167,7 +170,7 @@ def test_unusable_address_is_an_error_and_is_not_printed():
     assert printed == []
 
 
-def test_address_is_printed_when_the_page_is_served(monkeypatch):
+def test_address_is_printed_as_soon_as_the_page_is_served(monkeypatch):
     printed: list[str] = []
 
     def run_app(app, *, host, port, print, handle_signals) -> None:
@@ -179,13 +182,13 @@ def test_address_is_printed_when_the_page_is_served(monkeypatch):
     assert re.search(r"open http://0.0.0.0:8765/\?token=.+; press Ctrl-C", printed[0])
 
 
-def test_file_instead_of_a_port_is_an_error(tmp_path):
+def test_file_given_as_a_port_is_an_error(tmp_path):
     (tmp_path / "log.csv").touch()
     with pytest.raises(CaptureError, match="log.csv: cannot open the port: it is a file"):
         open_sessions([str(tmp_path / "log.csv")], [], "a board")
 
 
-def test_page_waits_for_a_missing_board(tmp_path):
+def test_page_waits_for_a_board_that_is_not_plugged_in(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         async with client.ws_connect(f"{address}/live") as socket:
             state = await until(socket, lambda message: "not open" in " ".join(message.get("alarms", [])))
@@ -201,19 +204,19 @@ def test_page_waits_for_a_missing_board(tmp_path):
                 assert page.status == 200
                 assert kind in page.headers["Content-Type"]
                 assert "default-src 'self'" in page.headers["Content-Security-Policy"]
-                # the page loads no external resource
+                # The page loads nothing from other servers.
                 assert "://" not in (await page.text()).replace("http://www.w3.org", "")
 
     serve(str(tmp_path / "none"), [], act)
 
 
-def test_requests_from_other_hosts_and_sites_are_forbidden(tmp_path):
+def test_requests_with_other_host_or_origin_headers_are_forbidden(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         host = address.removeprefix("http://")
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
             ({"Host": "lohost[::1]::8786"}, 403),
-            ({"Host": "localhost:9000"}, 200),  # a request through an SSH tunnel
+            ({"Host": "localhost:9000"}, 200),  # This is a request through an SSH tunnel.
             ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{host}"}, 200),
         ):  # fmt: skip
             async with client.get(f"{address}/", headers=headers) as page:

@@ -1,4 +1,4 @@
-"""Tests of eight boards on eight ports, of which one has forty chips (a sleeve) and one is unplugged."""
+"""Tests of eight boards on eight ports. One of them has forty chips (a sleeve), and one is unplugged."""
 
 import asyncio
 import math
@@ -31,7 +31,10 @@ pytestmark = [
 
 
 def plug_in_all(stack: ExitStack, unplugged: ExitStack, folder, boards) -> list[str]:
-    """Emulate eight boards in threads. Closing `unplugged` unplugs the last one; closing `stack` unplugs the rest."""
+    """Emulate eight boards in threads.
+
+    Closing `unplugged` unplugs the last board, and closing `stack` unplugs the others.
+    """
     names = []
     for i in boards:
         script = make_script(pokes_n=3, chips_n=CHIPS_N[i], rate_hz=RATES_HZ[i])
@@ -40,7 +43,7 @@ def plug_in_all(stack: ExitStack, unplugged: ExitStack, folder, boards) -> list[
     return names
 
 
-def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
+def test_page_of_eight_boards_shows_which_board_is_unplugged(tmp_path):
     async def look(address: str, client: aiohttp.ClientSession, i: int) -> None:
         async with client.ws_connect(f"{address}/live?board={i}") as page:
             state = await until(page, lambda message: message.get("zeroed") is True)
@@ -50,7 +53,7 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
             poke = await until(
                 page, lambda message: message.get("contact") == 1 and 0 < message["rate_hz"] < 1.3 * RATES_HZ[i]
             )
-            # The model is for five chips: boards with another number of chips have no estimate.
+            # The model is for five chips. Boards with another number of chips have no estimate.
             assert math.isfinite(poke["x_mm"]) == (CHIPS_N[i] == 5)
             assert len(poke["change_uT"]) == 3 * CHIPS_N[i]
             assert np.abs(poke["change_uT"]).max() > 100
@@ -71,7 +74,7 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
         for page in pages:
             await page.close()
 
-    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # the number of stored bins has an upper bound
+    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # The number of stored time bins has an upper bound.
     assert LATENCIES_N < 1e4
     with ExitStack() as stack, ExitStack() as unplugged:
         serve(plug_in_all(stack, unplugged, tmp_path, range(len(CHIPS_N))), load_universal(), act)
@@ -81,7 +84,7 @@ def test_unplugged_board_does_not_delay_the_others(tmp_path):
     with ExitStack() as stack, ExitStack() as unplugged:
         names = plug_in_all(stack, unplugged, tmp_path, (1, 2, UNPLUGGED_I))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
-            # number of readings of each other board during each update of the last board
+            # The number of readings of each other board during each update of the last board.
             updates, found = Counter(), []
             for *others, last in skins:
                 found += [contact[1:4] for contact in others if contact.F_N > 0]
@@ -102,7 +105,7 @@ def skin_at(port: str) -> LiveSkin:
     return skin
 
 
-def test_model_error_is_raised_to_the_caller():
+def test_error_in_the_model_is_raised_to_the_caller():
     failing, working = skin_at("failing"), skin_at("working")
     failing.estimator = FailingModel()
     with LiveSkins([failing, working]) as skins:
@@ -111,7 +114,7 @@ def test_model_error_is_raised_to_the_caller():
             next(iter(skins))
 
 
-def test_model_error_is_an_alarm_on_the_page():
+def test_error_in_the_model_is_shown_as_an_alarm_on_the_page():
     live = Session("played", [], "a board")
     live.skin = skin_at("played")
     live.skin.estimator = FailingModel()
@@ -123,7 +126,7 @@ def test_model_error_is_an_alarm_on_the_page():
     assert "estimation stopped: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
-def test_invalid_lists_of_ports_raise(tmp_path):
+def test_invalid_lists_of_ports_are_refused(tmp_path):
     for ports in (["a", "a"], [f"p{i}" for i in range(BOARDS_MAX_N + 1)], []):
         with pytest.raises(ReskinError, match="--port: ports must be 1 to 16, each named once"):
             open_sessions(ports, [], "a board")

@@ -1,4 +1,4 @@
-"""Tests of `LiveSkin`: estimates, no-load reading, alarms, counts of bytes."""
+"""Tests of `LiveSkin`: estimates, no-load readings, alarms, and counts of bytes."""
 
 import itertools
 import math
@@ -31,12 +31,13 @@ from tests.live.boards import (
 )
 
 SCRIPT = make_script(pokes_n=2)
-LATE = {"no data", "slower than before: frames are missing"}  # alarms that a healthy board may raise on a busy machine
+# On a busy machine, a healthy board may raise these alarms.
+LATE = {"no data", "slower than before: frames are missing"}
 
 
 def test_every_reading_has_time_place_and_force(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
-    unread_n = 1000  # at most this many frames are discarded if the pseudo-terminal is opened late
+    unread_n = 1000  # At most this number of frames is discarded if the pseudo-terminal is opened late.
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         wanted_n = len(script) - unread_n
         contacts = list(itertools.takewhile(lambda _: skin.account["frames_n"] < wanted_n, skin.every()))
@@ -44,7 +45,7 @@ def test_every_reading_has_time_place_and_force(tmp_path):
     found = np.array([contact[1:4] for contact in contacts if contact.F_N > 0])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
-    # tolerance in mm and N: noise of 3 uT in fifteen channels
+    # The tolerance in mm and N allows for noise of 3 uT in fifteen channels.
     np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
     assert all(math.isnan(contact.x_mm) for contact in contacts if contact.F_N == 0)
     assert 300 < len(found) < len(contacts)
@@ -54,18 +55,18 @@ def test_every_reading_has_time_place_and_force(tmp_path):
     assert all(math.isnan(contact.sd_mm[0]) for contact in contacts)
 
 
-def test_several_models_give_mean_and_standard_deviation(tmp_path):
+def test_estimates_of_several_models_are_averaged_with_a_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # The first detected touch may be either poke, because a busy machine may miss the first poke.
+    # The first touch that is detected may be either of the two pokes, because a busy machine may miss the first one.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
     assert touched.sd_F_N == pytest.approx(0.0, abs=0.01)
 
 
-def test_slow_caller_gets_the_latest_reading(tmp_path):
+def test_caller_that_is_slow_gets_the_latest_reading(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
@@ -73,20 +74,20 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        # readings with alarm "no data" (NaN), which a busy machine may cause, are excluded
+        # Readings with alarm "no data" (NaN) are excluded, because a busy machine may cause them.
         readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())
         before, before_n = next(readings), skin.account["frames_n"]
-        while skin.reader.waiting_bytes_n < 300 * 82:  # the caller is slow
+        while skin.reader.waiting_bytes_n < 300 * 82:  # The caller waits, so that readings accumulate.
             time.sleep(0.01)
         late = next(readings)
         received_n = skin.account["frames_n"] - before_n
         assert received_n >= 300
-        # `late` is the latest frame, and no frame was lost
+        # The reading `late` is the latest frame, and no frame was lost.
         assert (frame_i(late) - frame_i(before) - received_n) % len(SCRIPT) == 0
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
-def test_stall_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
+def test_pauses_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, seen = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -110,9 +111,9 @@ def test_frames_with_failed_reads_have_no_estimate(tmp_path):
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
 
 
-def test_opening_a_port_mid_frame_loses_no_frame():
+def test_no_frame_is_lost_if_the_port_is_opened_within_a_frame():
     whole = make_script(pokes_n=0)
-    # If the stream begins with a line feed, the next frame is skipped too.
+    # If the stream begins with a line feed, the next frame is skipped too, because its start is not known.
     for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):
         pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
         skin, _ = play_to_skin(replace(whole, pieces=pieces))
@@ -122,7 +123,7 @@ def test_opening_a_port_mid_frame_loses_no_frame():
 
 
 @pytest.mark.parametrize("chunk_n", [20, 3280])
-def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
+def test_bytes_without_frames_after_plugging_in_are_counted_as_lost(chunk_n):
     skin, _ = play_to_skin(make_script(pokes_n=0))
     garbage = np.random.default_rng(0).bytes(40 * 3280)
     skin._start_stream(skin.detected)
@@ -132,7 +133,7 @@ def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
     assert {"bytes lost between frames", "no frames in the data: wrong baud rate?"} <= set(skin.health.alarms)
 
 
-def test_magnet_raises_only_the_alarm_external_field(tmp_path):
+def test_magnet_raises_only_the_alarm_for_external_fields(tmp_path):
     skin, _ = play_to_skin(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 
@@ -141,15 +142,15 @@ def test_no_load_reading_waits_until_the_skin_is_not_touched():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    # tolerance: four standard errors of a mean of 100 readings with 3 uT of noise
+    # The tolerance is four standard errors of a mean of 100 readings with 3 uT of noise.
     np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not play_to_skin(moving)[0].zeroed
 
 
-def test_zero_from_another_thread_restarts_the_no_load_reading():
+def test_zero_called_in_another_thread_restarts_the_no_load_reading():
     class ZeroingList(list):
-        def append(self, frames):  # runs between two statements of the polling thread
+        def append(self, frames):  # This function runs between two statements of the thread that reads the port.
             super().append(frames)
             skin.zero()
 
@@ -187,7 +188,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
         - sum(count for name, count in account.items() if name.startswith("skipped_"))
     )
     assert account["bytes_n"] + account["missed_bytes_n"] == sum(sent)
-    assert 0 <= waiting_n < 3 * 82  # the last bytes are neither in a frame nor lost yet
+    assert 0 <= waiting_n < 3 * 82  # The last bytes are not yet in a frame, and not yet lost.
     assert account["frames_n"] * 82 == account["frame_bytes_n"]
     assert account["skipped_resync_bytes_n"] > 1000
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
@@ -220,7 +221,7 @@ def test_eight_boards_are_read_at_once():
         assert list(pool.map(look, names)) == list(chips_n)
 
 
-def test_other_chip_count_and_missing_port_raise(tmp_path):
+def test_wrong_number_of_chips_and_missing_ports_are_refused(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model has 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
@@ -228,12 +229,13 @@ def test_other_chip_count_and_missing_port_raise(tmp_path):
         pass
 
 
-def test_port_held_by_another_program_is_not_open():
+def test_port_that_another_program_uses_is_reported():
     with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
         skin = LiveSkin(name)
         skin.reader.start(must_exist=False)
         try:
-            while not skin.reader.problem:  # if no problem is reported, the time limit of the suite ends the loop
+            # If no problem were reported, the time limit of the test suite would end the loop.
+            while not skin.reader.problem:
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:

@@ -34,7 +34,10 @@ pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseud
 
 
 def make_poke_script() -> tuple[Script, ProbeLog]:
-    """Return a script of pokes on a grid with varying pauses, and the robot's log. The robot's clock is 100 s ahead."""
+    """Return a script of pokes on a grid with varying pauses, and the log of the robot.
+
+    The clock of the robot is 100 s ahead.
+    """
     rng = rng_for(0, "poked")
     starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
@@ -62,10 +65,10 @@ def make_poke_script() -> tuple[Script, ProbeLog]:
 
 
 def write_punctual_arrivals(folder: Path, sent: Script) -> None:
-    """Replace the recorded arrival times by those of a machine without delays."""
+    """Replace the recorded arrival times by those of a machine that causes no delays."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
-    assert first >= 0  # the recorded bytes are the last ones that were sent
+    assert first >= 0  # The recorded bytes are the last ones that were sent.
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
     received = (ends > 0) & (ends <= len(data))
     times = clocks.Arrivals(ends[received], 1e9 + sent.t_s[received])
@@ -73,7 +76,7 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     seal(folder, header)
 
 
-def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path, empty_store):
+def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path, empty_store):
     script, log = make_poke_script()
     root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
     (root / "robot.csv").write_text(probe.render(log))
@@ -84,7 +87,8 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path, empty_st
     with closing(Shell(root)) as shell:
         shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", CRLF)
         wait_until(link.is_symlink)
-        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # the script has ended
+        # This message means that the script has ended.
+        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
         write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
     with warm_stages(root) as run_stages:
@@ -94,7 +98,8 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path, empty_st
     assert numbers["provenance"]["source"] == "recorded"
     assert numbers["capture"]["logged_indentations_n"] == POKES_N
     assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
-    assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discards bytes
+    # When a terminal is opened or closed, bytes that wait there are discarded.
+    assert numbers["capture"]["frames_n"] > 0.7 * len(script)
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = play_to_skin(script, [read_network(model)])
     t_s = np.concatenate([batch.t_s[batch.contact] for batch in readings])
@@ -102,5 +107,5 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path, empty_st
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
-    # in mm, mm, N; the errors are small because most presses are training data
+    # The limits are in mm, mm and N. They are small, because most presses are training data.
     assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()

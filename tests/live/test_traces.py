@@ -1,4 +1,4 @@
-"""Tests that messages to the live page have a limited size and contain the peaks of the force."""
+"""Tests that messages to the live page have a limited size, but contain the peaks of the force."""
 
 import numpy as np
 
@@ -13,16 +13,16 @@ def readings(t_s, force_N):
 
 
 def forces(data):
-    """Return the start, minimum force and maximum force of each time bin in a message."""
+    """Return the start, the minimum force and the maximum force of each time bin in a message."""
     _, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
     start_s, traces = t_s + rest[:bins_n].astype(float), rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
     return start_s, traces[0, :, 0], traces[1, :, 0]
 
 
-def test_bins_contain_peaks_and_the_last_ten_seconds():
+def test_time_bins_contain_force_peaks_and_cover_the_last_ten_seconds():
     traces, peak_s = Traces(layout_of(5), 0.0), 115.0
-    for first in range(0, 48_000, 40):  # two minutes at 400 Hz
+    for first in range(0, 48_000, 40):  # The loop adds two minutes of readings at 400 Hz.
         t_s = (first + np.arange(40)) / 400
         traces.add(readings(t_s, np.where(np.abs(t_s - peak_s) < 1e-3, 3.0, 0.1)), t_s[-1] + 0.001)
     start_s, low_N, high_N = forces(traces.message(0, rate_hz=400.0, lost_bytes_n=0))
@@ -34,7 +34,7 @@ def test_bins_contain_peaks_and_the_last_ten_seconds():
     assert len(traces.message(traces.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
 
 
-def test_messages_omit_gaps_and_bins_sent_before():
+def test_messages_contain_neither_gaps_nor_bins_that_were_sent_before():
     traces = Traces(layout_of(5), 0.0)
     for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
         traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
@@ -44,18 +44,19 @@ def test_messages_omit_gaps_and_bins_sent_before():
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
 
 
-def test_bin_times_are_precise_after_two_weeks():
+def test_times_of_bins_are_precise_after_two_weeks():
     traces, t_s = Traces(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
     traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
     start_s, _, _ = forces(traces.message(0, rate_hz=200.0, lost_bytes_n=0))
     np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
-def test_display_latency_of_the_confirmed_message():
+def test_latency_of_the_display_is_measured_by_confirmed_messages():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
-    for seen in (number, number + 1, -1):  # a number that is confirmed again or unknown has no latency
+    # A message that is confirmed a second time has no latency, and neither has one that is unknown.
+    for seen in (number, number + 1, -1):
         traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])
     np.testing.assert_allclose(traces.to_estimate_s, [0.002])

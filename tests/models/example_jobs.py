@@ -1,7 +1,7 @@
 """Small recipes, training data and jobs for tests.
 
 `some_job` prepares a network whose targets are a smooth function of the inputs. The other jobs use `example_data`, a
-scene of four skins: the first two are training skins, the last one is the new skin.
+scene of four skins: the first two are training skins, and the last one is the new skin, to which networks are adapted.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from reskin.models.network import draw_weights, paper_layers
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe
 from reskin.seeds import rng_for
 
-ROWS_N = 48  # twelve rows on each of four skins
+ROWS_N = 48  # There are twelve rows on each of four skins.
 TRAIN, TEST, POKED, LABELLED = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
@@ -47,7 +47,10 @@ def some_rows(n: int, *names: str | int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: str | int = "draws") -> PreparedJob:
-    """Return a new prepared job, equal for equal arguments; with `terms`, the job has the data for all loss terms."""
+    """Return a new prepared job. Equal arguments give equal jobs.
+
+    With `terms`, the job contains the data for all loss terms.
+    """
     inputs, targets = some_rows(n, name)
     start, rng = some_weights(name), rng_for(0, draws, name)
     if not terms:
@@ -55,7 +58,7 @@ def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: st
     places = rng_for(0, "places", name).integers(0, 5, (n, 2)).astype(np.float64)
     labelled = LabelledRows(inputs, targets, triplet_points(places, np.arange(n) % 2))
     poked, _ = some_rows(20, name, "poked")
-    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows are on two lines each
+    row = np.concatenate([np.arange(20), np.arange(10)])  # Rows 0 to 9 are on two lines each.
     line_i = np.repeat([0, 1, 2], 10)
     order = triplet_points(np.tile(np.arange(10) // 2, 3)[:, None].astype(np.float64), line_i)
     few_labels = LabelledRows(*some_rows(6, name, "own"), None)
@@ -70,7 +73,7 @@ def example_data() -> TrainingData:
 
 
 def with_values(data: TrainingData, part: str, row: np.ndarray, value: object) -> TrainingData:
-    """Return the data with `value` in the given rows of the array `part`."""
+    """Return the training data, with `value` in the given rows of the array named `part`."""
     values = getattr(data, part).copy()
     values[row] = value
     return replace(data, **{part: values})
@@ -85,7 +88,7 @@ def without_triplets() -> TrainingJob:
 
 
 def lines(row: np.ndarray = POKED) -> Lines:
-    """Return one line of hand pokes at the given rows, two pokes per place."""
+    """Return the pokes of a new skin as one line, which has two pokes at each place."""
     one = hand_lines(np.zeros(len(row), np.int32), np.repeat(np.arange(len(row) // 2), 2).astype(np.int32))
     return replace(one, row=row[one.row])
 

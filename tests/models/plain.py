@@ -1,4 +1,7 @@
-"""Reference for stacks of networks: the paper's network and training loop in plain PyTorch, for a single network."""
+"""Reference for networks that are trained together in a stack: a single network in plain PyTorch.
+
+It has the layers and the training loop of the paper.
+"""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -11,8 +14,8 @@ from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 
 UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")
-# Layers in section 4 of the paper: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) ->
-# xyF(3)
+# The layers as printed in section 4 of the paper: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) ->
+# MLP+ReLU(200) -> xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
 RELEASED = ("15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU")
 PRINTED = {"paper": PAPER, "released": RELEASED}
@@ -40,7 +43,7 @@ def features_of(net: nn.Sequential) -> nn.Sequential:
 
 
 def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarray]:
-    """Return the weights (or their gradients) of a plain network, under the names in saved models."""
+    """Return the weights of a plain network, or the gradients of its weights, under the names that saved models use."""
     linear = [part for part in net if isinstance(part, nn.Linear)]
     return {
         f"layer{i}.{name}": (values.grad if gradient else values.detach()).numpy().copy()
@@ -52,7 +55,7 @@ def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarr
 def plain_train(
     start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: LossWeights
 ) -> dict[str, np.ndarray]:
-    """Train a network in a plain loop, on the batches that a stack of one network would get."""
+    """Train a network in a plain loop. `batches` are those of a stack that contains only this network."""
     net = plain_net("paper", start)
     features = features_of(net)
     optimizer = torch.optim.AdamW(net.parameters(), lr=schedule.rate_max, weight_decay=schedule.weight_decay)
@@ -78,7 +81,7 @@ def plain_train(
 def hinge(
     features: Callable[[torch.Tensor], torch.Tensor], anchor: torch.Tensor, near: torch.Tensor, far: torch.Tensor
 ) -> torch.Tensor:
-    """Return the triplet loss as printed in the paper, computed row by row; mean over the batch."""
+    """Return the triplet loss as printed in the paper: computed row by row, then averaged over the batch."""
     a, p, n = features(anchor), features(near), features(far)
     rows = [torch.clamp((a[i] - p[i]).dot(a[i] - p[i]) - (a[i] - n[i]).dot(a[i] - n[i]), min=0) for i in range(len(a))]
     return torch.stack(rows).mean()

@@ -1,4 +1,7 @@
-"""Tests of alignment methods against SciPy's matrix square roots, a known linear map, and leave-one-out errors."""
+"""Tests of methods that align the field changes of a new skin with those of known skins.
+
+References are SciPy's matrix square roots, a known linear map, and leave-one-out errors.
+"""
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from reskin.seeds import rng_for
 
 
 def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
-    """Return random inputs of a skin: correlated channels with different scales and means."""
+    """Return random inputs of a skin. Their channels are correlated, and have different scales and means."""
     rng = rng_for(0, "alignment", name)
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
@@ -17,24 +20,24 @@ def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
 SOURCE, TARGET = draw_inputs("of"), draw_inputs("to", n=70)
 
 
-def test_matched_channels_have_the_means_and_deviations():
+def test_matched_channels_have_the_means_and_deviations_of_the_target():
     moved = match_channels(SOURCE, TARGET)(SOURCE)
     np.testing.assert_allclose(moved.mean(axis=0), TARGET.mean(axis=0))
     np.testing.assert_allclose(moved.std(axis=0, ddof=1), TARGET.std(axis=0, ddof=1))
 
 
-def test_gains_and_offsets_are_removed():
+def test_matching_channels_recovers_gains_and_offsets():
     gains, offsets = np.array([0.5, 2.0, 1.3, 0.9]), np.array([3.0, -7.0, 0.0, 40.0])
     np.testing.assert_allclose(match_channels(SOURCE, SOURCE * gains + offsets)(SOURCE), SOURCE * gains + offsets)
 
 
-def test_coral_matches_the_covariance():
+def test_coral_inputs_have_the_covariance_of_the_target():
     moved = coral(SOURCE, TARGET, ridge=0.0)(SOURCE)
     np.testing.assert_allclose(np.cov(moved, rowvar=False), np.cov(TARGET, rowvar=False))
     np.testing.assert_allclose(moved.mean(axis=0), TARGET.mean(axis=0))
 
 
-def test_coral_uses_square_roots_of_covariances():
+def test_coral_equals_a_product_of_square_roots_of_covariances():
     scale = SOURCE.std(axis=0, ddof=1)
     source, target = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (SOURCE, TARGET))
     expected = (SOURCE - SOURCE.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(source)) @ sqrtm(
@@ -44,11 +47,11 @@ def test_coral_uses_square_roots_of_covariances():
 
 
 @pytest.mark.parametrize("align", [match_channels, coral])
-def test_alignment_with_itself_is_the_identity(align):
+def test_aligning_a_skin_with_itself_changes_nothing(align):
     np.testing.assert_allclose(align(SOURCE, SOURCE)(SOURCE), SOURCE)
 
 
-def test_constant_channel_is_moved_but_not_scaled():
+def test_constant_channel_is_shifted_but_not_scaled():
     source, target = SOURCE.copy(), TARGET.copy()
     source[:, 1], target[:, 1] = 3.0, 5.0
     np.testing.assert_allclose(match_channels(source, target)(source)[:, 1], 5.0)
@@ -60,14 +63,14 @@ def test_direct_standardisation_recovers_a_linear_map():
     np.testing.assert_allclose(direct(SOURCE, SOURCE @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_undetermined_directions_are_unchanged():
+def test_direct_standardisation_keeps_directions_without_pairs():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.01, 30.0])
-def test_ridge_minimises_the_leave_one_out_error(noise):
+def test_chosen_ridge_penalty_has_the_smallest_leave_one_out_error(noise):
     source = draw_inputs("pairs", n=9)
     to = source @ np.diag([1.5, 0.5, 1.0, 1.2]) + noise * rng_for(0, "noise").standard_normal(source.shape)
 
@@ -75,7 +78,8 @@ def test_ridge_minimises_the_leave_one_out_error(noise):
         total = 0.0
         for i in range(len(source)):
             rest = np.delete(np.arange(len(source)), i)
-            held = ridge * (source**2).sum() / source.shape[1]  # the penalty is proportional to the number of pairs
+            # The penalty is proportional to the sum of squares of all pairs, also when one pair is left out.
+            held = ridge * (source**2).sum() / source.shape[1]
             gain = np.linalg.solve(
                 source[rest].T @ source[rest] + held * np.eye(4), source[rest].T @ (to - source)[rest]
             )

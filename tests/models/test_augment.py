@@ -17,34 +17,34 @@ def augmentation(**changes: float) -> Augmentation:
     return Augmentation.model_validate({"copies_n": 3, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0} | changes)
 
 
-def test_boards_without_spread_read_the_same():
+def test_virtual_boards_without_spread_have_unchanged_readings():
     copies, skin = virtual_boards(rows(), SKIN, augmentation(), rng_for(1, "draw"))
     np.testing.assert_array_equal(copies, np.tile(rows(), (3, 1)))
     assert len(np.unique(skin)) == 2 * 3
 
 
-def test_tilt_rotates_the_field_of_each_chip():
+def test_tilt_rotates_the_field_of_each_chip_and_keeps_its_length():
     copies, _ = virtual_boards(rows(), SKIN, augmentation(lean_sd_deg=20.0), rng_for(1, "draw"))
     before, after = (np.linalg.norm(values.reshape(-1, 2, 3), axis=2) for values in (np.tile(rows(), (3, 1)), copies))
-    np.testing.assert_allclose(after, before, rtol=1e-5)  # tolerance: rotations are computed in float32
+    np.testing.assert_allclose(after, before, rtol=1e-5)  # Tolerance: rotations are computed in single precision.
     assert np.abs(copies - np.tile(rows(), (3, 1))).max() > 10
 
 
-def test_each_copy_of_a_skin_is_on_one_board():
+def test_rows_of_a_copied_skin_are_on_one_virtual_board():
     copies, skin = virtual_boards(rows(), SKIN, augmentation(gain_sd=0.3), rng_for(1, "draw"))
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
         gain_of_copy = gain[skin == name]
-        # tolerance: quotients of float32 numbers
+        # The tolerance is the rounding of quotients in single precision.
         np.testing.assert_allclose(gain_of_copy, np.broadcast_to(gain_of_copy[0], gain_of_copy.shape), rtol=1e-5)
     one_of_each = np.array([gain[skin == name][0] for name in np.unique(skin)])
     assert len(np.unique(np.round(one_of_each, 4), axis=0)) == 6
 
 
-def test_noise_has_the_given_deviation():
+def test_noise_has_the_given_standard_deviation():
     no_field = np.zeros((2000, 15), np.float32)
     copies, _ = virtual_boards(no_field, np.array(["s"] * 2000), augmentation(noise_uT=5.0), rng_for(1, "draw"))
-    assert abs(copies.std() - 5.0) < 0.05  # 90,000 draws: standard error 0.012
+    assert abs(copies.std() - 5.0) < 0.05  # The tolerance is four standard errors: 90,000 draws have one of 0.012.
 
 
 @given(st.floats(0.1, 10))
@@ -52,4 +52,5 @@ def test_copies_are_linear_in_the_field(factor):
     settings = augmentation(gain_sd=0.2, lean_sd_deg=10.0)
     one, _ = virtual_boards(rows(), SKIN, settings, rng_for(1, "draw"))
     other, _ = virtual_boards(np.float32(factor) * rows(), SKIN, settings, rng_for(1, "draw"))
-    np.testing.assert_allclose(other, np.float32(factor) * one, rtol=1e-4, atol=1e-3)  # sums of three float32 terms
+    # The tolerance is the rounding of sums of three single-precision terms.
+    np.testing.assert_allclose(other, np.float32(factor) * one, rtol=1e-4, atol=1e-3)

@@ -28,7 +28,10 @@ NO_ROWS = np.zeros(0, np.int64)
 
 
 class PicklingExecutor(Executor):
-    """Executor that pickles and unpickles a call and runs it here; another process would get the same copy."""
+    """An executor that pickles and unpickles each call, and runs it in this process.
+
+    A worker process would get the same copy of the call.
+    """
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -82,34 +85,36 @@ def expected_inputs(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_job_equals_direct_call(name, inputs):
+def test_job_equals_a_direct_call_of_fit_and_predict(name, inputs):
     one = method(name, inputs)
     (found,) = results_of(task(one))
     train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
-    # Inputs of 1 uT to 200 uT may differ in the last bit of float32; predictions then differ by at most 1e-5.
+    # Tolerance: the inputs of 1 to 200 uT may differ in the last bit of single precision, which changes predictions by
+    # at most 1e-5.
     np.testing.assert_allclose(found.predicted, by_hand.predict(test), atol=1e-5)
     assert found.rows_n == 30
     assert found.seconds > 0
     assert found.one_reading_s > 0
 
 
-def test_labels_of_a_new_skin_weigh_as_much_as_all_others():
+def test_labels_of_a_new_skin_weigh_as_much_as_all_other_rows():
     (found,) = results_of(task(few_labels=NEW_SKIN_ROWS))
     train = np.concatenate([TRAIN, NEW_SKIN_ROWS])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
-    weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 weigh as much as 30 rows
+    # The 6 labelled rows have the weight 5 each, so together they weigh as much as the 30 other rows.
+    weight = [1.0] * 30 + [5.0] * 6
     plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
     expected = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
-    np.testing.assert_allclose(found.predicted, expected, atol=1e-5)  # rounding to float32
+    np.testing.assert_allclose(found.predicted, expected, atol=1e-5)  # The tolerance is rounding to single precision.
     assert found.rows_n == 36
     assert np.abs(found.predicted - results_of(task())[0].predicted).max() > 1e-3
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 40))
-def test_weights_of_both_groups_have_the_same_sum(own_n, rows_max_n):
+def test_labelled_and_other_rows_have_equal_sums_of_weights(own_n, rows_max_n):
     with pytest.MonkeyPatch.context() as patch:
         weights = []
 
@@ -123,7 +128,8 @@ def test_weights_of_both_groups_have_the_same_sum(own_n, rows_max_n):
     others, labelled = weight[:-own_n], weight[-own_n:]
     assert len(others) == min(30, rows_max_n)
     assert (others == 1).all()
-    assert labelled.sum() == pytest.approx(len(others), rel=1e-6)  # float32 sums
+    # The tolerance is the rounding of sums in single precision.
+    assert labelled.sum() == pytest.approx(len(others), rel=1e-6)
 
 
 def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):
@@ -132,7 +138,10 @@ def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):
 
 
 def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
-    """Return the row numbers passed to each fit; rows are identified by their fields."""
+    """Return, for each call of `fit`, the numbers of the rows that it received.
+
+    Rows are identified by their field changes, which are all different.
+    """
     return [[int(np.flatnonzero((ROWS.db_uT == row).all(axis=1))[0]) for row in one["inputs"]] for one in fits]
 
 
@@ -141,14 +150,14 @@ def test_thinning_keeps_the_given_number_of_rows(fits):
     thinned, with_own, whole = rows_of(fits)
     assert len(set(thinned)) == len(thinned) == 12
     assert set(thinned) < set(TRAIN)
-    assert with_own == [*thinned, *NEW_SKIN_ROWS]  # labelled rows of a new skin are never dropped
+    assert with_own == [*thinned, *NEW_SKIN_ROWS]  # The labelled rows of a new skin are never dropped.
     assert whole == TRAIN.tolist()
     assert [one.rows_n for one in done] == [12, 18, 30]
     for one, numbers in zip(fits, (thinned, with_own, whole), strict=True):
         assert (one["target"] == ROWS.target[numbers]).all()
 
 
-def test_thinning_depends_on_seed_and_name_only(fits):
+def test_random_choice_of_rows_depends_only_on_seed_and_name(fits):
     others = {"seed": 4}, {"name": "other"}
     results_of(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
     results_of(*(task(rows_max_n=12, **other) for other in others))
@@ -157,7 +166,7 @@ def test_thinning_depends_on_seed_and_name_only(fits):
     assert all(numbers != first for numbers in different)
 
 
-def test_results_are_in_the_order_of_jobs_and_logged():
+def test_results_and_log_lines_are_in_the_order_of_jobs():
     lines: list[str] = []
     names = {"first": TEST, "second": TEST[:5], "third": TEST[5:]}
     tasks = [task(name=name, test=test) for name, test in names.items()]
@@ -167,7 +176,7 @@ def test_results_are_in_the_order_of_jobs_and_logged():
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_targets_of_test_rows_do_not_matter(name):
+def test_targets_of_test_rows_do_not_change_the_result(name):
     used = np.concatenate([TRAIN, NEW_SKIN_ROWS])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6

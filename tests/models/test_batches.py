@@ -14,7 +14,10 @@ def batches(jobs: list[PreparedJob], steps_n: int = STEPS_N, batch_n: int = BATC
 
 
 def rows_of(batch: torch.Tensor, rows: np.ndarray) -> list[int]:
-    """Return the row numbers in a network's batch (no two rows are equal)."""
+    """Return the numbers of the rows in the batch of a network.
+
+    No two rows are equal, so rows are identified by content.
+    """
     (found,) = [np.argmax((rows[None] == batch.numpy()[:, None]).all(axis=2), axis=1)]
     assert (rows[found] == batch.numpy()).all()
     return found.tolist()
@@ -30,11 +33,11 @@ def test_every_step_has_a_batch_for_each_term():
         }
 
 
-def test_absent_data_gives_no_batches():
+def test_terms_without_data_get_no_batches():
     assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 
-def test_targets_belong_to_their_rows():
+def test_targets_in_a_batch_belong_to_the_inputs_of_the_same_row():
     jobs = [some_job(i, n=n, terms=True) for i, n in enumerate((12, 32, 17))]
     for step in batches(jobs):
         for i, job in enumerate(jobs):
@@ -57,7 +60,11 @@ def test_positive_is_nearer_than_the_negative_in_labelled_triplets():
             assert ((place[anchor] - place[near]) ** 2).sum() < ((place[anchor] - place[far]) ** 2).sum()
 
 
-def test_poke_triplets_are_ordered_along_one_line():
+def test_triplets_of_unlabelled_pokes_are_ordered_along_one_line():
+    """Rows can be on two lines.
+
+    On one of these lines, the positive poke must be nearer to the anchor than the negative.
+    """
     job = some_job(terms=True)
     points, row = job.unlabelled.points, job.unlabelled.row
     lines_of = {r: {(points.group[q], points.place[q, 0]) for q in np.flatnonzero(row == r)} for r in range(20)}
@@ -77,11 +84,11 @@ def test_poke_triplets_are_ordered_along_one_line():
 def test_rows_are_drawn_with_equal_probability():
     job, n = some_job(n=8), 400 * BATCH_N
     rows = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
-    # six binomial standard deviations
+    # The tolerance is six standard deviations of a binomial distribution.
     assert (np.abs(np.bincount(rows, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()
 
 
-def test_batches_do_not_depend_on_the_stack():
+def test_batches_of_a_network_do_not_depend_on_other_networks_of_the_stack():
     (alone, beside) = (
         batches(jobs) for jobs in ([some_job(1, terms=True)], [some_job(i, terms=True) for i in range(3)])
     )
@@ -89,8 +96,11 @@ def test_batches_do_not_depend_on_the_stack():
         assert all(torch.equal(one[name][0], other[name][1]) for name in one)
 
 
-def test_additional_loss_term_does_not_change_other_batches():
-    """Methods must be compared on equal batches, in every block of steps."""
+def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
+    """Methods are compared on equal batches, so a loss term must not change the random draws for other terms.
+
+    This must hold in every block of steps.
+    """
     full = some_job(terms=True)
     without = {
         "triplet": PreparedJob(
@@ -108,7 +118,7 @@ def test_additional_loss_term_does_not_change_other_batches():
                 assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_blocks_and_networks_draw_different_rows():
+def test_each_block_and_each_network_draws_other_rows():
     same_rows = some_job(0)
     other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
     feed = BatchSampler([same_rows, other], BATCH_N, "cpu")
@@ -118,6 +128,6 @@ def test_blocks_and_networks_draw_different_rows():
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 16), (1, 1), (32, 1), (3, 100)])
-def test_any_number_of_rows_fills_any_batch(n, batch_n):
+def test_few_rows_are_repeated_to_fill_a_batch(n, batch_n):
     (step,) = batches([some_job(n=n)], 1, batch_n)
     assert step["inputs"].shape == (1, batch_n, 15)

@@ -21,7 +21,8 @@ SETTINGS = {
 }
 every_method = pytest.mark.parametrize("method", SETTINGS)
 
-# Tolerance: inputs (about 30 uT), targets (up to 16 mm) and predictions are float32, with relative rounding of 6e-8.
+# Tolerance: inputs (about 30 uT), targets (up to 16 mm) and predictions are in single precision, with a relative
+# rounding error of 6e-8.
 PREDICTION_ATOL_MM = 1e-4
 
 
@@ -30,7 +31,10 @@ def settings_of(method: str, **changes: object) -> Classical:
 
 
 def rows(seed: int = 0, n: int = 200, ch: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Return field changes and targets of a skin: the field is smooth in place and force, plus 1 uT of noise."""
+    """Return field changes and targets of a skin.
+
+    The field changes are smooth functions of place and force, plus noise of 1 uT.
+    """
     rng, skin = rng_for(seed, "rows"), rng_for(0, "skin")
     target = rng.uniform(0, 16, (n, 3))
     db_uT = 30 * np.tanh(target @ skin.normal(0, 0.1, (3, ch)) + skin.normal(0, 1, ch)) + rng.normal(0, 1, (n, ch))
@@ -46,7 +50,7 @@ def fit_to(
 def standardise(
     db_uT: np.ndarray, target: np.ndarray, query_uT: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return inputs, targets and queries standardised by the mean and deviation of the training rows."""
+    """Return inputs, targets and queries, standardised by the means and standard deviations of the training rows."""
     mean, sd = db_uT.mean(axis=0, dtype=float), db_uT.std(axis=0, dtype=float)
     expected = (target - target.mean(axis=0, dtype=float)) / target.std(axis=0, dtype=float)
     return (db_uT - mean) / sd, expected, (query_uT - mean) / sd
@@ -57,21 +61,21 @@ def unstandardise(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_ridge_equals_closed_form(weighted):
+def test_ridge_regression_equals_the_closed_form(weighted):
     db_uT, target = rows()
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1)
     a, t, q = standardise(db_uT, target, query_uT)
     w = np.ones(len(a)) if weight is None else weight.astype(float)
     a1, q1 = np.c_[a, np.ones(len(a))], np.c_[q, np.ones(len(q))]
-    penalty = np.diag([3.0] * 5 + [0.0])  # the intercept is not penalised
+    penalty = np.diag([3.0] * 5 + [0.0])  # The intercept is not penalised.
     expected = q1 @ np.linalg.solve(a1.T @ (w[:, None] * a1) + penalty, a1.T @ (w[:, None] * t))
     found = fit_to("ridge", db_uT, target, weight, alpha=3.0).predict(query_uT)
     np.testing.assert_allclose(found, unstandardise(expected, target), atol=PREDICTION_ATOL_MM)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_knn_weights_neighbours_by_inverse_distance(weighted):
+def test_nearest_neighbours_are_weighted_by_inverse_distance(weighted):
     db_uT, target = rows()
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1, n=20)
@@ -87,7 +91,7 @@ def test_knn_weights_neighbours_by_inverse_distance(weighted):
 
 
 @every_method
-def test_prediction_does_not_depend_on_blocks(method):
+def test_predictions_do_not_depend_on_the_size_of_blocks(method):
     db_uT, target = rows()
     fitted = fit_to(method, db_uT, target)
     query_uT, _ = rows(1, n=BLOCK_ROWS_N + 2)
@@ -96,14 +100,14 @@ def test_prediction_does_not_depend_on_blocks(method):
         np.testing.assert_allclose(found[i : i + 1], fitted.predict(query_uT[i : i + 1]), atol=PREDICTION_ATOL_MM)
 
 
-def test_knn_returns_the_target_at_distance_0():
+def test_nearest_neighbour_at_distance_zero_determines_the_prediction():
     db_uT, target = rows()
     weight = np.where(np.arange(len(db_uT)) < 5, 50, 1).astype(np.float32)
     np.testing.assert_allclose(fit_to("knn", db_uT, target, weight).predict(db_uT), target, atol=PREDICTION_ATOL_MM)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_rbf_equals_kernel_solve(weighted):
+def test_rbf_ridge_equals_a_solution_with_the_kernel_matrix(weighted):
     db_uT, target = rows(n=60)
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1, n=20)
@@ -130,7 +134,7 @@ def test_cubic_ridge_equals_scikit_learn(weighted):
     np.testing.assert_allclose(found, unstandardise(expected, target), atol=PREDICTION_ATOL_MM)
 
 
-def test_cubic_function_is_recovered():
+def test_cubic_ridge_recovers_a_cubic_function():
     rng = rng_for(0, "cubic")
     db_uT = rng.uniform(-30, 30, (400, 4)).astype(np.float32)
 
@@ -140,13 +144,13 @@ def test_cubic_function_is_recovered():
 
     query_uT = rng.uniform(-30, 30, (50, 4)).astype(np.float32)
     found = fit_to("cubic_ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
-    # predictions up to 54, in float32 (relative rounding 6e-8)
+    # Tolerance: predictions of up to 54 are in single precision, with a relative rounding error of 6e-8.
     np.testing.assert_allclose(found, cubic(query_uT), atol=1e-4)
     plane = fit_to("ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
     assert np.abs(plane - cubic(query_uT)).max() > 1
 
 
-def test_boosting_is_deterministic():
+def test_equal_seeds_give_equal_boosted_trees():
     db_uT, target = rows()
     query_uT, _ = rows(1)
     assert (
@@ -155,7 +159,7 @@ def test_boosting_is_deterministic():
 
 
 @every_method
-def test_predictions_are_better_than_the_mean_target(method):
+def test_predictions_are_better_than_the_mean_of_the_targets(method):
     db_uT, target = rows(n=600)
     found = fit_to(method, db_uT[:400], target[:400]).predict(db_uT[400:])
     error, spread = ((found - target[400:]) ** 2).mean(axis=0), target[400:].var(axis=0)
@@ -163,10 +167,10 @@ def test_predictions_are_better_than_the_mean_target(method):
 
 
 @every_method
-@settings(max_examples=10, deadline=None)  # an example fits two models
+@settings(max_examples=10, deadline=None)  # Fewer examples than usual, because each fits two models.
 @given(st.integers(0, 10_000), st.integers(-20, 20))
-def test_other_units_of_targets_scale_the_predictions(method, seed, power):
-    """The factor (1e-6 to 1e6) is a power of 2, so no value is rounded, and trees split at the same values."""
+def test_predictions_scale_with_the_unit_of_the_targets(method, seed, power):
+    """The factor (1e-6 to 1e6) is a power of 2, so no value is rounded, and decision trees split at the same values."""
     db_uT, target = rows(seed, n=60)
     query_uT, _ = rows(seed + 1, n=20)
     factor = np.float32(2.0**power)
@@ -177,18 +181,19 @@ def test_other_units_of_targets_scale_the_predictions(method, seed, power):
 
 @every_method
 @pytest.mark.parametrize("shift_mm", [-500.0, 3.0, 40.0])
-def test_shifted_places_shift_the_predictions(method, shift_mm):
+def test_predictions_shift_with_the_places_of_the_targets(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    target = np.round(target * 64) / 64  # multiples of 1/64 mm, which are still exact after the shift
+    # Places are rounded to multiples of 1/64 mm, so that they are exact after the shift.
+    target = np.round(target * 64) / 64
     found = fit_to(method, db_uT, target).predict(query_uT)
     other = fit_to(method, db_uT, target + np.float32(shift_mm)).predict(query_uT)
-    # additional tolerance: shifted predictions of up to 500 mm are rounded to float32 (6e-8)
+    # The additional tolerance is for shifted predictions of up to 500 mm, which are rounded to single precision (6e-8).
     np.testing.assert_allclose(other - shift_mm, found, atol=PREDICTION_ATOL_MM + 6e-8 * abs(shift_mm))
 
 
 @every_method
-def test_constant_channel_is_ignored(method):
+def test_channel_without_variation_is_ignored(method):
     db_uT, target = rows()
     query_uT, _ = rows(1)
     constant = np.full((len(db_uT), 1), 0.1, np.float32)
@@ -197,7 +202,7 @@ def test_constant_channel_is_ignored(method):
 
 
 @every_method
-def test_unknown_force_leaves_places_unchanged(method):
+def test_rows_without_a_force_are_still_used_for_places(method):
     db_uT, target = rows()
     query_uT, _ = rows(1)
     placed = target.copy()
@@ -210,8 +215,8 @@ def test_unknown_force_leaves_places_unchanged(method):
 
 
 @every_method
-def test_force_that_is_known_for_some_rows_is_learned(method):
-    """Rows without force repeat the inputs of rows with force, so both sets have equal means and deviations."""
+def test_force_is_learnt_from_the_rows_where_it_is_known(method):
+    """Rows without a force have the same inputs as rows with a force, so both sets are scaled in the same way."""
     db_uT, target = rows(n=80)
     query_uT, _ = rows(1)
     both = np.vstack([target, target])
@@ -221,13 +226,17 @@ def test_force_that_is_known_for_some_rows_is_learned(method):
         found[:, 2], fit_to(method, db_uT, target).predict(query_uT)[:, 2], atol=PREDICTION_ATOL_MM
     )
     whole = fit_to(method, np.vstack([db_uT, db_uT]), np.vstack([target, target])).predict(query_uT)
-    if method != "rbf_ridge":  # rbf_ridge is excluded, because it uses a random selection of 100 of the 160 rows
+    # The method rbf_ridge is excluded, because it uses a random selection of 100 of the 160 rows.
+    if method != "rbf_ridge":
         np.testing.assert_allclose(found[:, :2], whole[:, :2], atol=PREDICTION_ATOL_MM)
 
 
 @every_method
-def test_rows_of_large_weight_dominate_the_prediction(method):
-    """A tenth of the rows are shifted by 8 mm along x. Their weight is twice that of all other rows, or nearly 0."""
+def test_rows_with_a_large_total_weight_determine_the_prediction(method):
+    """A tenth of the rows are shifted by 8 mm along x.
+
+    Their total weight is twice that of all other rows, or nearly 0.
+    """
     db_uT, target = rows(n=400)
     further = np.arange(400) < 40
     target[further, 0] += 8
@@ -238,11 +247,13 @@ def test_rows_of_large_weight_dominate_the_prediction(method):
         weight = np.where(further, weight_of_one, 1).astype(np.float32)
         predicted = fit_to(method, db_uT, target, weight, **most).predict(query_uT)
         errors_mm.append((predicted[:, 0] - expected[:, 0] - 8).mean())
-    assert errors_mm[0] == pytest.approx(-8, abs=1)  # the other rows have a third of the total weight
+    # With nearly no weight, the shifted rows do not influence the prediction, which is therefore 8 mm off.
+    assert errors_mm[0] == pytest.approx(-8, abs=1)
+    # With two thirds of the total weight, the shifted rows move the prediction by more than 2 mm.
     assert errors_mm[1] > -6
 
 
-def test_rbf_draws_rows_at_random():
+def test_rbf_ridge_selects_random_rows():
     db_uT, target = rows(n=300)
     fitted = fit_to("rbf_ridge", db_uT, target, rows_max_n=50)
     assert fitted.rows_n == 50
@@ -252,24 +263,26 @@ def test_rbf_draws_rows_at_random():
     assert (again.predict(db_uT) != fitted.predict(db_uT)).any()
 
 
-def test_rbf_keeps_rows_of_greater_weight():
-    """Only a subset of the training rows is kept, but every row with a greater weight must be in it.
+def test_rbf_ridge_always_selects_rows_of_greater_weight():
+    """Only a selection of the training rows is used, but it must contain every row whose weight is greater than 1.
 
-    Five of the 300 rows have a greater weight. Their inputs are far from those of all other rows, so a prediction at
-    one of these inputs depends on this row alone.
+    Five of the 300 rows have a greater weight. Their inputs are far from the inputs of all other rows, so a prediction
+    at one of these inputs depends on this row alone.
     """
     db_uT, target = rows(n=300)
     db_uT[:5] += 1e5 * np.arange(1, 6)[:, None]
-    # The five rows together have the weight 5 * 59 = 295, the same as the 295 other rows together.
+    # Each of the five rows has the weight 59, so together they weigh 5 * 59 = 295, as much as the 295 other rows.
     weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)
     found = fit_to("rbf_ridge", db_uT, target, weight, gamma=300.0, rows_max_n=64).predict(db_uT[:5])
-    lowered = 59 * 59 / 295  # 59 of the 295 other rows are kept, each standing for five
+    # Of the 295 other rows, 59 are selected. Each stands for five rows, so the weight of the five special rows is
+    # divided by five.
+    lowered = 59 * 59 / 295
     mean = target.mean(axis=0, dtype=float)
     expected = mean + (target[:5] - mean) / (1 + 0.1 / lowered)
     np.testing.assert_allclose(found, expected, atol=PREDICTION_ATOL_MM)
 
 
-def test_rbf_refuses_too_many_weighted_rows():
+def test_more_weighted_rows_than_rbf_ridge_can_select_are_refused():
     db_uT, target = rows(n=300)
     weight = np.where(np.arange(300) < 50, 20, 1).astype(np.float32)
     with pytest.raises(TrainingError, match="rows_max_n must be more than the 50 labelled rows of the skin; got 50"):
@@ -277,7 +290,7 @@ def test_rbf_refuses_too_many_weighted_rows():
 
 
 @pytest.mark.parametrize(("method", "n"), [("ridge", 0), ("knn", 3)])
-def test_too_few_rows_are_refused(method, n):
+def test_fewer_rows_than_a_method_needs_are_refused(method, n):
     db_uT, target = rows()
     target[n:] = np.nan
     with pytest.raises(TrainingError, match=f"training rows must be .* or more for each target; got {n}"):
@@ -291,7 +304,7 @@ def test_nan_readings_are_refused():
         fit_to("boosting", db_uT, target)
 
 
-def test_settings_are_required_and_methods_have_titles():
+def test_each_method_has_a_title_and_requires_its_settings():
     with pytest.raises(ValidationError, match="alpha"):
         TypeAdapter(Classical).validate_python({"method": "ridge", "inputs": "raw"})
     with pytest.raises(ValidationError, match="extra"):

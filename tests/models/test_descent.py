@@ -15,7 +15,7 @@ def weights() -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("steps_n", [1, 2, 3, 10, 150])
 @pytest.mark.parametrize("weight_decay", [0.0, 0.1])
-def test_steps_equal_torch_bit_for_bit(steps_n, weight_decay):
+def test_optimiser_steps_equal_those_of_pytorch_bit_for_bit(steps_n, weight_decay):
     ours, theirs = weights(), weights()
     optimizer = torch.optim.AdamW(theirs, 1.2e-2, weight_decay=weight_decay, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.2e-2, total_steps=max(steps_n, 2))
@@ -31,8 +31,8 @@ def test_steps_equal_torch_bit_for_bit(steps_n, weight_decay):
             assert torch.equal(one, other)
 
 
-def test_training_imports_no_compiler():
-    """Importing PyTorch's compiler would cost two seconds per process, and this project compiles no network."""
+def test_training_does_not_import_the_compiler_of_pytorch():
+    """This project compiles no network, and importing PyTorch's compiler would cost two seconds in each process."""
     code = (
         "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
         "from tests.models.example_jobs import some_job\nfrom tests.models.example_jobs import recipe\n"

@@ -8,21 +8,22 @@ from hypothesis import strategies as st
 from reskin.models.inputs import VIEW, DB_FLOOR_uT
 from reskin.seeds import rng_for
 
-SHAPE_ATOL = 1e-6  # components of at most 1, after a few float32 roundings of 6e-8
-LOG_ATOL = 1e-5  # logarithms of at most 17, after a few float32 roundings
+# Tolerance for the components of a direction, which are at most 1: a few roundings in single precision, 6e-8 each.
+SHAPE_ATOL = 1e-6
+LOG_ATOL = 1e-5  # Tolerance for logarithms, which are at most 17: a few roundings in single precision.
 
 
 def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
-    """Return field changes of about 120 uT, far above the floor of the length."""
+    """Return field changes of about 120 uT. This is far above the limit below which lengths are not divided out."""
     return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
 
 
-def test_raw_is_the_change_of_field():
+def test_input_raw_is_the_unchanged_field_change():
     db_uT = rows()
     assert (VIEW["raw"](db_uT) == db_uT).all()
 
 
-def test_shape_is_direction_and_log_length():
+def test_input_shape_is_the_direction_and_the_log_length():
     db_uT = rows()
     seen = VIEW["shape"](db_uT)
     assert seen.shape == (20, 16)
@@ -35,7 +36,7 @@ def test_shape_is_direction_and_log_length():
 
 
 @given(st.integers(0, 10_000), st.floats(1, 1e6))
-def test_stronger_magnet_changes_the_log_only(seed, times):
+def test_stronger_magnetisation_changes_only_the_log_length(seed, times):
     db_uT = rows(seed)
     seen, stronger = VIEW["shape"](db_uT), VIEW["shape"]((db_uT * times).astype(np.float32))
     np.testing.assert_allclose(stronger[:, :-1], seen[:, :-1], atol=SHAPE_ATOL)
@@ -43,7 +44,7 @@ def test_stronger_magnet_changes_the_log_only(seed, times):
 
 
 @given(st.integers(0, 10_000), st.floats(1e-3, 1e6))
-def test_shape_has_unit_length(seed, times):
+def test_direction_has_unit_length_above_the_limit(seed, times):
     db_uT = (rows(seed) * times).astype(np.float32)
     above = np.linalg.norm(db_uT.astype(float), axis=1) >= DB_FLOOR_uT
     length = np.linalg.norm(VIEW["shape"](db_uT)[:, :-1].astype(float), axis=1)
@@ -51,12 +52,12 @@ def test_shape_has_unit_length(seed, times):
     assert (length[~above] < 1).all()
 
 
-def test_shape_of_a_zero_change_is_finite():
+def test_input_shape_of_a_zero_field_change_is_finite():
     seen = VIEW["shape"](np.zeros((2, 15), np.float32))
     assert (seen[:, :-1] == 0).all()
     assert (seen[:, -1] == math.log(DB_FLOOR_uT)).all()
 
 
 @given(st.floats(0, 2.0**100))
-def test_inputs_are_finite(length_uT):
+def test_input_shape_of_any_field_change_is_finite(length_uT):
     assert np.isfinite(VIEW["shape"](np.array([[length_uT, -length_uT, 0]], np.float32))).all()

@@ -28,7 +28,7 @@ from tests.models.example_jobs import (
     without_triplets,
 )
 
-NEW = np.arange(24, ROWS_N)  # rows of the skins outside the training data
+NEW = np.arange(24, ROWS_N)  # Rows of the skins that are not in the training data.
 KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
@@ -37,13 +37,13 @@ def train_job(job: TrainingJob, rows: TrainingData) -> TrainingResult:
 
 
 def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
-    """Return whether the weights, scalers and loss curves of two results are equal bit for bit."""
+    """Return whether two results have the same weights, scalers and loss curves, bit for bit."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
     return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
 
 
-# Which data an adaptation may use
+# --- Which data may an adaptation use? ---
 
 
 @pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
@@ -57,14 +57,14 @@ def test_adaptation_ignores_places_and_forces_of_the_new_skin(rows, new):
     assert (once.predicted == blind.predicted).all()
 
 
-def test_adaptation_ignores_the_skin_of_its_pokes():
+def test_adaptation_ignores_the_names_of_skins_of_its_pokes():
     assert equal_results(
         train_job(adaptation(), example_data()),
         train_job(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0")),
     )
 
 
-def test_adaptation_uses_fields_and_order_of_the_lines():
+def test_adaptation_depends_on_field_changes_and_order_of_the_pokes_on_lines():
     once, along = train_job(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
     assert not equal_results(once, train_job(adaptation(along=backwards), example_data()))
@@ -72,11 +72,11 @@ def test_adaptation_uses_fields_and_order_of_the_lines():
     assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
-def test_lines_have_no_place_and_no_force():
+def test_lines_contain_no_places_and_no_forces():
     assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
 
 
-def test_pokes_use_the_scaler_of_the_pretrained_network():
+def test_unlabelled_pokes_are_scaled_as_for_the_pretrained_network():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
@@ -94,7 +94,7 @@ def test_pokes_use_the_scaler_of_the_pretrained_network():
 
 
 @pytest.mark.parametrize("rows", [POKED, NEW], ids=["poked", "all"])
-def test_control_uses_no_data_of_the_new_skin(rows):
+def test_control_without_unlabelled_pokes_ignores_the_new_skin(rows):
     control = adaptation(unlabelled_weight=0.0)
     once = train_job(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
@@ -110,12 +110,12 @@ def test_fine_tuning_uses_only_the_given_labels_of_the_new_skin():
     assert not equal_results(once, train_job(fine_tuning(own_weight=0.0), example_data()))
 
 
-# Held-out data must not influence the result
+# --- Held-out data must not influence the result. ---
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
-def test_test_rows_do_not_influence_the_model(scaling, view):
+def test_test_rows_do_not_change_the_trained_network(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
     once = train_job(job, example_data())
     planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
@@ -131,7 +131,7 @@ def test_scaler_is_fitted_to_training_rows(kind):
     np.testing.assert_allclose(scaler.target_scale, example_data().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
 
 
-def test_labelled_triplets_are_formed_by_distance_in_mm_on_each_skin():
+def test_labelled_triplets_compare_distances_in_mm_on_the_same_skin():
     rows = example_data()
     prepared, _ = prepare(pooled(), rows)
     assert (prepared.labelled.points.place == rows.target[TRAIN, :2]).all()
@@ -144,7 +144,7 @@ def test_labelled_triplets_are_formed_by_distance_in_mm_on_each_skin():
     )
 
 
-def test_loss_weights_follow_the_recipe():
+def test_weights_of_the_loss_terms_are_those_of_the_recipe():
     assert pooled().loss_weights == LossWeights(0.5)
     assert adaptation(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
     assert fine_tuning(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
@@ -152,7 +152,7 @@ def test_loss_weights_follow_the_recipe():
     assert pooled().schedule == pooled().recipe
 
 
-# Methods are compared in pairs, with equal batches
+# --- Methods are compared in pairs, so they must be trained on equal batches. ---
 
 
 def first_batches(job: TrainingJob) -> list[np.ndarray]:
@@ -190,7 +190,7 @@ def test_folds_and_seeds_have_different_batches(changes):
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-# Keys of the cache of training results
+# --- Keys, under which training results are stored in the cache ---
 
 
 def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
@@ -225,13 +225,13 @@ OTHER_ROWS = {
 
 
 @pytest.mark.parametrize("what", sorted(INFLUENTIAL_ROWS))
-def test_key_changes_with_rows_that_influence_the_result(what):
+def test_cache_key_changes_with_rows_that_influence_the_result(what):
     kind, rows = INFLUENTIAL_ROWS[what]
     assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
 
 
 @pytest.mark.parametrize("what", sorted(OTHER_ROWS))
-def test_key_ignores_rows_without_influence(what):
+def test_cache_key_ignores_rows_without_influence(what):
     kind, rows = OTHER_ROWS[what]
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
@@ -240,7 +240,7 @@ def with_tuning_settings(job: TrainingJob, **changes: object) -> TrainingJob:
     return with_tuning(job, settings=job.tuning.settings.model_copy(update=changes))
 
 
-def test_different_settings_have_different_keys():
+def test_different_settings_have_different_cache_keys():
     along = lines()
     jobs = [
         pooled(), adaptation(), fine_tuning(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
@@ -262,6 +262,7 @@ def test_different_settings_have_different_keys():
 
 
 def test_restart_after_collapse_has_other_weights_and_batches():
+    """If a training run collapses to a constant output, it is repeated with other random numbers."""
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
     (one, _), (other, _) = prepare(pooled(), example_data()), prepare(again, example_data())
@@ -270,13 +271,13 @@ def test_restart_after_collapse_has_other_weights_and_batches():
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
-def test_initial_output_bias_is_the_mean_target(scaling):
+def test_initial_bias_of_the_output_layer_is_the_mean_target(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = with_values(example_data(), "target", np.arange(3), np.nan)
     prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))
     predicted = scaler.decode(prepared.initial_weights["layer6.bias"][None])[0]
     np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
-    assert prepared.initial_weights["layer6.bias"][2] == 0  # no force is known
+    assert prepared.initial_weights["layer6.bias"][2] == 0  # All forces are unknown, so the bias of the force is 0.
 
 
 WITHOUT_INFLUENCE = {
@@ -294,7 +295,7 @@ WITHOUT_INFLUENCE = {
 }
 
 
-def test_key_includes_the_code_of_training():
+def test_cache_key_includes_the_code_of_all_modules_that_train():
     graph = grimp.build_graph("reskin", cache_dir=None)
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
@@ -303,51 +304,52 @@ def test_key_includes_the_code_of_training():
     assert others <= imported
 
 
-def test_key_ignores_experiments_and_names():
+def test_cache_key_ignores_the_names_of_experiment_and_recipe():
     assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
-def test_key_ignores_unused_rows():
+def test_cache_key_ignores_rows_that_the_job_does_not_use():
     rows = example_data()
     fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
-def test_data_digest_distinguishes_rows_of_other_skins():
+def test_data_digest_depends_on_the_skin_of_each_row():
     rows = example_data()
     other = replace(rows, skin=np.roll(rows.skin, 1))
     assert JobKeys(rows).data_digest() != JobKeys(other).data_digest()
 
 
-def test_keys_do_not_depend_on_their_cache():
+def test_cache_keys_do_not_depend_on_earlier_calls():
     book, jobs = JobKeys(example_data()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adaptation()]
     assert [book.key(job) for job in jobs] == [key(job) for job in jobs]
 
 
-def test_key_changes_with_the_code_that_trains(monkeypatch):
+def test_cache_key_changes_with_the_code_that_trains(monkeypatch):
     before = key(pooled())
     monkeypatch.setattr(job_module, "digest", lambda name: f"another {name}")
     assert key(pooled()) != before
 
 
-def test_name_describes_the_job():
+def test_name_of_a_job_contains_recipe_fold_and_seed():
     assert pooled().name == "triplet.paper.b1.seed0"
     assert replace(adaptation(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 
 
-def test_augmented_copies_keep_targets_and_are_new_skins():
+def test_augmented_copies_have_the_same_targets_and_count_as_new_skins():
     settings = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # Boards without spread do not change the fields, so the rows appear three times, with equal fields and targets.
+    # Virtual boards without spread do not change the fields. Therefore each row appears three times (the original and
+    # two copies), with equal fields and targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
 
 
-def test_augmentation_depends_on_fold_and_seed():
+def test_augmented_rows_depend_on_fold_and_seed():
     settings = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
     recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings})
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings | {"gain_sd": 0.2}})

@@ -11,7 +11,7 @@ from reskin.models.losses import squared_error, triplet_loss
 from reskin.seeds import rng_for
 
 M, B, D = 3, 7, 40
-SUM_RTOL = 1e-5  # rounding of float32 sums of up to 280 terms
+SUM_RTOL = 1e-5  # Relative tolerance: rounding of sums of up to 280 terms in single precision.
 
 
 def predictions(*names: str | int) -> torch.Tensor:
@@ -27,7 +27,7 @@ def random_triplet(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
 
 
 def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch.Tensor) -> list[float]:
-    """Reference: max(0, |a - p|^2 - |a - n|^2) in float64, by three nested loops."""
+    """Return the reference, max(0, |a - p|^2 - |a - n|^2), in double precision by three nested loops."""
     losses = []
     for member_i in range(len(anchor)):
         total = 0.0
@@ -42,7 +42,7 @@ def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch
     return losses
 
 
-def test_l2_loss_equals_nested_loops():
+def test_squared_error_equals_nested_loops():
     predicted, truth = predictions("answer"), predictions("truth")
     for i in range(M):
         total = sum((float(predicted[i, j, k]) - float(truth[i, j, k])) ** 2 for j in range(B) for k in range(3))
@@ -65,16 +65,16 @@ def test_unknown_targets_are_ignored():
     assert torch.isfinite(predicted.grad).all()
 
 
-def test_gradient_points_to_the_target():
+def test_gradient_of_the_squared_error_points_away_from_the_target():
     predicted, truth = predictions("answer").requires_grad_(), predictions("truth")
     squared_error(predicted, truth).sum().backward()
     torch.testing.assert_close(predicted.grad, 2 * (predicted.detach() - truth) / (3 * B), rtol=SUM_RTOL, atol=1e-7)
 
 
 @given(st.floats(-100, 100))
-def test_shift_invariance_of_l2(shift):
+def test_squared_error_does_not_change_if_predictions_and_targets_are_shifted(shift):
     predicted, truth = predictions("answer"), predictions("truth")
-    # rounding error of float32 numbers up to 100 is about 1e-5
+    # Tolerance: numbers of up to 100 have rounding errors of about 1e-5 in single precision.
     torch.testing.assert_close(
         squared_error(predicted + shift, truth + shift), squared_error(predicted, truth), rtol=1e-3, atol=0
     )
@@ -89,22 +89,23 @@ def test_triplet_loss_equals_nested_loops(seed):
     )
 
 
-def test_satisfied_triplet_has_no_loss():
+def test_triplet_with_a_nearer_positive_has_no_loss():
     anchor = torch.zeros(1, 1, 2)
     positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
-    assert float(triplet_loss(anchor, positive, negative)) == 0  # the loss has no margin
+    assert float(triplet_loss(anchor, positive, negative)) == 0  # The loss has no margin, so any difference is enough.
     assert float(triplet_loss(anchor, negative, positive)) > 0
 
 
-def test_gradient_of_a_violated_triplet():
-    # loss = |a - p|^2 - |a - n|^2 = 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
+def test_gradient_of_a_triplet_with_a_nearer_negative_equals_the_closed_form():
+    # The loss is |a - p|^2 - |a - n|^2 = 2^2 - 1^2. Its derivatives are d/dp = -2 (a - p), d/dn = 2 (a - n) and d/da =
+    # 2 (a - p) - 2 (a - n).
     a, p, n = (torch.tensor([[[x]]], requires_grad=True) for x in (0.0, 2.0, 1.0))
     loss = triplet_loss(a, p, n)
     loss.sum().backward()
     assert [float(one) for one in (loss.detach(), a.grad, p.grad, n.grad)] == [3.0, -2.0, 4.0, -2.0]
 
 
-def test_identical_points_have_no_gradient():
+def test_triplet_of_identical_points_has_no_gradient():
     points = [features("anchor").clone().requires_grad_() for _ in range(3)]
     loss = triplet_loss(*points)
     loss.sum().backward()
@@ -124,21 +125,21 @@ def test_networks_of_a_stack_have_separate_losses():
 def test_triplet_loss_is_invariant_under_rotation_and_shift(seed, shift):
     turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
     moved = [one @ turn + shift for one in random_triplet()]
-    # tolerance: differences of sums of about 80, from float32 numbers of up to 10
+    # The tolerance is the rounding of differences of sums of about 80, from single-precision numbers of up to 10.
     torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*random_triplet()), rtol=1e-4, atol=1e-4)
 
 
 @given(st.floats(0.01, 100))
-def test_triplet_loss_scales_with_the_square(k):
+def test_triplet_loss_scales_with_the_square_of_the_features(k):
     stretched = [one * k for one in random_triplet()]
-    torch.testing.assert_close(
-        triplet_loss(*stretched), triplet_loss(*random_triplet()) * k**2, rtol=1e-4, atol=0
-    )  # tolerance of float32
+    # The tolerance is that of single precision.
+    torch.testing.assert_close(triplet_loss(*stretched), triplet_loss(*random_triplet()) * k**2, rtol=1e-4, atol=0)
 
 
 @given(st.integers(0, 1000))
-def test_swapping_positive_and_negative_changes_the_sign(seed):
+def test_losses_of_a_triplet_and_its_reverse_differ_by_the_difference_of_squared_distances(seed):
     anchor, positive, negative = random_triplet(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
-    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # tolerance: float32 sums of about 80
+    # The tolerance is the rounding of single-precision sums of about 80.
+    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)

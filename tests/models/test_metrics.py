@@ -9,7 +9,7 @@ from reskin.metrics import METRICS, coverage_pct, interval_score, median_error_m
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
 
-def test_scores_of_a_perfect_prediction():
+def test_perfect_predictions_have_no_error_and_r2_of_one():
     found = score(TRUE, TRUE)
     assert {name: found[name] for name in METRICS} == {
         "accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0, "r2_f": 1.0,
@@ -29,23 +29,23 @@ def test_r2_of_force_equals_scikit_learn(forces):
         assert "r2_f" not in score(true, constant)
 
 
-def test_accuracy_needs_both_axes_within_one_millimetre():
+def test_accuracy_counts_predictions_within_one_millimetre_in_both_axes():
     error = np.array([[1.0, -1.0, 0.0], [1.01, 0.0, 0.0], [0.0, -1.01, 0.0], [0.5, 0.5, 0.0]])
     assert score(TRUE, TRUE + error)["accuracy_pct"] == 50.0
 
 
-def test_place_error_equals_naive_loop():
+def test_place_error_equals_a_loop():
     rng = np.random.default_rng(0)
     predicted = TRUE + rng.normal(size=TRUE.shape)
     total = 0.0
     for i in range(len(TRUE)):
         for axis in (0, 1):
             total += (predicted[i, axis] - TRUE[i, axis]) ** 2
-    # tolerance: rounding of the same sum in another order
+    # The tolerance is rounding, because the same terms are summed in another order.
     assert score(TRUE, predicted)["mse_xy_mm2"] == pytest.approx(total / (2 * len(TRUE)), rel=1e-12)
 
 
-def test_unknown_force_is_ignored():
+def test_rows_without_a_force_are_not_scored_for_force():
     true = TRUE.copy()
     true[1:, 2] = np.nan
     assert score(true, TRUE + [0, 0, 2.0])["mse_f_N2"] == 4.0
@@ -54,17 +54,17 @@ def test_unknown_force_is_ignored():
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5))
-def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
+def test_registration_removes_a_constant_offset_of_places(dx_mm, dy_mm):
     shifted = TRUE + [dx_mm, dy_mm, 0.0]
-    # tolerance: rounding of means of numbers below 32
+    # The tolerance is the rounding of means of numbers below 32.
     assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
 
 
 @given(st.floats(1e-6, 1e6))
-def test_force_error_scales_with_the_square_of_the_unit(scale):
+def test_squared_force_error_scales_with_the_square_of_the_unit(scale):
     predicted = TRUE + 0.25
     scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
-    # tolerance: two roundings per row
+    # The tolerance is two roundings per row.
     assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
 
 
@@ -72,7 +72,7 @@ BOARD = np.repeat(["b0", "b1"], 2)
 SKIN = np.array(["s0", "s1", "s1", "s2"])
 
 
-def test_groups_are_scored_separately():
+def test_each_group_of_rows_is_scored_separately():
     predicted = TRUE + np.random.default_rng(1).normal(size=TRUE.shape)
     scores = score_groups(TRUE, predicted, BOARD, SKIN)
     assert scores["rows_n"] == 4
@@ -80,22 +80,22 @@ def test_groups_are_scored_separately():
     assert scores["by_skin"]["s1"] == score(TRUE[1:3], predicted[1:3])
 
 
-def test_registration_uses_one_offset_per_board():
+def test_registration_subtracts_one_offset_per_board():
     offset = np.where(BOARD == "b0", 3.0, -2.0)[:, None] * [1.0, 1.0, 0.0]
     scores = score_groups(TRUE, TRUE + offset, BOARD, SKIN)
     assert scores["all"]["accuracy_pct"] == 0.0
     assert scores["registered"]["accuracy_pct"] == 100.0
 
 
-def test_interval_score_is_smallest_for_the_quantiles_of_the_errors():
+def test_interval_score_is_smallest_for_intervals_between_the_error_quantiles():
     errors = np.random.default_rng(2).standard_normal(200_000)
     ends = np.ones(len(errors))
     scores = {width: interval_score(errors, -width * ends, width * ends) for width in (1.2, 1.645, 2.2)}
     assert min(scores, key=scores.__getitem__) == 1.645
     assert interval_score(np.array([3.0]), np.array([-1.0]), np.array([1.0])) == pytest.approx(2 + 20 * 2)
-    # tolerance: four standard errors of a proportion of 0.9 with 200,000 values
+    # The tolerance is four standard errors of a proportion of 0.9 in 200,000 values.
     assert coverage_pct(errors, -1.645 * ends, 1.645 * ends) == pytest.approx(90, abs=0.27)
 
 
-def test_median_error_is_a_distance():
+def test_median_place_error_is_the_median_of_distances():
     assert median_error_mm(TRUE[:3, :2], TRUE[:3, :2] + [[3.0, 4.0], [0.0, 1.0], [9.0, 9.0]]) == 5.0

@@ -8,7 +8,7 @@ from reskin.models.network import LAYERS, Predictor, Stack, draw_weights
 from reskin.seeds import rng_for
 from tests.models.plain import features_of, plain_net, weights_of
 
-# Tolerance: six layers of float32 sums of up to 200 terms near 1, in another order.
+# Tolerance: the six layers sum up to 200 single-precision terms near 1, in another order.
 CLOSE = {"rtol": 1e-4, "atol": 1e-6}
 
 
@@ -32,7 +32,7 @@ def output_and_gradients(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Te
 
 @pytest.mark.parametrize("architecture", sorted(LAYERS))
 @pytest.mark.parametrize("members_n", [1, 3])
-def test_stacked_networks_equal_plain_networks(architecture, members_n):
+def test_networks_in_a_stack_equal_plain_networks(architecture, members_n):
     net, inputs = stack(members_n, architecture), batch(members_n)
     outputs, _ = output_and_gradients(net, inputs)
     for i in range(members_n):
@@ -43,7 +43,7 @@ def test_stacked_networks_equal_plain_networks(architecture, members_n):
         torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
         gradients = _with_gradients_for_weights(net).weights_of(i)
         for name, values in weights_of(alone, gradient=True).items():
-            # larger tolerance, because gradients are also summed over the batch
+            # The tolerance for gradients is larger, because they are also summed over the batch.
             np.testing.assert_allclose(gradients[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
@@ -54,7 +54,7 @@ def _with_gradients_for_weights(net: Stack) -> Stack:
     return copied
 
 
-def test_stacked_networks_are_independent():
+def test_networks_of_a_stack_do_not_influence_each_other():
     inputs = batch(3)
     outputs, gradients = output_and_gradients(stack(3), inputs)
     others = Stack(LAYERS["paper"](15), [draw_parameters(name=0), draw_parameters(name=9), draw_parameters(name=2)])
@@ -65,7 +65,7 @@ def test_stacked_networks_are_independent():
         assert all(torch.equal(a[i], b[i]) == same for a, b in zip(again_gradients, gradients, strict=True))
 
 
-def test_nan_input_affects_its_network_only():
+def test_nan_input_of_a_network_affects_no_other_network_of_the_stack():
     inputs = batch(3)
     _, gradients = output_and_gradients(stack(3), inputs)
     inputs[1] = torch.nan
@@ -74,7 +74,7 @@ def test_nan_input_affects_its_network_only():
     assert all(torch.equal(a[[0, 2]], b[[0, 2]]) for a, b in zip(poisoned, gradients, strict=True))
 
 
-def test_network_round_trip_through_a_stack():
+def test_weights_taken_out_of_a_stack_equal_those_put_in():
     net = stack(3)
     for i in range(3):
         put, taken = draw_parameters(name=i), net.weights_of(i)
@@ -82,7 +82,7 @@ def test_network_round_trip_through_a_stack():
         assert all((taken[name] == put[name]).all() for name in put)
 
 
-def test_extracted_network_is_a_copy():
+def test_weights_taken_out_of_a_stack_are_a_copy():
     net = stack(2)
     taken = net.weights_of(1)
     with torch.no_grad():
@@ -92,17 +92,17 @@ def test_extracted_network_is_a_copy():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_nan_weight_affects_its_network_only(bad):
+def test_network_with_a_weight_that_is_not_finite_is_identified(bad):
     members = [draw_parameters(name=i) for i in range(3)]
     members[1]["layer4.bias"][7] = bad
     assert Stack(LAYERS["paper"](15), members).is_finite().tolist() == [True, False, True]
 
 
-def test_output_depends_on_forty_features():
+def test_output_is_computed_from_forty_features():
     net, inputs = stack(2), batch(2)
     features = net.features(inputs)
     assert features.shape == (2, 16, 40)
-    assert (features < 0).any()  # there is no ReLU after the feature layer
+    assert (features < 0).any()  # Some features are negative, because there is no ReLU after the feature layer.
     assert torch.equal(net.head(features), net(inputs))
 
 
@@ -113,7 +113,7 @@ def test_outputs_of_the_released_network_are_not_negative():
 
 
 @pytest.mark.parametrize("block_n", [1, 7, 16, 100])
-def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
+def test_predictions_do_not_depend_on_the_size_of_blocks(monkeypatch, block_n):
     inputs = batch(1)[0].numpy()
     monkeypatch.setattr(network, "BLOCK_ROWS_N", block_n)
     predict = Predictor(draw_parameters(), "paper", "cpu")

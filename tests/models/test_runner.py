@@ -19,11 +19,16 @@ from reskin.models.train import CHECKED_STEPS_N, train_stack
 from tests.models.example_jobs import TRAIN, adaptation, example_data, fine_tuning, pooled, recipe, without_triplets
 
 SIZE_N = STACK_N["cpu"]
-STACKED_ATOL = 1e-3  # mm and N: rounding differences between stacks (see test_train.py)
+# Tolerance in mm and N: networks that are trained in different stacks have different rounding errors (see
+# test_train.py).
+STACKED_ATOL = 1e-3
 
 
 class InlineExecutor(Executor):
-    """Executor that runs and counts calls in this process; after `die_after` calls, its workers count as dead."""
+    """An executor that runs calls in this process and counts them.
+
+    After `die_after` calls, it behaves as if its worker processes had died.
+    """
 
     def __init__(self, die_after: int = 10**9, error: type[Exception] = BrokenProcessPool) -> None:
         self.calls_n = 0
@@ -44,7 +49,7 @@ class InlineExecutor(Executor):
 
 
 def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
-    """Return jobs of `folds_n` folds; each fold holds out some rows of two skins."""
+    """Return one job for each of `folds_n` folds. Each fold holds out one row of two skins."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
     one = replace(pooled(**changes), experiment="lobo")
@@ -59,7 +64,7 @@ def run(
 
 
 def trainings_n(selected: list[TrainingJob], cache: Path) -> int:
-    """Run jobs; return the number of stacks that are trained (not taken from the cache)."""
+    """Run the jobs, and return the number of stacks that were trained because they were not in the cache."""
     executor = InlineExecutor()
     run(selected, cache, executor)
     return executor.calls_n
@@ -70,14 +75,13 @@ def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
-def test_result_reports_whether_it_was_cached(tmp_path):
+def test_result_says_whether_it_was_read_from_the_cache(tmp_path):
     first = run(jobs(2), tmp_path)
     both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
-    assert [one.seconds for one in both[:2]] == pytest.approx(
-        [one.seconds for one in first]
-    )  # the seconds are those of the training, not of reading the cache
+    # Also for a result from the cache, the seconds are those of the training.
+    assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])
 
 
 def test_results_are_in_the_order_of_jobs(tmp_path):
@@ -87,7 +91,7 @@ def test_results_are_in_the_order_of_jobs(tmp_path):
     assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in selected]
 
 
-def test_result_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
+def test_result_of_a_job_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
     selected = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
     for job, one in zip(selected, run(selected, tmp_path), strict=True):
         (alone,) = train_stack([job], example_data())
@@ -95,7 +99,7 @@ def test_result_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
-def test_call_sends_each_set_of_rows_once(tmp_path, monkeypatch):
+def test_each_set_of_rows_is_sent_to_workers_once(tmp_path, monkeypatch):
     sent, written = [], []
     here, write = InlineExecutor(), io.write_tensors
     monkeypatch.setattr(
@@ -106,21 +110,23 @@ def test_call_sends_each_set_of_rows_once(tmp_path, monkeypatch):
     )
     run([replace(job, seed_i=seed_i) for job in jobs(2) for seed_i in (0, 1)], tmp_path, here)
     assert {job.train.size + job.test.size for _, stack, _ in sent for job, *_ in stack} == {0}
-    assert len(written[0]) == 3 + 4  # 3: fields, targets and skins; 4: training and test rows of two folds
+    # Three arrays are shared by all jobs: fields, targets and skins. Four are the training and test rows of two folds.
+    assert len(written[0]) == 3 + 4
 
 
-def test_killed_run_keeps_finished_jobs(tmp_path):
+def test_jobs_that_finished_before_a_run_was_killed_are_kept(tmp_path):
     selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
         run(selected, tmp_path / "killed", InlineExecutor(die_after=1))
-    assert trainings_n(selected, tmp_path / "killed") == 2  # two of three stacks
+    # In the second run, two of the three stacks are left to train.
+    assert trainings_n(selected, tmp_path / "killed") == 2
     done, fresh = run(selected, tmp_path / "killed"), run(selected, tmp_path / "fresh")
     assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
-def test_stack_killed_during_writing_is_retrained(tmp_path):
-    # Last bits depend on the position of a network in its stack. Many steps with batches of one row amplify such
-    # differences.
+def test_stack_killed_while_its_results_were_written_is_trained_again(tmp_path):
+    # The last bits of a result depend on the position of the network in its stack. Many steps with batches of one row
+    # amplify such differences.
     selected = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
@@ -128,18 +134,18 @@ def test_stack_killed_during_writing_is_retrained(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
-def test_damaged_result_is_reported_and_retrained(tmp_path, damage):
+def test_damaged_result_in_the_cache_is_reported_and_trained_again(tmp_path, damage):
     first, log = run(jobs(), tmp_path), []
     file = tmp_path / f"{first[1].key}.safetensors"
     content = bytearray(file.read_bytes())
-    content[-5] ^= 1  # changes one bit of a weight, which the file format does not detect
+    content[-5] ^= 1  # One bit of a weight is changed. The file format does not detect such damage.
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
     again = run(jobs(), tmp_path, log=log)
     assert [line.startswith("warning: a cached result is damaged") for line in log[:2]] == [True, False]
     assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_memory_error_is_explained(tmp_path, monkeypatch):
+def test_worker_killed_for_memory_is_explained(tmp_path, monkeypatch):
     def allocate(*_: object) -> None:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes.")
 
@@ -148,14 +154,14 @@ def test_memory_error_is_explained(tmp_path, monkeypatch):
         run(jobs(), tmp_path, make_executor(1, imports="reskin.models.train"))
 
 
-def test_error_names_its_job(tmp_path):
+def test_error_message_names_its_job(tmp_path):
     with pytest.raises(
         TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: all \d+ points are at one place"
     ):
         run([replace(job, train=np.array([0, 0, 12])) for job in jobs(1)], tmp_path)
 
 
-def test_finished_jobs_are_not_trained_again(tmp_path):
+def test_finished_jobs_are_read_from_the_cache(tmp_path):
     log: list[str] = []
     first = run(jobs(), tmp_path)
     again = run(jobs(), tmp_path, InlineExecutor(die_after=0), log)
@@ -169,7 +175,7 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
         (replace(jobs(1)[0], seed_i=1), 1),
         (jobs(1, steps_n=5)[0], 1),
         (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # a job of another fold, which changes the stack
+        (jobs(3)[2], 3),  # A job of another fold, which changes the composition of the stack.
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
@@ -185,7 +191,7 @@ def test_renamed_job_is_read_from_the_cache(tmp_path):
     assert trainings_n([renamed], tmp_path) == 0
 
 
-def test_equal_jobs_are_trained_once(tmp_path):
+def test_equal_jobs_are_trained_only_once(tmp_path):
     one = jobs(1)[0]
     selected = [one, replace(one, recipe_name="twin"), one]
     done = run(selected, tmp_path)
@@ -193,7 +199,7 @@ def test_equal_jobs_are_trained_once(tmp_path):
     assert all(equal_results(done[0], other) for other in done[1:])
 
 
-def test_different_jobs_of_one_name_are_both_trained(tmp_path):
+def test_different_jobs_with_the_same_name_are_both_trained(tmp_path):
     one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
@@ -206,7 +212,7 @@ def test_cache_contains_no_rows(tmp_path):
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
 
-def test_cache_opens_without_pickle(tmp_path):
+def test_files_in_the_cache_can_be_read_without_pickle(tmp_path):
     run(jobs(1), tmp_path)
     (file,) = tmp_path.glob("*.safetensors")
     tensors, metadata = io.read_tensors(file)
@@ -216,14 +222,14 @@ def test_cache_opens_without_pickle(tmp_path):
 
 
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_result_round_trip_through_the_cache(tmp_path, job):
+def test_result_written_to_the_cache_is_read_unchanged(tmp_path, job):
     (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
     assert equal_results(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
 
 
-def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
+def test_network_whose_training_diverges_keeps_its_last_finite_weights(tmp_path):
     wild = jobs(2, rate_max=1e30, batch_n=4)
     for done in (run(wild, tmp_path), run(wild, tmp_path)):
         assert [one.stopped_step for one in done] == [4, 4]
@@ -231,11 +237,15 @@ def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
         assert all(np.isfinite(one.predicted).all() for one in done)
 
 
-DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # the output is constant and has no gradient, because all ReLUs are 0
+# With these weights, all ReLUs are 0, so the output is constant and there is no gradient.
+DEAD = {"layer1.weight": 0, "layer1.bias": 0}
 
 
 def prepare_dead(attempts: set[int]) -> object:
-    """Return a substitute for `prepare` with which fold b0 starts with dead weights in these attempts."""
+    """Return a substitute for `prepare`.
+
+    In the given attempts, the network of fold b0 starts with weights whose output is constant.
+    """
 
     def make(job: TrainingJob, rows: object) -> object:
         prepared, scaler = prepare(job, rows)
@@ -249,10 +259,12 @@ def prepare_dead(attempts: set[int]) -> object:
 
 
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
-def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dead, before_n, collapsed):
+def test_training_that_collapses_to_a_constant_output_is_repeated_at_most_twice(
+    tmp_path, monkeypatch, dead, before_n, collapsed
+):
     monkeypatch.setattr(train, "prepare", prepare_dead(dead))
     selected, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
-    for _ in range(2):  # the second time, results are from the cache
+    for _ in range(2):  # The second run reads the same results from the cache.
         first, second = run(selected, tmp_path, log=log)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
         assert (second.collapsed_before_n, second.collapsed) == (0, False)
@@ -266,7 +278,7 @@ def test_short_training_is_not_checked_for_collapse(tmp_path, monkeypatch):
     assert (first.explained_min, first.collapsed) == (None, False)
 
 
-def test_constant_or_unknown_target_is_not_a_collapse(tmp_path):
+def test_constant_or_unknown_target_does_not_count_as_a_collapse(tmp_path):
     rows = example_data()
     flat, unknown = rows.target.copy(), rows.target.copy()
     flat[:, 2], unknown[:, 2] = 1.5, np.nan
@@ -278,7 +290,7 @@ def test_constant_or_unknown_target_is_not_a_collapse(tmp_path):
         assert trained.explained_min == pytest.approx(truth.min(), rel=1e-5)
 
 
-def test_worker_process_gives_the_same_result(tmp_path, monkeypatch):
+def test_training_in_a_worker_process_gives_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     selected = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
@@ -300,7 +312,7 @@ def test_jobs_with_equal_recipes_share_a_stack():
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
-def test_every_job_is_in_one_stack(kinds, size_n):
+def test_each_job_is_in_exactly_one_stack(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
     selected = by_key([pooled(**settings[kind]) for kind in kinds])
     found = make_stacks(selected, size_n)
@@ -309,16 +321,18 @@ def test_every_job_is_in_one_stack(kinds, size_n):
         assert 1 <= len(one) <= size_n
         assert len({kinds[int(key.removeprefix("key"))] for key in one}) == 1
     counts = [kinds.count(kind) for kind in set(kinds)]
-    assert len(found) == sum(-(-count // size_n) for count in counts)  # as few stacks as possible
+    # There are as few stacks as the limit on their size allows.
+    assert len(found) == sum(-(-count // size_n) for count in counts)
 
 
-def test_five_targets_are_learned():
+def test_network_with_five_targets_learns_all_of_them():
     data = example_data()
     shear_N = data.target[:, 2:] * np.array([0.5, -0.25], np.float32)
     five = replace(data, target=np.hstack([data.target, shear_N]))
     many = replace(without_triplets(), recipe=recipe(steps_n=400))
     (one,) = train_stack([replace(many, test=many.train)], five)
     assert one.predicted.shape == (len(many.train), 5)
-    # predictions for training data, which the network overfits; shear is proportional to the third target
+    # Predictions are for training data, which the network overfits. The two shear forces are proportional to the third
+    # target.
     rms_N = np.sqrt(((one.predicted - five.target[many.train]) ** 2).mean(axis=0))
     assert (rms_N < 0.5 * five.target.std(axis=0)).all()

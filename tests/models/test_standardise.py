@@ -11,25 +11,25 @@ def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(3, 40, (n, ch)).astype(np.float32), rng.uniform(0, 16, (n, 3)).astype(np.float32)
 
 
-def test_inputs_have_zero_mean_and_unit_deviation():
+def test_scaled_inputs_have_zero_mean_and_unit_standard_deviation():
     db_uT, target = rows()
     scaled = fit_standard(db_uT, target).encode(db_uT).astype(float)
-    # tolerance: rounding of numbers of about 3 standard deviations to float32
+    # Tolerance: numbers of about 3 standard deviations are rounded to single precision.
     np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(scaled.std(axis=0), 1, atol=1e-5)
 
 
-def test_scaler_uses_training_rows_only():
+def test_scaler_of_training_rows_does_not_depend_on_test_rows():
     db_uT, target = rows()
     train = np.arange(30)
     fitted = fit_standard(db_uT[train], target[train])
-    db_uT[30:] += 1e6  # rows 30 and later are test rows
+    db_uT[30:] += 1e6  # Rows 30 and later are test rows.
     target[30:] -= 1e6
     again = fit_standard(db_uT[train], target[train])
     assert all((a == b).all() for a, b in zip(fitted.arrays().values(), again.arrays().values(), strict=True))
 
 
-def test_constant_channel_gets_the_floor():
+def test_scale_of_a_constant_channel_is_the_minimum_scale():
     db_uT, target = rows()
     db_uT[:, 2] = 5.0
     for fit in (fit_standard, fit_released):
@@ -38,33 +38,33 @@ def test_constant_channel_gets_the_floor():
         assert np.isfinite(scaler.encode(db_uT)).all()
 
 
-def test_unknown_force_leaves_places_unchanged():
+def test_scaler_is_finite_if_all_forces_are_unknown():
     db_uT, target = rows()
     target[:, 2] = np.nan
     scaler = fit_standard(db_uT, target)
     assert np.isfinite(scaler.decode(np.zeros((1, 3), np.float32))).all()
 
 
-def test_scaling_of_the_released_code():
+def test_released_scaling_equals_that_of_the_papers_code():
     db_uT, target = rows()
     scaler = fit_released(db_uT, target)
-    # tolerance: float32 compared with float64
+    # Tolerance: single precision is compared with double precision.
     np.testing.assert_allclose(scaler.input_scale, 5 * db_uT.std(axis=0, dtype=float), rtol=1e-6)
     assert (scaler.input_shift == 0).all()
     assert scaler.encode_target(np.array([[16, 8, 3]], np.float32)).tolist() == [[1.0, 0.5, 1.0]]
 
 
 @given(st.integers(0, 10_000))
-def test_decode_inverts_encode(seed):
+def test_decoding_inverts_encoding_of_targets(seed):
     rng = rng_for(seed, "round trip")
     db_uT, target = rows()
     scaler = fit_standard(db_uT, target)
     expected = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
-    # tolerance: two float32 roundings
+    # The tolerance is two roundings in single precision.
     np.testing.assert_allclose(scaler.decode(scaler.encode_target(expected)), expected, atol=1e-4)
 
 
-def test_scaler_round_trip():
+def test_scaler_can_be_restored_from_its_arrays():
     scaler = fit_standard(*rows())
     again = Scaler.of_arrays(scaler.arrays() | {"other": np.zeros(1)})
     assert all((a == b).all() for a, b in zip(scaler.arrays().values(), again.arrays().values(), strict=True))

@@ -19,10 +19,10 @@ from tests.models.plain import plain_net, plain_train
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
-# Tolerance. Sums differ by 6e-8 of a term if the order, the processor or the memory alignment changes. This can make a
-# ReLU positive for one more row; then all weights of this unit move by a whole step, because AdamW divides a gradient
-# by its size. One unit of 200 changes the distance from the start by at most 7 %; a missing loss term changes it by
-# more.
+# Tolerance for weights, relative to their distance from the initial weights. Sums differ by 6e-8 of a term if the order
+# of terms, the processor or the memory alignment changes. Such a difference can make a ReLU positive for one more row.
+# Then all weights of this unit change by a whole step, because AdamW divides a gradient by its size. One unit of 200
+# changes the distance from the start by at most 7 %, and a missing loss term changes it by more.
 DISTANCE_MAX = 2e-2
 
 
@@ -39,7 +39,7 @@ def block_sizes(steps_n: int) -> list[int]:
     return [BLOCK_STEPS_N] * (steps_n // BLOCK_STEPS_N) + [steps_n % BLOCK_STEPS_N] * (steps_n % BLOCK_STEPS_N > 0)
 
 
-def test_gradients_are_clipped_per_network():
+def test_gradients_of_each_network_are_clipped_separately():
     net = Stack(paper_layers(15), [some_weights(i) for i in range(3)])
     lengths = torch.tensor([0.0, 0.5, 70.0])
     for parameter in net.parameters():
@@ -55,8 +55,8 @@ def test_gradients_are_clipped_per_network():
     torch.testing.assert_close(after[2] * 70, torch.cat([one.flatten(1) for one in before], dim=1)[2])
 
 
-def test_clipping_prevents_dead_networks():
-    """Without clipping, at four times the usual rate, all ReLUs of a layer become 0 in most networks."""
+def test_clipping_of_gradients_prevents_dead_networks():
+    """Without clipping, at four times the usual learning rate, all ReLUs of a layer become 0 in most networks."""
     jobs = [some_job(i, n=400) for i in range(3)]
     schedule = recipe(steps_n=400, batch_n=64, rate_max=2.4e-2)
     free, cut = (run(jobs_of(jobs), schedule.model_copy(update={"gradient_norm_max": one})) for one in (1e9, 1.0))
@@ -64,11 +64,11 @@ def test_clipping_prevents_dead_networks():
 
 
 def jobs_of(jobs: list[PreparedJob]) -> list[PreparedJob]:
-    """Return the jobs with new random generators, because training advances them."""
+    """Return the jobs with new random generators, because a training run advances the generators."""
     return [replace(job, rng=some_job(i).rng) for i, job in enumerate(jobs)]
 
 
-def test_thirty_two_rows_are_overfitted():
+def test_network_can_overfit_thirty_two_rows():
     job = some_job()
     (outcome,) = run([job], recipe(steps_n=600))
     output = plain_net("paper", outcome.weights)(torch.from_numpy(job.labelled.inputs)).detach().numpy()
@@ -78,7 +78,7 @@ def test_thirty_two_rows_are_overfitted():
 
 
 @pytest.mark.parametrize("terms", [NO_TERMS, ALL_TERMS])
-def test_weights_depend_on_the_seed(terms):
+def test_equal_seeds_give_equal_weights_and_other_seeds_do_not(terms):
     one, again, other = (
         run([replace(some_job(terms=True), rng=some_job(draws=draws).rng)], recipe(steps_n=60), terms)[0]
         for draws in ("a", "a", "b")
@@ -88,7 +88,7 @@ def test_weights_depend_on_the_seed(terms):
 
 
 @pytest.mark.parametrize(("terms", "batch_n"), [(NO_TERMS, 1), (ALL_TERMS, 16), (NO_TERMS, 128)])
-def test_stack_equals_single_training(terms, batch_n):
+def test_networks_trained_in_a_stack_equal_networks_trained_alone(terms, batch_n):
     schedule = recipe(steps_n=60, rate_max=5e-4, batch_n=batch_n)
     together = run([some_job(i, terms=True) for i in range(3)], schedule, terms)
     for i in range(3):
@@ -100,7 +100,7 @@ def test_stack_equals_single_training(terms, batch_n):
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize(  # a single case with weight decay, which does not depend on the loss terms
+@pytest.mark.parametrize(  # Weight decay does not depend on the loss terms, so not every case needs it.
     ("terms", "decay"),
     [
         (NO_TERMS, 0.0),
@@ -111,7 +111,7 @@ def test_stack_equals_single_training(terms, batch_n):
     ],
     ids=str,
 )
-def test_stack_equals_plain_pytorch_loop(terms, decay):
+def test_network_trained_in_a_stack_equals_a_plain_pytorch_loop(terms, decay):
     schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70
     (outcome,) = run([some_job(terms=True)], schedule, terms)
     feed = BatchSampler([some_job(terms=True)], schedule.batch_n, "cpu")
@@ -121,7 +121,7 @@ def test_stack_equals_plain_pytorch_loop(terms, decay):
 
 
 def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float:
-    """Return the distance of the weights from `truth`, relative to the distance of the initial weights from `truth`."""
+    """Return the distance of the weights from `truth`, divided by the distance of the initial weights from `truth`."""
     off, start_off = (
         np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start)
     )
@@ -129,7 +129,7 @@ def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float
 
 
 @pytest.mark.parametrize("name", ["triplet", "unlabelled", "few_labels"])
-def test_each_term_changes_the_weights(name):
+def test_each_loss_term_changes_the_weights(name):
     schedule = recipe(steps_n=10)
     job = some_job(terms=True)
     (with_it,) = run([job], schedule, replace(NO_TERMS, **{name: 0.5}))
@@ -150,7 +150,7 @@ def test_data_of_each_loss_term_changes_the_weights(name):
 
 
 def test_unlabelled_pokes_train_the_feature_layers_only():
-    # one large step; without clipping, because clipping would scale the gradients of all layers
+    # One large step. Gradients are not clipped, because clipping would scale the gradients of all layers.
     far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
@@ -160,19 +160,19 @@ def test_unlabelled_pokes_train_the_feature_layers_only():
 
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
-def test_curve_is_the_mean_loss_between_its_points(steps_n):
-    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # a rate with which the weights hardly change
+def test_points_of_the_loss_curve_are_mean_losses_since_the_previous_point(steps_n):
+    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # The learning rate is so low that weights hardly change.
     job = some_job()
     (outcome,) = run([job], schedule)
     feed, net, losses = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
     for n in block_sizes(steps_n):
         losses += [nn.functional.mse_loss(net(b["inputs"][0]), b["targets"][0]).item() for b in feed.sample(n)]
     means = [sum(losses[start:end]) / (end - start) for start, end in pairwise([0, *curve_steps(steps_n)])]
-    assert outcome.curve == pytest.approx(means, rel=1e-5)  # rounding of float32 sums
+    assert outcome.curve == pytest.approx(means, rel=1e-5)  # The tolerance is the rounding of sums in single precision.
 
 
 @given(st.integers(1, 100_000))
-def test_points_of_a_curve_are_evenly_spaced_and_end_with_the_training(steps_n):
+def test_points_of_the_loss_curve_are_evenly_spaced_up_to_the_last_step(steps_n):
     ends = curve_steps(steps_n)
     assert len(ends) == min(50, steps_n)
     assert ends[-1] == steps_n
@@ -189,7 +189,7 @@ def test_any_number_of_rows_trains_in_any_batch(n, batch_n):
 
 
 @pytest.mark.parametrize(("times", "rate_max"), [(1e30, 3e-3), (1.0, 1e6), (1e20, 1e6)])
-def test_diverging_training_keeps_its_last_finite_weights(times, rate_max):
+def test_network_whose_training_diverges_keeps_its_last_finite_weights(times, rate_max):
     job = scale_inputs(some_job(), times)
     (outcome,) = run([job], recipe(steps_n=500, rate_max=rate_max))
     assert outcome.stopped_step is not None
@@ -207,7 +207,7 @@ def scale_inputs(job: PreparedJob, times: float) -> PreparedJob:
 
 
 def test_nan_weights_of_the_last_step_are_detected():
-    """Pokes of 1e30 uT make the triplet loss infinite, while the L2 loss of the same step stays finite."""
+    """Pokes of 1e30 uT make the triplet loss infinite, while the squared error in the same step stays finite."""
     job = some_job(terms=True)
     job.unlabelled.inputs[:] *= 1e30
     (outcome,) = run([job], recipe(steps_n=1), LossWeights(0.0, unlabelled=1.0))
@@ -217,13 +217,14 @@ def test_nan_weights_of_the_last_step_are_detected():
 
 def test_infinite_loss_with_finite_weights_is_detected():
     job = some_job()
-    job.labelled.targets[:] *= 1e20  # squares overflow in float32, gradients do not
+    # In single precision, the squares of these targets overflow, but the gradients do not.
+    job.labelled.targets[:] *= 1e20
     (outcome,) = run([job], recipe(steps_n=1))
     assert (outcome.stopped_step, outcome.curve) == (1, [])
 
 
 def test_divergence_restores_the_weights_of_the_previous_block(monkeypatch):
-    """Row 0 makes the network diverge; it is first drawn in the second block of steps."""
+    """Row 0 makes the network diverge. It is drawn for the first time in the second block of steps."""
     n, schedule = 60, recipe(steps_n=170, batch_n=1)
     seed = next(seed for seed in range(1000) if first_step_of_row_0(n, seed) // BLOCK_STEPS_N == 1)
     broken, sound = some_job(n=n, draws=seed), some_job(n=n, draws=seed)
@@ -234,7 +235,9 @@ def test_divergence_restores_the_weights_of_the_previous_block(monkeypatch):
     )
     (whole,) = run([sound], schedule)
     (outcome,) = run([broken], schedule)
-    assert len(checks) == len(block_sizes(170)) + 2  # no network is left to train after the second check
+    # Besides all checks of the first training run, there are two of the second run, which then has no network left to
+    # train.
+    assert len(checks) == len(block_sizes(170)) + 2
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
     assert outcome.curve == whole.curve[: sum(step <= BLOCK_STEPS_N for step in curve_steps(170))]
     assert all((outcome.weights[name] == checks[0][name]).all() for name in checks[0])
@@ -251,7 +254,7 @@ def first_step_of_row_0(n: int, seed: int) -> int:
     return steps_with_row_0[0] if steps_with_row_0 else -1
 
 
-def test_diverging_network_does_not_affect_others_of_the_stack():
+def test_network_that_diverges_does_not_affect_others_of_the_stack():
     schedule = recipe(steps_n=120)
     well = run([some_job(i, terms=True) for i in range(3)], schedule, ALL_TERMS)
     jobs = [some_job(i, terms=True) for i in range(3)]
@@ -263,7 +266,7 @@ def test_diverging_network_does_not_affect_others_of_the_stack():
     assert len(first.curve) == len(curve_steps(120))
 
 
-def test_initial_weights_and_rows_are_not_modified():
+def test_training_does_not_modify_initial_weights_and_rows():
     job, untouched = some_job(terms=True), some_job(terms=True)
     run([job], recipe(), ALL_TERMS)
     assert all((job.initial_weights[name] == untouched.initial_weights[name]).all() for name in job.initial_weights)

@@ -8,7 +8,7 @@ from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
-ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, whose places are the indices 0 to 4
+ROW = np.arange(5, dtype=np.float64)[:, None]  # Five pokes of a line, whose places are the indices 0 to 4.
 
 
 def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -16,13 +16,16 @@ def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.n
 
 
 def distances(place: np.ndarray, anchor: int) -> list[float]:
-    """Return the squared distances of all points from the anchor, by a loop."""
+    """Return the squared distances of all points from the anchor, computed in a loop."""
     return [sum((float(a) - float(b)) ** 2 for a, b in zip(one, place[anchor], strict=True)) for one in place]
 
 
 @st.composite
 def placed_points(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
-    """Draw points in up to four groups. Few integer places give many equal distances; each has two or more visits."""
+    """Draw points in up to four groups, and a seed.
+
+    Places are small integers, so that many distances are equal. Each place has two or three points.
+    """
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
     for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):
@@ -37,7 +40,7 @@ def placed_points(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 @given(placed_points())
-def test_positive_is_strictly_nearer_in_the_same_group(case):
+def test_positive_is_strictly_nearer_than_negative_in_the_group_of_the_anchor(case):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=64)
     positive, negative = draw(triplet_points(place, group), anchor, seed)
@@ -49,7 +52,7 @@ def test_positive_is_strictly_nearer_in_the_same_group(case):
 
 
 @given(placed_points(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
-def test_triplets_are_invariant_under_shift_and_scale(case, shift, times):
+def test_shifting_and_scaling_places_gives_the_same_triplets(case, shift, times):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=32)
     one = draw(triplet_points(place, group), anchor, seed)
@@ -58,7 +61,7 @@ def test_triplets_are_invariant_under_shift_and_scale(case, shift, times):
 
 
 @given(placed_points())
-def test_triplets_do_not_depend_on_group_names(case):
+def test_names_of_groups_do_not_change_triplets(case):
     place, group, seed = case
     anchor = np.arange(len(group))
     one = draw(triplet_points(place, group), anchor, seed)
@@ -66,46 +69,46 @@ def test_triplets_do_not_depend_on_group_names(case):
     assert all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
-def test_places_in_mm_use_both_axes():
-    # from the corner, the point 3 mm along x is nearer than the point 2 mm along x and 3 mm along y
+def test_distances_of_places_use_both_axes():
+    # Seen from (0, 0), the point (3, 0) is nearer than the point (2, 3), although its x is larger.
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
     positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
     assert set(positive) == {1}
     assert set(negative) == {2}
 
 
-def test_two_places_with_two_visits_each_suffice():
+def test_two_places_with_two_points_each_are_enough_for_triplets():
     points = triplet_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
     positive, negative = draw(points, np.tile(np.arange(4), 50))
-    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the positive is the other visit to the anchor's place
+    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # The positive is the other point at the place of the anchor.
     assert all(set(negative[i::4]) == ({2, 3} if i < 2 else {0, 1}) for i in range(4))
 
 
-def test_group_with_one_place_is_named():
+def test_error_names_the_group_whose_points_are_all_at_one_place():
     place = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0], [3.0, 0.0], [1.0, 2.0]])
     skins = np.array(["b3_s2", "b1_s1", "b3_s2", "b1_s1", "b3_s2"])
     with pytest.raises(TrainingError, match="group b3_s2: all 3 points are at one place"):
         triplet_points(place, skins)
 
 
-def test_places_that_differ_along_one_axis():
+def test_places_may_differ_along_one_axis_only():
     assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
-def test_point_with_equal_distances_is_not_an_anchor():
+def test_point_that_is_equally_far_from_all_others_is_not_an_anchor():
     three_pokes = triplet_points(np.arange(3.0)[:, None], np.zeros(3, int))
     assert three_pokes.anchors.tolist() == [0, 2]
     near, far = draw(three_pokes, np.array([0, 1, 2]))
     assert (near.tolist(), far.tolist()) == ([1, 1, 1], [2, 1, 0])
 
 
-def test_points_with_equal_distances_are_refused():
+def test_group_without_an_anchor_is_refused():
     with pytest.raises(TrainingError, match="all 2 points are equally far"):
         triplet_points(np.array([[0.0], [1.0]]), np.zeros(2, int))
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
-def test_anchors_equal_double_loop(places):
+def test_possible_anchors_equal_those_of_a_double_loop(places):
     expected = [
         len({(x - u) ** 2 + (y - v) ** 2 for j, (u, v) in enumerate(places) if j != i}) > 1
         for i, (x, y) in enumerate(places)
@@ -115,7 +118,7 @@ def test_anchors_equal_double_loop(places):
     assert triplet_points(np.array(places, float), np.zeros(len(places), int)).is_anchor.tolist() == expected
 
 
-def test_draws_follow_the_generator():
+def test_equal_generators_give_equal_triplets():
     points, anchor = triplet_points(ROW, np.zeros(5, int)), np.tile(np.arange(5), 20)
     one, again, other = draw(points, anchor, 1), draw(points, anchor, 1), draw(points, anchor, 2)
     assert all((a == b).all() for a, b in zip(one, again, strict=True))
@@ -123,29 +126,30 @@ def test_draws_follow_the_generator():
 
 
 def test_every_ordered_pair_is_equally_likely():
-    # from index 0, the distances of the four other points differ: they form six ordered pairs
+    # From index 0, the four other points have different distances, so they form six ordered pairs (positive, negative).
     n = 6000
     positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))
     pairs, times = np.unique(np.stack([positive, negative]), axis=1, return_counts=True)
     assert pairs.T.tolist() == [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
-    assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial standard deviations
+    # The tolerance is six standard deviations of a binomial distribution.
+    assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()
 
 
 @given(placed_points())
-def test_every_other_point_is_drawn(case):
+def test_every_point_is_drawn_as_positive_and_negative_where_possible(case):
     place, group, seed = case
     mates = np.flatnonzero(group == group[0])
     assume(len(mates) <= 12)
     others = mates[mates != 0]
     away = np.array(distances(place, 0))[others]
     positive, negative = draw(triplet_points(place, group), np.zeros(3000, int), seed)
-    # Worst case: of eleven points, one forms a pair with only one other point. The probability that no draw contains it
-    # is (1 - 2 / 121)^3000 = 1e-22.
+    # The worst case for chance: of eleven points, one forms a pair with only one other point. The probability that no
+    # draw contains it is (1 - 2 / 121)^3000 = 1e-22.
     assert set(positive) == set(others[away < away.max()])
     assert set(negative) == set(others[away > away.min()])
 
 
-def test_anchors_are_not_modified():
+def test_drawing_does_not_modify_the_anchors():
     anchor = np.arange(5)
     draw(triplet_points(ROW, np.zeros(5, int)), anchor)
     assert (anchor == np.arange(5)).all()

@@ -26,7 +26,7 @@ from reskin.physics.aging import (
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-14  # relative error of a few dozen operations in double precision
+ROUNDING = 1e-14  # The relative rounding error of a few dozen operations in double precision.
 times_s = st.floats(0, 1e5)
 changes = st.floats(-10, 10)
 
@@ -36,22 +36,23 @@ def test_one_step_equals_50_digit_arithmetic(ratio, dt_over_fastest):
     assert signals.step_error(1e-3 * dt_over_fastest, signals.stiff(ratio)) <= signals.ROUNDING
 
 
-def test_pokes_relax_as_the_relaxation_function():
+def test_force_of_held_pokes_follows_the_relaxation_function():
     assert not broken(signals.check_relaxation())
 
 
-def test_without_time_or_change_the_state_is_kept():
+def test_state_is_kept_if_no_time_passes_and_the_force_does_not_change():
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     assert advance(state, 0.0, 0.0, SKIN_RELAXATION).tobytes() == state.tobytes()
 
 
 @given(changes)
-def test_instantaneous_change_acts_in_full(change):
+def test_instantaneous_change_is_not_relaxed(change):
+    """No time passes during the change, so each relaxing part of the force changes by its whole share."""
     np.testing.assert_array_equal(advance(np.zeros(5), change, 0.0, SKIN_RELAXATION), SKIN_RELAXATION.share * change)
 
 
 @given(times_s, times_s, changes)
-def test_ramp_may_be_split_anywhere(first_s, second_s, rate):
+def test_splitting_a_ramp_into_two_parts_changes_nothing(first_s, second_s, rate):
     whole = advance(np.ones(5), rate * (first_s + second_s), first_s + second_s, SKIN_RELAXATION)
     halfway = advance(np.ones(5), rate * first_s, first_s, SKIN_RELAXATION)
     size = 1 + abs(rate) * (first_s + second_s)
@@ -68,7 +69,7 @@ def test_force_is_linear_in_the_elastic_force(dt_s, change, factor):
     )
 
 
-def test_force_at_constant_depth_relaxes_to_the_remaining_share():
+def test_force_at_constant_depth_relaxes_to_the_share_that_does_not_relax():
     relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
     assert (np.diff(relaxed) <= ROUNDING).all()
     assert relaxed[0] == pytest.approx(1, abs=ROUNDING)
@@ -76,7 +77,7 @@ def test_force_at_constant_depth_relaxes_to_the_remaining_share():
 
 
 @pytest.mark.parametrize("dt_s", [-1e-9, np.nan, np.inf])
-def test_negative_or_nan_time_is_refused(dt_s):
+def test_invalid_time_step_is_refused(dt_s):
     with pytest.raises(ParamsError, match="time step"):
         advance(np.zeros(5), 1.0, dt_s, SKIN_RELAXATION)
     with pytest.raises(ParamsError, match="time step"):
@@ -89,11 +90,12 @@ def test_invalid_relaxation_is_refused(tau_s, share):
         Prony(np.array([tau_s]), np.array([share]))
 
 
-def test_force_at_a_reading_follows_approach_and_hold():
+def test_force_at_a_reading_is_relaxed_during_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
-    # Force that builds up during the approach relaxes for a shorter time, so the decay is averaged over the approach.
+    # During the approach, the force builds up gradually. The parts that build up later relax for a shorter time, so the
+    # decay is averaged over the approach.
     x = 5.0 / SKIN_RELAXATION.tau_s
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 
@@ -101,7 +103,8 @@ def test_force_at_a_reading_follows_approach_and_hold():
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 
 
-def test_field_memory_equals_integration_in_small_steps():
+def test_field_memory_equals_the_differential_equation_solved_in_small_steps():
+    """The memory is the part of a press's field change that remains in the next no-load reading, and decays."""
     stops_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 3, 2, 3)), MEMORY, 20_000
     change_T = stops_T.mean(axis=1)
     q_T = np.zeros((2, *change_T.shape[1:]))
@@ -117,7 +120,7 @@ def test_field_memory_equals_integration_in_small_steps():
                 np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
-def test_memory_of_a_press_is_5_to_8_percent():
+def test_memory_of_a_press_is_5_to_8_percent_and_decays():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = field_memory(once_T, MEMORY)
@@ -127,18 +130,21 @@ def test_memory_of_a_press_is_5_to_8_percent():
     assert (np.diff(left[1:]) < 0).all()
 
 
-def test_hovering_tip_leaves_no_memory():
+def test_stops_of_the_tip_above_the_skin_leave_no_memory():
     stops_T = np.zeros((2, 4, 1, 3))
-    stops_T[:, 2] = 1e-3  # field changes at the stops: none, none, a press, none
+    # Each press has four stops of the tip. At the first, second and fourth stop, the tip is above the skin, so the
+    # field does not change. At the third stop, it presses.
+    stops_T[:, 2] = 1e-3
     _, added_T = field_memory(stops_T, MEMORY)
     assert not added_T[0, :2].any()
     assert (added_T[0, 2:] > 0).all()
-    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press with the same mean field change
+    # For comparison: a press with a single stop, whose field change is the mean over these four stops.
+    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)
     np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, MEMORY)[1][0, 0])
 
 
 @given(st.floats(-3, 3))
-def test_memory_is_linear_and_needs_time(factor):
+def test_memory_is_proportional_to_field_changes_and_zero_if_no_time_passes(factor):
     change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
     for once, times in zip(field_memory(change_T, MEMORY), field_memory(factor * change_T, MEMORY), strict=True):
         np.testing.assert_allclose(times, factor * once, atol=1e-18)
@@ -155,18 +161,19 @@ DESIGN = {"settling": 0.10, "ageing": 0.01}
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=50).map(lambda n: np.array(sorted(n)))
 
 
-def test_fresh_skin_is_unchanged():
+def test_skin_before_its_first_contact_is_neither_softened_nor_faded():
     assert softening(np.array([0]), **DESIGN) == 1
     assert fading(np.array([0]), per_decade=0.005) == 0
 
 
-def test_softening_is_settling_plus_ageing():
-    # Expected: 0.1 (1 - e^-1) = 0.0632121 and 0.01 log10(1.3) = 0.0011394; after 999,000 contacts, 0.1 + 0.01 * 3.
+def test_softening_is_the_sum_of_settling_and_ageing():
+    # Expected after 300 contacts: settling of 0.1 (1 - e^-1) = 0.0632121 and ageing of 0.01 log10(1.3) = 0.0011394.
+    # After 999,000 contacts: 0.1 + 0.01 * 3.
     np.testing.assert_allclose(softening(np.array([300, 999_000]), **DESIGN), [0.9356485, 0.87], atol=1e-7)
 
 
-def test_early_softening_matches_the_specification():
-    # A scene may neglect softening of a cycled skin: from contact 1000 to 1030, it is far below 1 %.
+def test_softening_from_contact_1000_to_1030_is_below_1_percent():
+    # Therefore a scene with few contacts on a skin that was cycled 1000 times may neglect softening.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 
@@ -178,22 +185,24 @@ def test_stiffness_never_increases_with_contacts(contacts_n):
     assert ((left > 0) & (left <= 1)).all()
 
 
-def test_fading_is_half_a_percent_per_decade():
+def test_magnetisation_fades_by_half_a_percent_per_decade_of_contacts():
     np.testing.assert_allclose(fading(np.array([9, 99, 999]), per_decade=0.005), [0.005, 0.010, 0.015], atol=1e-15)
 
 
-def test_baseline_walks_with_the_square_root_of_contacts():
+def test_baseline_drift_grows_with_the_square_root_of_contacts():
     walks_T = baseline_walk(np.array([100, 10_000]), 20_000, step_T=0.2e-6, rng=rng_for(0, "wear"))
-    # tolerance 2 %: four standard errors, 1 / sqrt(2 n) each
+    # The tolerance of 2 % is four standard errors. The standard error of a standard deviation of n draws is 1 / sqrt(2
+    # n).
     np.testing.assert_allclose(walks_T.std(axis=1), [2e-6, 20e-6], rtol=0.02)
-    # the walk to the later contact includes the walk to the earlier one
+    # The drift up to contact 10,000 contains the drift up to contact 100, which is a tenth as large. Therefore the
+    # correlation of the two is 0.1.
     np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)
 
 
-def test_walk_follows_the_generator():
+def test_equal_generators_give_equal_baseline_drift():
     first, again = (baseline_walk(np.arange(50), 15, step_T=1e-7, rng=rng_for(0, "wear")) for _ in range(2))
     assert first.tobytes() == again.tobytes()
-    assert not first[0].any()  # no walk before the first contact
+    assert not first[0].any()  # There is no drift before the first contact.
 
 
 @pytest.mark.parametrize(
@@ -204,12 +213,12 @@ def test_walk_follows_the_generator():
         lambda: baseline_walk(np.array([3, 2]), 1, step_T=1e-7, rng=rng_for(0, "wear")),
     ],
 )
-def test_invalid_counts_are_refused(of):
+def test_invalid_contact_counts_are_refused(of):
     with pytest.raises(ParamsError, match="contact count"):
         of()
 
 
-def test_wear_without_remaining_stiffness_is_refused():
+def test_wear_that_leaves_no_stiffness_is_refused():
     with pytest.raises(ParamsError, match="remaining force"):
         softening(np.array([10_000]), settling=0.99, ageing=0.1)
 
@@ -217,7 +226,7 @@ def test_wear_without_remaining_stiffness_is_refused():
 TEMPERATURE = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
 
 
-def test_magnetisation_loses_3_6_uT_of_3_mT_per_kelvin():
+def test_field_of_3_mt_changes_by_3_6_ut_per_kelvin():
     np.testing.assert_allclose(
         3e-3 * (relative_remanence(np.array([-1.0, 0.0, 1.0])) - 1), [3.6e-6, 0.0, -3.6e-6], atol=1e-18
     )
@@ -230,12 +239,14 @@ def test_board_warms_up_exponentially():
 
 
 @given(st.floats(0, 1e5))
-def test_room_temperature_oscillates_about_the_warming(time_s):
+def test_temperature_of_the_room_oscillates_about_the_warming_board(time_s):
     room = TEMPERATURE.model_copy(update={"swing_K": 2.0})
-    assert temperature_rise_K(np.zeros(1), room) == 0  # rises are relative to the start
-    # The oscillation starts with a rise.
+    # The temperature is given as the rise since the start, so it is zero at the start.
+    assert temperature_rise_K(np.zeros(1), room) == 0
+    # The first half of the oscillation is warm.
     assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), TEMPERATURE)
-    time = np.array([time_s, time_s + 300.0])  # times that are half a period apart
+    # The two times are half a period apart, so the oscillation has opposite signs.
+    time = np.array([time_s, time_s + 300.0])
     swing_K = temperature_rise_K(time, room) - temperature_rise_K(time, TEMPERATURE)
     assert swing_K.sum() == pytest.approx(0.0, abs=1e-9)
     assert np.abs(swing_K).max() <= 2.0

@@ -1,4 +1,7 @@
-"""Tests of the field of an iron ball against magpylib's sphere, boundary conditions and laws of magnetostatics."""
+"""Tests of the field of an iron ball against magpylib's sphere, boundary conditions and laws of magnetostatics.
+
+The ball is magnetised by the earth's field and by the skin, and its field disturbs the readings.
+"""
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from reskin.seeds import rng_for
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
 B_T = np.array([20e-6, 10e-6, -45e-6])
-ROUNDING = 1e-10  # relative error of differences of places of a few mm
+ROUNDING = 1e-10  # The relative rounding error of a difference between places that are a few mm apart.
 MU_R = st.floats(1.0, 1e5)
 NEAR = np.array([[3e-3, 1e-3, 2e-3], [-4e-3, -1e-3, 4e-3]]), np.array([[0.0, 1e-3, 5e-3], [2e-3, 0.0, -1e-3]])
 
@@ -43,12 +46,12 @@ def test_field_outside_equals_magpylib_sphere(mu_r):
     theirs_T = magnet_sphere_Bfield(
         observers=observers_m - CENTRE_M, diameters=diameters_m, polarizations=polarisation_T
     )
-    # tolerance: rounding of fields of 50 uT
+    # The tolerances are rounding errors of fields of 50 uT.
     np.testing.assert_allclose(field(observers_m, mu_r=mu_r), theirs_T, rtol=1e-9, atol=1e-18)
 
 
 @given(MU_R)
-def test_boundary_conditions_on_the_surface(mu_r):
+def test_normal_b_and_tangential_h_are_continuous_on_the_surface_of_the_ball(mu_r):
     observers_m = on_sphere(RADIUS_M)
     normal = outward(observers_m)
     outside_T, inside_T = B_T + field(observers_m, mu_r=mu_r), 3 * mu_r / (mu_r + 2) * B_T
@@ -58,28 +61,31 @@ def test_boundary_conditions_on_the_surface(mu_r):
 
 
 @given(st.floats(-3, 3), st.floats(1.5, 20))
-def test_induced_field_is_linear_and_falls_with_the_third_power(factor, times):
+def test_field_of_the_ball_is_linear_in_the_ambient_field_and_falls_with_the_third_power(factor, times):
     near_m, far_m = on_sphere(1.5 * RADIUS_M), on_sphere(1.5 * times * RADIUS_M)
     np.testing.assert_allclose(field(near_m, factor * B_T), factor * field(near_m), rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(field(far_m) * times**3, field(near_m), rtol=1e-9, atol=1e-16)
 
 
-def test_ball_of_air_has_no_field():
+def test_ball_of_permeability_one_has_no_field():
     assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
 
 
-def test_field_of_dipoles_near_iron_is_normal_to_its_surface():
+def test_field_of_dipoles_near_iron_is_perpendicular_to_its_surface():
     observers_m = on_sphere(RADIUS_M)
     together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))
-    assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # zero, except for rounding
+    # The component along the surface is zero, except for rounding.
+    assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()
     without_T = np.cross(magnet.field(*NEAR, observers_m), outward(observers_m))
-    # the test is meaningful: without the ball, the field is not normal
+    # Without the ball, the field has a component along the surface. Otherwise this test would show nothing.
     assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()
 
 
-def test_flux_of_images_is_zero():
-    # Gauss's law on a sphere of 1.5 times the radius of the ball, integrated at 60 latitudes and 120 longitudes.
+def test_magnetic_flux_of_the_ball_through_a_surrounding_sphere_is_zero():
+    """Images are the dipoles that replace the magnetised ball."""
+    # Gauss's law on a sphere whose radius is 1.5 times that of the ball. The flux is integrated numerically, over 60
+    # latitudes and 120 longitudes.
     cos, weights = np.polynomial.legendre.leggauss(60)
     angles = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     sin = np.sqrt(1 - cos**2)
@@ -91,22 +97,21 @@ def test_flux_of_images_is_zero():
     assert abs(flux) < 1e-9 * np.abs(through_T).max()
 
 
-def test_images_of_a_far_dipole_equal_those_of_its_uniform_field():
+def test_ball_near_a_far_dipole_has_the_field_of_a_ball_in_a_uniform_field():
     far = np.array([[0.4, -0.6, 0.9]]), np.array([[1.0, 2.0, -3.0]])
     observers_m = on_sphere(2 * RADIUS_M)
     uniform_T = magnet.field(*far, CENTRE_M[None])[0]
     of_uniform_T = field(observers_m, uniform_T, mu_r=1e12)
-    np.testing.assert_allclose(  # tolerance: over 5 mm, the field of a dipole 1 m away varies by 3 * 5 mm / 1 m = 1.5 %
-        images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max()
-    )
+    # Tolerance: within the ball's radius of 5 mm, the field of a dipole at 1 m varies by 3 * 5 mm / 1 m = 1.5 %.
+    np.testing.assert_allclose(images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max())
 
 
-def test_directions_are_uniform_unit_vectors():
+def test_random_directions_are_uniform_unit_vectors():
     directions = random_directions(20_000, rng_for(0, "directions"))
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-12)
-    # tolerance: five standard errors of the mean
+    # The tolerance is five standard errors of the mean.
     np.testing.assert_allclose(directions.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))
-    # tolerance: five standard errors of 0.3 / sqrt(n)
+    # The tolerance is five standard errors. A product of two components has a standard deviation of at most 0.3.
     np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.012)
 
 

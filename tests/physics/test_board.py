@@ -1,4 +1,4 @@
-"""Tests of boards: chip positions and rotations of the design, and random draws by name and seed."""
+"""Tests of boards: the positions and rotations of their chips as designed, and random boards drawn by name and seed."""
 
 import numpy as np
 import pytest
@@ -50,10 +50,11 @@ def same(one, other):
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
 
 
-def test_board_without_spreads_equals_design_file_and_recordings():
+def test_board_drawn_without_spreads_has_the_positions_and_rotations_of_the_real_board():
     board = draw_board(design(), no_spread(), seed=1, name="b0")
     np.testing.assert_allclose(board.chips_m, 1e-3 * np.array([[*xy, -1.1] for xy in CROSS_MM]))
-    # lab boards 1 and 2 (tests/recordings/test_lab_frames.py); the board's design file swaps chips 2 and 4
+    # Rotations of the chips that were found in recordings of lab boards 1 and 2 (tests/recordings/test_lab_frames.py).
+    # In the design file of the board, the numbers of chips 2 and 4 are swapped.
     recorded = [
         np.eye(3),
         np.diag([-1, -1, 1]),
@@ -67,29 +68,31 @@ def test_board_without_spreads_equals_design_file_and_recordings():
 
 
 @given(st.integers(0, 10**6))
-def test_chip_axes_stay_orthonormal(seed):
+def test_axes_of_tilted_chips_are_orthonormal(seed):
     turn = draw_board(design(), spreads(chip_tilt_deg=10.0), seed=seed, name="b0").turn
     np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
     assert (np.linalg.det(turn) > 0).all()
 
 
-def test_boards_depend_on_name_and_seed():
+def test_equal_name_and_seed_give_equal_boards():
     first, again = (draw_board(design(), spreads(), seed=1, name="b0") for _ in range(2))
     assert same(first, again)
     assert not same(first, draw_board(design(), spreads(), seed=1, name="b1"))
     assert not same(first, draw_board(design(), spreads(), seed=2, name="b0"))
 
 
-def test_draws_have_the_given_spreads():
+def test_drawn_boards_have_the_given_spreads():
     boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
     gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
-    # 10 %: the standard error of a standard deviation of n draws is 1 / sqrt(2 n), which is 3.5 % for 400 boards.
+    # The tolerance of 10 % is about three standard errors: the standard deviation of n draws has a standard error of 1
+    # / sqrt(2 n), which is 3.5 % for 400 boards.
     assert np.std([board.chips_m[0, 2] for board in boards]) == pytest.approx(0.1e-3, rel=0.1)
     assert np.std([board.offset_T for board in boards]) == pytest.approx(200e-6, rel=0.1)
     assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
     cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
     assert np.std(cross) == pytest.approx(0.01, rel=0.1)
-    # total angle of two tilts with an sd of 2 degrees each, about x and about y
+    # The angle between the chip's z axis and that of the board results from two tilts, about x and about y, each with a
+    # standard deviation of 2 degrees.
     tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])
     assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
 
@@ -97,7 +100,7 @@ def test_draws_have_the_given_spreads():
 TILES = {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}
 
 
-def test_tiled_boards_have_forty_chips():
+def test_array_of_eight_boards_has_forty_chips():
     board = draw_board(design(tiles=TILES), no_spread(), seed=1, name="v0")
     one = draw_board(design(), no_spread(), seed=1, name="b0")
     centres_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
@@ -109,7 +112,7 @@ def test_tiled_boards_have_forty_chips():
 
 
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))
-def test_boards_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
+def test_boards_of_an_array_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
     tiles = {"columns_n": columns_n, "rows_n": rows_n, "pitch_mm": pitch_mm}
     centres_mm = np.array(design(tiles=tiles).tiles.centres_mm)
     assert len(centres_mm) == columns_n * rows_n
@@ -118,7 +121,7 @@ def test_boards_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
     assert apart_mm.min(initial=pitch_mm) == pytest.approx(pitch_mm)
 
 
-def test_array_of_one_board_equals_this_board():
+def test_array_of_one_board_equals_the_board():
     alone = {"columns_n": 1, "rows_n": 1, "pitch_mm": 25.4}
     assert same(
         draw_board(design(), spreads(), seed=1, name="b0"),
@@ -126,7 +129,7 @@ def test_array_of_one_board_equals_this_board():
     )
 
 
-def test_too_many_chips_are_refused():
+def test_array_with_more_than_64_chips_is_refused():
     with pytest.raises(ParamsError, match="tiles must have at most 64 chips in total, not 65"):
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
@@ -136,8 +139,8 @@ def test_drawn_gaps_are_positive():
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
     assert (gaps_m > 0).all()
-    # log gap = log(middle) + 0.5 (a x + b y + c r^2), with r = 1 at the outer chips. The difference of opposite chips
-    # gives the tilt (a, b), and the mean of all outer chips gives the bow (c).
+    # The drawn gaps follow log gap = log(middle) + 0.5 (a x + b y + c r^2), where r = 1 at the outer chips. The
+    # difference of opposite chips gives the tilt (a, b), and the mean of the four outer chips gives the bow (c).
     log = np.log(gaps_m / gaps_m[:, :1])
     tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
     assert 0.35 < tilt.std() < 0.7
@@ -145,7 +148,7 @@ def test_drawn_gaps_are_positive():
     np.testing.assert_allclose(log[:, 1] + log[:, 3], log[:, 2] + log[:, 4], atol=1e-12)
 
 
-def test_chip_without_a_rotation_is_refused():
+def test_design_without_a_rotation_for_each_chip_is_refused():
     with pytest.raises(ParamsError, match="chips_turn_deg must have one rotation"):
         design(chips_turn_deg=[0.0])
 

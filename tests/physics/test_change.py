@@ -1,4 +1,7 @@
-"""Tests of the compiled change of field against a NumPy loop and magpylib; linearity; exact zeros."""
+"""Tests of the compiled loop that sums the change of field of moving dipoles.
+
+It is compared with a NumPy loop and magpylib, must be linear, and must return exact zeros where nothing changes.
+"""
 
 import numpy as np
 import pytest
@@ -12,24 +15,29 @@ from reskin.physics.magnet import change_of_field
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-12  # error of a few thousand float64 operations, relative to the sum of the magnitudes
+# The rounding error of a few thousand double-precision operations, relative to the sum of the magnitudes.
+ROUNDING = 1e-12
 seeds = st.integers(0, 10**6)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled():
-    """Compile the kernel before Hypothesis measures the time of examples."""
+    """Compile the loop before the tests, because Hypothesis limits the time of each example."""
     change_of_field(*scene(0))
 
 
 def naive(rest, moved, observers_m):
-    """Reference: sum the field differences of all dipoles in a NumPy loop."""
+    """Return the reference: the sum of the field differences of all dipoles, in a NumPy loop."""
     after_T = magnet.field_of_each(*moved, observers_m)
     return (after_T - magnet.field_of_each(*rest, observers_m)).sum(axis=1)
 
 
 def scene(seed, nodes_n=200):
-    """Return dipoles before and after a move (0.1 mm; moments change by 10 %), and observers; none is at the origin."""
+    """Return dipoles before and after a move, and the places of observers.
+
+    The dipoles move by about 0.1 mm, and their moments change by about 10 %. No dipole and no observer is at the
+    origin.
+    """
     rng = rng_for(seed, "change")
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), size=(nodes_n, 3))
     moments = 1e-5 * rng.normal(size=(nodes_n, 3))
@@ -48,12 +56,12 @@ def test_compiled_sum_equals_naive_sum(seed):
 
 
 @given(seeds, st.floats(-5, 5).filter(lambda factor: abs(factor) > 1e-6))
-def test_change_is_linear_in_moments_and_equals_magpylib(seed, factor):
+def test_change_is_linear_in_the_moments_and_equals_that_of_magpylib(seed, factor):
     assert not broken(dipoles(seed, factor))
 
 
 @given(seeds)
-def test_fixed_dipoles_change_nothing(seed):
+def test_dipoles_that_do_not_move_change_nothing(seed):
     rest, _, observers_m = scene(seed)
     assert not change_of_field(rest, rest, observers_m).any()
 
@@ -64,31 +72,32 @@ def test_dipoles_without_moment_change_nothing():
     assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
 
 
-def test_no_dipoles_cause_no_change():
+def test_empty_set_of_dipoles_changes_nothing():
     nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
     assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
 
 
 @given(seeds)
-def test_moving_there_and_back_changes_nothing(seed):
+def test_changes_of_a_move_and_of_its_reverse_sum_to_zero(seed):
     rest, moved, observers_m = scene(seed)
     back_T = change_of_field(moved, rest, observers_m)
     np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)
 
 
-def test_tiny_move_keeps_precision():
-    # Reference: the derivative of the field along the move. A move of 1e-9 m changes the field by 1e-6 of its value.
+def test_change_by_a_tiny_move_is_precise():
+    # Reference: the derivative of the field along the move. For a move of 1e-9 m, the change is only 1e-6 of the field,
+    # so a difference of two fields would lose six digits.
     (nodes_m, moments), _, observers_m = scene(3)
     step_m = np.array([1e-9, 0.0, 0.0])
     found_T = change_of_field((nodes_m, moments), (nodes_m + step_m, moments), observers_m)
     wide_m = 1e3 * step_m
     ahead_T, behind_T = (magnet.field(nodes_m + side * wide_m, moments, observers_m) for side in (1, -1))
-    # rtol: terms of next order, (1e-6 m / 3e-3 m)^2 and 1e-9 m / 3e-3 m
+    # The relative tolerance covers the terms of next order, (1e-6 m / 3e-3 m)^2 and 1e-9 m / 3e-3 m.
     np.testing.assert_allclose(found_T, (ahead_T - behind_T) / 2e3, rtol=1e-4)
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
-def test_observer_on_a_dipole_is_refused(place):
+def test_observer_at_the_place_of_a_dipole_is_refused(place):
     dipole_m, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
         change_of_field((dipole_m, moment), (away, moment), np.zeros((1, 3)))

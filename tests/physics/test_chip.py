@@ -1,4 +1,4 @@
-"""Tests of the chip model against the data sheet: gains, range, noise, temperature, conversion times."""
+"""Tests of the simulated chip against its data sheet: gain, range, noise, temperature, conversion times."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def read(b_T, of=None, design=QUIET):
 
 
 @given(st.integers(0, 7), st.integers(0, 10**6))
-def test_lsb_and_wrap_follow_the_data_sheet(gain_sel, seed):
+def test_step_and_range_of_readings_follow_the_data_sheet(gain_sel, seed):
     assert not broken([*signals.steps(), *signals.conversion(gain_sel, seed)])
 
 
@@ -57,42 +57,48 @@ def test_readings_within_range_are_neither_wrapped_nor_clipped():
         ([0.0, 50_010.0, 0.0], 1, 1), ([0.0, -60e3, 0.0], 1, 1),
     ],
 )  # fmt: skip
-def test_out_of_range_fields_wrap_or_clip(b_uT, wrapped_n, clipped_n):
+def test_readings_out_of_range_wrap_around_or_are_clipped(b_uT, wrapped_n, clipped_n):
+    """The chip's counter wraps around above its range.
+
+    Far above, the sensor itself saturates, and readings are clipped.
+    """
     assert out_of_range(np.array([b_uT]), "", "", wrapped_n=wrapped_n, clipped_n=clipped_n).holds
 
 
-def test_rotated_chip_reads_the_field_in_its_axes():
+def test_rotated_chip_reads_the_field_along_its_own_axes():
     b_uT, _ = read([0, 300e-6, 0], board(turn=QUARTER))
-    np.testing.assert_allclose(b_uT, [[300, 0, 0]], atol=0.08)  # tolerance: half a step
+    np.testing.assert_allclose(b_uT, [[300, 0, 0]], atol=0.08)  # The tolerance is half a step of a reading.
 
 
-def test_gain_and_offset_act_in_the_chips_frame():
+def test_gain_and_offset_are_applied_along_the_axes_of_the_chip():
     b_uT, _ = read([100e-6, 0, 0], board(gain=2.0, offset_T=30e-6))
-    np.testing.assert_allclose(b_uT, [[230, 30, 30]], atol=0.13)  # tolerance: half a step of z
+    np.testing.assert_allclose(b_uT, [[230, 30, 30]], atol=0.13)  # The tolerance is half a step of a z reading.
 
 
-def test_readings_are_multiples_of_the_lsb():
+def test_readings_are_whole_numbers_of_steps():
     b_uT, _ = read(rng_for(1, "sensor").uniform(-4e-3, 4e-3, size=(500, 3)), design=LOUD)
     counts = b_uT.astype(np.float64) / steps_uT(7)
-    np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)  # float32 rounds 4000 uT by 1e-3 steps
+    # Tolerance: single precision rounds a reading of 4000 uT by up to 1e-3 steps.
+    np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)
 
 
-def test_clipping_ignores_the_offset():
+def test_saturation_depends_on_the_field_without_the_offset():
     _, overruns = read([0, 0, 49.9e-3], board(offset_T=200e-6))
     assert overruns.clipped_n == 0
     assert read([0, 0, 49.9e-3], board(gain=1.1))[1].clipped_n == 1
 
 
-def test_noise_and_temperature_resolution():
+def test_readings_have_the_given_noise_and_temperature_resolution():
     assert not broken([*signals.noise(LOUD, 0), signals.temperature(0)])
     b_uT, _ = read(np.zeros((40_000, 3)), design=LOUD)
-    np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)  # four standard errors 5 uT / sqrt(n)
+    # The tolerance is four standard errors of the mean, 5 uT / sqrt(n) each.
+    np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)
     read_degC = read_temperature(np.full((10_000, 5), 25.0), LOUD, rng_for(2, "sensor"))
     assert read_degC.std() == pytest.approx(0.1, rel=0.05)
     assert read_degC.mean() == pytest.approx(25, abs=0.01)
 
 
-def test_readings_follow_the_generator():
+def test_equal_generators_give_equal_readings():
     first, again = (read(np.full((50, 3), 1e-3), design=LOUD)[0] for _ in range(2))
     assert first.tobytes() == again.tobytes()
 
@@ -102,24 +108,26 @@ phases_s = st.floats(0, CONVERSION_S)
 
 
 @given(rates_hz, phases_s)
-def test_frame_has_the_last_finished_conversion(rate_hz, phase_s):
+def test_frame_contains_the_last_conversion_that_is_finished(rate_hz, phase_s):
     frame_s = (1 + np.arange(40)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)
     truth_s = [t - max(end for end in ends_s if end <= t + 1e-12) for t in frame_s]
-    # a conversion that ends exactly at the time of the frame may or may not be included
+    # If a conversion ends at the very time of the frame, it may be in this frame or in the next one.
     off_s = np.abs(age_s[:, 0] - truth_s)
     assert (np.minimum(off_s, CONVERSION_S - off_s) < 1e-9).all()
 
 
-def test_share_of_repeated_conversions_by_rate():
-    for rate_hz, least, most in ((400, 0, 0), (1000, 0.44, 0.48)):  # 1 - 1 / (1.84 ms x 1 kHz) = 0.457
+def test_share_of_repeated_conversions_grows_with_the_frame_rate():
+    """If frames are read faster than the chip converts, some frames repeat the last conversion."""
+    # A conversion lasts 1.84 ms, so at 1 kHz the share of repeated conversions is 1 - 1 / (1.84 ms x 1 kHz) = 0.457.
+    for rate_hz, least, most in ((400, 0, 0), (1000, 0.44, 0.48)):
         _, source_i = last_conversions((1 + np.arange(2000)) / rate_hz, np.zeros(1))
         repeated = np.mean(source_i[:, 0] != np.arange(2000))
         assert least <= repeated <= most
 
 
-def test_chips_of_one_frame_are_not_simultaneous():
+def test_chips_convert_at_different_times_within_a_frame():
     age_s, _ = last_conversions((1 + np.arange(100)) / 400, np.array([0.0, 0.9e-3]))
     assert np.abs(age_s[:, 0] - age_s[:, 1]).max() > 0.5e-3
     assert (age_s >= 0).all()
@@ -127,18 +135,19 @@ def test_chips_of_one_frame_are_not_simultaneous():
 
 
 @given(rates_hz)
-def test_reading_is_the_field_at_its_conversion(rate_hz):
+def test_reading_is_the_field_at_the_end_of_its_conversion(rate_hz):
     frame_s = (1 + np.arange(30)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([0.3e-3]))
     value = np.repeat(frame_s[:, None, None], 3, axis=2)
     seen = sample_at_conversion(value, age_s, rate_hz)
-    late = frame_s - age_s[:, 0] >= frame_s[0]  # earlier conversions use the field of the first frame
+    # Conversions before the first frame have the field of the first frame, because no earlier field is known.
+    late = frame_s - age_s[:, 0] >= frame_s[0]
     np.testing.assert_allclose(seen[late, 0, 0], (frame_s - age_s[:, 0])[late], atol=1e-9)
 
 
 def test_conversion_time_follows_table_18_of_the_data_sheet():
     table_ms = [[1.27, 1.84, 3.00, 5.30], [1.46, 2.23, 3.76, 6.84], [1.84, 3.00, 5.30, 9.91], [2.61, 4.53, 8.37, 16.05]]
     computed_ms = [[1e3 * conversion_s(osr, dig_filt) for osr in range(OSR_MAX + 1)] for dig_filt in range(4)]
-    np.testing.assert_allclose(computed_ms, table_ms, atol=0.005)  # the table has two decimals
+    np.testing.assert_allclose(computed_ms, table_ms, atol=0.005)  # The table gives times with two decimals.
     assert conversion_s(0, 2) == pytest.approx(CONVERSION_S, abs=5e-6)
     assert conversion_s(OSR_MAX, DIG_FILT_MAX) == pytest.approx(0.200, rel=0.01)

@@ -1,4 +1,7 @@
-"""Tests of the finite deformation under a tip: the laws in `verification`, linear limit, convergence of the steps."""
+"""Tests of the deformation of the skin under a tip, which is computed in small steps of depth.
+
+Tested are the laws in `verification`, the limit of small depths and the convergence of the steps.
+"""
 
 from itertools import pairwise
 
@@ -34,7 +37,7 @@ def det_f(deformed):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
-def test_surface_follows_the_tip(depth_m, base):
+def test_surface_under_the_tip_follows_its_shape(depth_m, base):
     # If the deformation were computed in one step, the surface would miss the tip by 27 % of the depth at 1.2 mm.
     assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
@@ -44,25 +47,26 @@ def test_volume_is_conserved_and_the_base_does_not_move(base):
     assert not broken(mechanics.finite_deformation(layer.IndentedLayer(H_M, TIP_M, base), 1.2e-3))
 
 
-def test_angle_equals_polar_decomposition():
+def test_rotation_angle_equals_that_of_the_polar_decomposition():
     f = follow(*nodes(14, 7)).f
-    u, _, vt = np.linalg.svd(f)  # F = R U, R = u vt
+    # Polar decomposition: F = R U with the rotation R = u vt, from the singular value decomposition of F.
+    u, _, vt = np.linalg.svd(f)
     np.testing.assert_allclose((u @ vt)[:, 0, 1], np.sin(deformation.rotation_angle(f)), atol=1e-12)
 
 
-def test_single_linear_step_would_lose_volume():
+def test_deformation_in_a_single_linear_step_would_lose_volume():
     r_m, z_m = nodes()
     linear = linear_at(r_m, z_m, 1.2e-3)
     one_shot = ((1 + linear.r_r) * (1 + linear.z_z) - linear.r_z * linear.z_r) * (1 + linear.hoop)
     followed = det_f(follow(r_m, z_m))
-    assert one_shot.min() < 0.5  # 0.42 of the volume would remain on the axis
+    assert one_shot.min() < 0.5  # Only a fraction of 0.42 of the volume would remain on the axis.
     assert np.mean(np.abs(followed - 1) < 0.01) > 0.97
 
 
 def test_material_under_the_dent_flows_outward_on_a_slipping_base():
     press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_field(press, 1.2e-3))
-    # The volume of the dent is between those of a cone and of a cylinder.
+    # The dent has more volume than a cone and less than a cylinder of the same radius and depth.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
     assert (
         press.contact(1.2e-3).radius_m ** 2 * 1.2e-3 / 3 < grown_m2 * H_M < press.contact(1.2e-3).radius_m ** 2 * 1.2e-3
@@ -71,34 +75,35 @@ def test_material_under_the_dent_flows_outward_on_a_slipping_base():
     assert (follow(base_m, np.zeros(20), base="slipping").r_m > base_m).all()
 
 
-def test_steps_converge_quadratically(monkeypatch):
+def test_errors_of_the_steps_converge_quadratically(monkeypatch):
     r_m, z_m = nodes(12, 6)
     found = []
     for step in (0.1, 0.05, 0.025):
         ladder = np.array([0.0, step / 4, step / 2, *np.arange(step, 1.01, step)])
         monkeypatch.setattr(deformation, "LADDER", ladder)
-        # this depth is a whole number of steps
+        # This depth is a whole number of steps, so that halving the step halves every step.
         found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))
     loss = [np.abs(det_f(deformed) - 1).max() for deformed in found]
     assert loss[1] < loss[0] / 2.5
     assert loss[2] < loss[1] / 2.5
     apart_m = [np.hypot(b.r_m - a.r_m, b.z_m - a.z_m).max() for a, b in pairwise(found)]
     assert apart_m[1] < apart_m[0] / 2
-    assert apart_m[1] < 0.03 * 1.2e-3  # difference between results with the default step and with half the step
+    assert apart_m[1] < 0.03 * 1.2e-3  # The last difference is between the default step and half the step.
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_shallow_poke_is_linear(base):
+def test_deformation_by_a_shallow_poke_is_linear_in_the_depth(base):
     r_m, z_m = nodes(r_max_m=1e-3)
     deformed, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
-    # tolerance: 5 % of the depth, because the material moves, and the contact (0.3 mm) is as small as the shortest wave
+    # The tolerance is 5 % of the depth. The linear theory neglects that the material moves, and the contact (0.3 mm) is
+    # as small as the shortest wave that is summed.
     np.testing.assert_allclose(deformed.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
     np.testing.assert_allclose(deformed.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_material_points_are_independent(base):
+def test_motion_of_a_point_does_not_depend_on_other_points(base):
     r_m, z_m = nodes(8, 4)
     alone = [follow(r_m + more_m, z_m, base=base) for more_m in (0.0, 3e-3)]
     together = follow(np.concatenate([r_m, r_m + 3e-3]), np.tile(z_m, 2), base=base)

@@ -1,4 +1,7 @@
-"""Tests of the tabulated deformation against following each node; cases without contact, base, reach, thin skins."""
+"""Tests of the tabulated deformation against the motion of each node, computed in steps.
+
+Further tests: pokes without contact, the base of the skin, places beyond the table, and thin skins.
+"""
 
 from functools import cache
 
@@ -17,7 +20,7 @@ depths_m = st.floats(1e-5, 1.2e-3)
 bases = st.sampled_from(BASES)
 
 
-@cache  # not computed at import, because every test worker imports this module
+@cache  # The table is not computed at import, because every test worker imports this module.
 def table(base="bonded"):
     return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
 
@@ -42,12 +45,14 @@ def places(rng, places_n, half_m=10e-3):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize(("rung_i", "share"), [(4, 2e-3), (-1, 2e-3), (None, 0.05)])
-def test_table_equals_following_nodes(rung_i, share, base):
-    # Interpolation in R/h (tip radius by thickness) and in r has an error of 0.2 % of the depth. Between tabulated
-    # depths, the error is 5 %, because the contact's edge is at another radius.
+def test_tabulated_motion_equals_the_computed_motion_of_nodes(rung_i, share, base):
+    # The table is interpolated in R/h (radius of the tip divided by the thickness) and in r, with an error of 0.2 % of
+    # the depth. Between the depths of the table, the error is 5 %, because the edge of the contact is at another radius
+    # there.
     depth_m = 0.55e-3 if rung_i is None else table(base).depth_m[rung_i]
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
-    start_m = start_m[start_m[:, 2] < H_M]  # below the surface, on which the angle jumps at the contact edge
+    # Only nodes below the surface are compared, because the angle of the surface jumps at the edge of the contact.
+    start_m = start_m[start_m[:, 2] < H_M]
     moved = move(start_m, (0, 0, depth_m), base)
     followed = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
     sign = np.sign(start_m[:, 0])
@@ -70,7 +75,7 @@ def test_nodes_move_in_planes_through_the_axis(x_m, y_m, depth_m, base):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.0, -0.3e-3])
-def test_without_contact_no_node_moves(depth_m, base):
+def test_poke_without_contact_moves_no_node(depth_m, base):
     assert move(places(np.random.default_rng(2), 100), (1e-3, 1e-3, depth_m), base).i.size == 0
 
 
@@ -82,15 +87,15 @@ def test_bonded_base_does_not_move(depth_m):
 
 @settings(max_examples=25)
 @given(depths_m, depths_m, bases)
-def test_deeper_pokes_move_material_deeper(first_m, second_m, base):
+def test_deeper_pokes_move_material_farther_down(first_m, second_m, base):
     shallow_m, deep_m = sorted((first_m, second_m))
     column_m = np.column_stack([np.zeros((7, 2)), H_M * np.array(HEIGHTS[1:])])
     shallow, deep = (move(column_m, (0, 0, depth), base).after[0][:, 2] for depth in (shallow_m, deep_m))
     assert (deep <= shallow + 1e-12).all()
-    assert (np.diff(deep) > 0).all()  # layers keep their order
+    assert (np.diff(deep) > 0).all()  # Layers stay in order of their height.
 
 
-def test_displacement_beyond_the_reach_is_negligible():
+def test_displacement_beyond_the_range_of_the_table_is_negligible():
     radius_m = layer.contact_of_depth(1.2e-3, thickness_m=H_M, tip_radius_m=TIP_M, base="bonded").radius_m
     assert table().reach_m == pytest.approx(radius_m + 5 * H_M, rel=0.01)
     assert move([[1.001 * table().reach_m, 0, 1e-3]], (0, 0, 1.2e-3)).i.size == 0
@@ -98,22 +103,21 @@ def test_displacement_beyond_the_reach_is_negligible():
 
 
 @given(depths_m)
-def test_slipping_skin_moves_outward_beyond_the_reach(depth_m):
+def test_slipping_skin_moves_outward_beyond_the_range_of_the_table(depth_m):
     r_m = np.repeat(table("slipping").reach_m * np.array([0.999, 1.001, 1.5, 2.2]), len(HEIGHTS))
     rest_m = np.column_stack([r_m, np.zeros_like(r_m), H_M * np.tile(HEIGHTS, 4)])
     moved = move(rest_m, (0, 0, depth_m), "slipping")
     assert moved.i.size == r_m.size
     grown_m2 = moved.after[0][:, 0] ** 2 - r_m**2
-    np.testing.assert_allclose(
-        grown_m2, grown_m2[-1], rtol=0.01
-    )  # tolerance: at the edge of the table, the two solutions differ by exp(-5 pi) and by rounding of sums
+    # Tolerance: at the edge of the table, the two solutions differ by exp(-5 pi), and by the rounding of sums.
+    np.testing.assert_allclose(grown_m2, grown_m2[-1], rtol=0.01)
     past = slice(len(HEIGHTS), None)
     np.testing.assert_array_equal(moved.after[0][past, 1:], rest_m[past, 1:])
     np.testing.assert_array_equal(moved.after[1][past], moved.before[1][past])
 
 
 @given(depths_m)
-def test_slipping_base_keeps_its_height(depth_m):
+def test_lower_surface_of_a_slipping_skin_stays_on_its_base(depth_m):
     base_m = np.column_stack([np.linspace(0.1e-3, 15e-3, 100), np.zeros(100), np.zeros(100)])
     after_m = move(base_m, (0, 0, depth_m), "slipping").after[0]
     assert not after_m[:, 2].any()

@@ -11,12 +11,13 @@ from reskin.errors import ParamsError
 from reskin.physics.magnet import MU0_4PI, field, field_of_each
 from reskin.seeds import rng_for
 
-ROUNDING = 1e-12  # relative error of a few hundred float64 operations
+ROUNDING = 1e-12  # The relative rounding error of a few hundred double-precision operations.
 SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)
 
 coordinates = st.floats(-1, 1, allow_subnormal=False)
 triples = st.tuples(coordinates, coordinates, coordinates).map(np.array)
-# Sources away from the origin and distant observers reveal a wrong sign of the separation vector.
+# Sources are away from the origin, and observers are far from the sources. Otherwise a separation vector with the wrong
+# sign could go unnoticed.
 sources_m = triples.map(lambda v: v + np.array([3.0, -2.0, 1.0]))
 observers_m = triples.map(lambda v: v + np.array([-3.0, 4.0, 5.0]))
 
@@ -25,14 +26,14 @@ def field_at(source_m, moment, observer_m):
     return field(np.atleast_2d(source_m), np.atleast_2d(moment).astype(float), np.atleast_2d(observer_m))[0]
 
 
-def test_constant_equals_codata():
+def test_magnetic_constant_equals_codata():
     assert mu_0 / (4 * np.pi) == MU0_4PI
     assert 0 < abs(MU0_4PI / 1e-7 - 1) < 1e-9
 
 
 @given(sources_m, st.floats(0.1, 5))
-def test_field_on_axis_and_beside(source_m, r_m):
-    # rtol: the separation (source + r) - source loses digits
+def test_field_on_the_axis_and_beside_the_dipole_equals_the_closed_form(source_m, r_m):
+    # The relative tolerance allows for the difference (source + r) - source, which loses digits.
     for direction, times in (((0, 0, r_m), 2), ((r_m, 0, 0), -1)):
         truth_T = (0, 0, times * 2.0 * MU0_4PI / r_m**3)
         np.testing.assert_allclose(
@@ -40,12 +41,12 @@ def test_field_on_axis_and_beside(source_m, r_m):
         )
 
 
-def test_field_at_45_degrees():
+def test_field_at_45_degrees_equals_the_closed_form():
     b_T = field_at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
     np.testing.assert_allclose(b_T, MU0_4PI * np.array([1.5, 0, 0.5]), rtol=ROUNDING, atol=1e-20)
 
 
-def test_sum_equals_textbook_loop():
+def test_sum_of_fields_equals_a_loop_over_the_textbook_formula():
     rng = rng_for(0, "dipole")
     positions, moments, observers = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(4, 3)) + 5
     naive = np.zeros((4, 3))
@@ -67,21 +68,22 @@ def test_field_equals_magpylib(seed):
 def test_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
     together = field_at(source_m, one + share * other, observer_m)
     summed = field_at(source_m, one, observer_m) + share * field_at(source_m, other, observer_m)
-    np.testing.assert_allclose(together, summed, rtol=1e-9, atol=1e-20)  # atol: the fields may cancel
+    # The absolute tolerance is needed where the fields cancel.
+    np.testing.assert_allclose(together, summed, rtol=1e-9, atol=1e-20)
 
 
 @given(sources_m, triples, observers_m)
-def test_divergence_and_curl_are_zero(source_m, moment, observer_m):
+def test_divergence_and_curl_of_the_field_are_zero(source_m, moment, observer_m):
     step_m = 1e-3
     b_T = field(source_m[None], moment[None], observer_m + step_m * SIX_STEPS).reshape(3, 2, 3)
     jacobian = (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
     size = MU0_4PI * (np.linalg.norm(moment) + 1e-3) / np.linalg.norm(observer_m - source_m) ** 4
-    assert abs(np.trace(jacobian)) < 1e-5 * size  # error of central differences: (step / r)^2
+    assert abs(np.trace(jacobian)) < 1e-5 * size  # Central differences have an error of about (step / r)^2.
     assert np.abs(jacobian - jacobian.T).max() < 1e-5 * size
 
 
 @given(sources_m, triples, observers_m)
-def test_rotation_by_90_degrees(source_m, moment, observer_m):
+def test_rotating_sources_and_observers_by_90_degrees_rotates_the_field(source_m, moment, observer_m):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(
         field_at(turn @ source_m, turn @ moment, turn @ observer_m),
@@ -92,10 +94,10 @@ def test_rotation_by_90_degrees(source_m, moment, observer_m):
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
-def test_observer_on_a_dipole_is_refused(place):
+def test_observer_at_the_place_of_a_dipole_is_refused(place):
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
         field(np.full((1, 3), place), np.ones((1, 3)), np.zeros((1, 3)))
 
 
-def test_no_dipoles_have_no_field():
+def test_field_of_an_empty_set_of_dipoles_is_zero():
     assert not field(np.zeros((0, 3)), np.zeros((0, 3)), np.ones((2, 3))).any()

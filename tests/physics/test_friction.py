@@ -1,4 +1,8 @@
-"""Tests of friction under a dragged tip: Q = min(k s, mu F), energy, Coulomb's limit, subdivided and rotated paths."""
+"""Tests of friction under a dragged tip, whose force is Q = min(k s, mu F).
+
+The tip sticks to the skin, which acts as a spring of stiffness k, until the force reaches the limit mu F. Tested are
+the energy, Coulomb's limit, and paths that are subdivided or rotated.
+"""
 
 import numpy as np
 import pytest
@@ -10,8 +14,8 @@ from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
-ROUNDING = 1e-12  # relative error of some hundred steps in double precision
-K = 1000.0  # N/m, of the order of the skin's stiffness
+ROUNDING = 1e-12  # The relative rounding error of some hundred steps in double precision.
+K = 1000.0  # Stiffness of the spring in N/m, of the same order as that of the skin.
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
 
@@ -29,13 +33,13 @@ def slipped_m(path_m, found):
 
 
 @given(st.floats(1e-6, 1e-2), st.floats(1e-3, 5), st.floats(1e-3, 2), st.floats(0, 5e3), st.integers(1, 50))
-def test_force_of_a_straight_drag_is_that_of_spring_or_friction(end_m, normal_N, mu, stiffness, steps_n):
+def test_force_of_a_straight_drag_is_the_smaller_of_spring_force_and_friction(end_m, normal_N, mu, stiffness, steps_n):
     path_m = np.linspace(0, end_m, steps_n + 1)
     assert straight_drag(path_m, mu * normal_N, stiffness_N_per_m=stiffness, coefficient=mu).holds
 
 
 @given(paths_m)
-def test_force_is_zero_without_friction(path_m):
+def test_tip_without_friction_has_no_tangential_force(path_m):
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=0.0)
     assert not found.force_N.any()
     assert not found.elastic_m.any()
@@ -44,20 +48,21 @@ def test_force_is_zero_without_friction(path_m):
 
 
 @given(paths_m)
-def test_infinite_friction_is_a_spring(path_m):
+def test_tip_with_infinite_friction_acts_as_a_spring(path_m):
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=1e6)
     np.testing.assert_allclose(found.force_N, K * (path_m - path_m[0]), atol=ROUNDING * K * 1e-2)
     assert not found.sliding.any()
 
 
 @given(paths_m, frictions, st.data())
-def test_force_stays_within_coulombs_disc(path_m, mu, data):
+def test_tangential_force_is_never_above_the_friction_limit(path_m, mu, data):
     t = len(path_m)
     normal_N = data.draw(arrays(float, t, elements=st.floats(0, 5)))
     stiffness = data.draw(arrays(float, t, elements=st.floats(0, 5e3)))
     found = drag_force(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu)
     size_N = np.hypot(*found.force_N.T)
-    assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()  # subnormal numbers lose digits
+    # The absolute tolerance is for subnormal numbers, which have fewer digits.
+    assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()
     np.testing.assert_allclose(size_N[found.sliding], (mu * normal_N)[found.sliding], rtol=ROUNDING, atol=1e-300)
     np.testing.assert_allclose(found.force_N, stiffness[:, None] * found.elastic_m, rtol=ROUNDING, atol=1e-300)
 
@@ -73,9 +78,10 @@ def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
     np.testing.assert_allclose(*ends, atol=ROUNDING)
 
 
-def test_loop_dissipates_friction_times_length():
+def test_loop_dissipates_friction_force_times_sliding_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
-    # 0.8 mm is a whole number of steps of 10 um, so sticking changes to sliding exactly at a stop
+    # The spring's greatest length of 0.8 mm is a whole number of steps of 10 um. Therefore sticking changes to sliding
+    # exactly at the end of a step.
     stuck_m = mu * 1.0 / K
     along_m = np.concatenate(
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
@@ -84,18 +90,19 @@ def test_loop_dissipates_friction_times_length():
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
-    # A loop has a length of 4 reaches. At each of its two reversals, the tip sticks over twice the spring's length;
-    # elsewhere it slides. Tolerance: rounding of sums over 1200 straight pieces.
+    # A loop has a length of 4 reaches. At each of the two reversals, the tip sticks while the spring changes from one
+    # greatest length to the opposite one. On the rest of the loop, it slides. Tolerance: rounding of sums over 1200
+    # straight pieces.
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
-    # From rest, the work equals the dissipated energy plus the energy stored in the spring.
+    # From rest, the work done equals the dissipated energy plus the energy that is stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
 
 
 @given(paths_m, frictions)
-def test_friction_opposes_slip(path_m, mu):
+def test_friction_force_opposes_the_sliding(path_m, mu):
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=mu)
     slip_m = slipped_m(path_m, found)
     power = (found.force_N[1:] * slip_m).sum(axis=1)
@@ -109,17 +116,19 @@ def test_rotating_the_path_rotates_the_force(path_m, mu, angle_rad):
     unrotated, rotated = (
         drag_force(p, constant_force_N(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
     )
-    # rounding of 40 steps of up to 30 N (before limiting by friction)
+    # The tolerance is the rounding of 40 steps, each with a spring force of up to 30 N before it is limited by
+    # friction.
     np.testing.assert_allclose(rotated, unrotated @ turn.T, atol=1e-10)
 
 
-def test_force_turns_within_a_few_spring_lengths():
+def test_force_follows_a_new_direction_within_a_few_spring_lengths():
     path_m = np.vstack([straight_path_m(4e-3, 400, 0.0), straight_path_m(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
-    # The spring follows a tractrix: its angle f to the new line obeys tan(f / 2) = exp(-distance / length).
+    # The end of the spring follows a tractrix. Therefore the angle f between the spring and the new line obeys tan(f /
+    # 2) = exp(-distance / length).
     angle_rad = 2 * np.arctan(np.exp(-past_m / 0.8e-3))
-    # tolerance: rotation within a step
+    # The tolerance is the rotation within one step.
     np.testing.assert_allclose(sideways_N, 0.8 * np.sin(angle_rad), atol=0.8 * 10e-6 / 0.8e-3)
 
 
@@ -129,7 +138,7 @@ def test_tangential_force_falls_with_the_normal_force():
     np.testing.assert_allclose(found.force_N[:, 0], [0, 0.8, 0.2, 0.2], rtol=ROUNDING)
 
 
-def test_lifting_resets_the_spring():
+def test_lifting_the_tip_relaxes_the_spring():
     path_m = np.array([[0.0, 0.0], [0.5e-3, 0.0], [5e-3, 0.0], [9e-3, 1e-3], [9.1e-3, 1e-3]])
     found = drag_force(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N, [[0, 0], [0.5, 0], [0, 0], [0, 0], [0.1, 0]], atol=1e-12)
@@ -137,7 +146,7 @@ def test_lifting_resets_the_spring():
     assert not found.sliding.any()
 
 
-def test_skin_without_stiffness_has_no_drag():
+def test_skin_without_stiffness_is_dragged_without_force():
     path_m = straight_path_m(5e-3, 10)
     found = drag_force(path_m, constant_force_N(path_m), stiffness_N_per_m=0.0, friction=0.8)
     assert not found.force_N.any()

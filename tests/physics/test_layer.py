@@ -1,4 +1,4 @@
-"""Tests of the bonded layer against limits, 50-digit arithmetic and the laws in `verification`; invalid input."""
+"""Tests of a bonded elastic layer under a tip against limits, 50-digit arithmetic and the laws in `verification`."""
 
 from dataclasses import asdict
 
@@ -36,17 +36,18 @@ def test_compliance_equals_50_digit_arithmetic(kh):
     assert mechanics.bonded_compliance(np.array([kh])).holds
 
 
-def test_compliance_limits():
+def test_compliance_has_the_limits_of_long_and_short_waves():
     long, short = (
         layer.bonded_compliance(np.array([0.0, 1e-6, 1e-3])),
         layer.bonded_compliance(np.array([20.0, 1e4, 1e150])),
     )
-    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3, A = kh; next term: factor A^2
+    # For long waves, the compliance is 2 A^3 / 3 with A = kh. The next term of the series is smaller by the factor A^2.
+    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)
     np.testing.assert_allclose(short, 1, rtol=1e-13)
 
 
 @given(st.floats(0.01, 30), st.floats(0, 1))
-def test_displacement_over_depth_equals_50_digit_arithmetic(kh, share):
+def test_displacement_divided_by_depth_equals_50_digit_arithmetic(kh, share):
     with mpmath.workdps(50):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh) * mpmath.mpf(share)
         ratio = (mpmath.cosh(a) + a * mpmath.sinh(a)) / (a * mpmath.cosh(a))
@@ -57,30 +58,30 @@ def test_displacement_over_depth_equals_50_digit_arithmetic(kh, share):
         size = (mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1) / w(a)
         truth = [float(size * mpmath.diff(w, z, order)) for order in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]))
-    # tolerance relative to the value 1 of a half-space
+    # The tolerance is relative to the value on a half-space, which is 1.
     np.testing.assert_allclose([float(part[0, 0]) for part in found], truth, atol=1e-12)
 
 
-def test_base_is_fixed_and_surface_free_of_shear():
+def test_base_does_not_move_and_surface_has_no_shear_stress():
     kh = np.geomspace(0.01, 500, 40)
     base = layer.depth_profile(np.zeros((1, 40)), kh)
     top = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(base[:2], 0, atol=1e-15)
-    np.testing.assert_allclose(top[0] + top[2], 0, atol=1e-13)  # no shear stress: W'' + W = 0
+    np.testing.assert_allclose(top[0] + top[2], 0, atol=1e-13)  # The surface has no shear stress if W'' + W = 0.
     assert np.isfinite(top).all()
 
 
-@settings(max_examples=30)  # an example takes 50 ms
+@settings(max_examples=30)  # Fewer examples than usual, because each takes 50 ms.
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
-def test_force_equals_dimitriadis_for_small_tips(thickness_m, tip_radius_m, relative_depth):
-    # The published series in chi = sqrt(R d) / h is too low from its term in chi^2 on: by 8 % at chi = 0.5, and by
-    # 16 % at chi = 1. The solution with pressure rings confirms this error.
+def test_force_of_small_tips_equals_the_series_of_dimitriadis(thickness_m, tip_radius_m, relative_depth):
+    # The published series in chi = sqrt(R d) / h is wrong from its term in chi^2 on. The force is too low by 8 % at chi
+    # = 0.5, and by 16 % at chi = 1. The solution with pressure rings confirms this error.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
     assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 
 
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
-def test_force_of_published_solutions(tip_m):
+def test_forces_equal_published_solutions(tip_m):
     press = IndentedLayer(2e-3, tip_m, "bonded")
     thick = mechanics.hertz("bonded", tip_m), *mechanics.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
     laws = mechanics.long_2011(DEPTHS_M, press), *mechanics.scaling(DEPTHS_M, press, 1e9)
@@ -92,29 +93,29 @@ def test_pressure_rings_give_the_same_force(base):
     press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
-    assert (pressure > 0).all()  # no tension, so the contact radius is not too large
-    assert pressure[-1] < 0.25 * pressure[0]  # no peak at the edge, so the contact radius is not too small
+    assert (pressure > 0).all()  # The pressure is nowhere negative, so the contact radius is not too large.
+    # The pressure has no peak at the edge, so the contact radius is not too small.
+    assert pressure[-1] < 0.25 * pressure[0]
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
-def test_small_step_conserves_volume_and_does_not_move_the_base(base, depth_m):
+def test_small_step_of_depth_conserves_volume_and_does_not_move_the_base(base, depth_m):
     assert not broken(mechanics.one_small_step(IndentedLayer(2e-3, 3e-3, base), depth_m))
 
 
-def test_hoop_strain_on_the_axis():
+def test_hoop_strain_is_continuous_at_the_axis():
     assert field([0.0], [1.5e-3]).hoop == pytest.approx(field([1e-7], [1.5e-3]).hoop, rel=1e-6)
 
 
-def test_forces_of_the_specification():
-    np.testing.assert_allclose(
-        force(DEPTHS_M), [0.09, 0.33, 0.74, 1.33, 2.08, 3.00], atol=0.006
-    )  # the specification has two decimals
+def test_forces_equal_those_of_the_specification():
+    # The specification gives forces with two decimals.
+    np.testing.assert_allclose(force(DEPTHS_M), [0.09, 0.33, 0.74, 1.33, 2.08, 3.00], atol=0.006)
 
 
 @settings(max_examples=15, deadline=None)
 @given(thicknesses_m, tips_m)
-def test_force_grows_with_depth_and_thinness(thickness_m, tip_radius_m):
+def test_force_grows_with_depth_and_on_thinner_layers(thickness_m, tip_radius_m):
     depth_m = np.linspace(0, 0.99 * min(thickness_m, tip_radius_m), 200)
     thin = force(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     thick = force(depth_m, thickness_m=1.1 * thickness_m, tip_radius_m=tip_radius_m)
@@ -127,7 +128,7 @@ def test_force_is_zero_without_contact_or_stiffness():
     assert not force(DEPTHS_M, modulus_Pa=0.0).any()
 
 
-def test_thin_skin_has_a_finite_force():
+def test_force_on_a_very_thin_skin_is_finite():
     assert 0 < force(0.1e-3, thickness_m=0.2e-3)[0] < 1e3
 
 
@@ -153,7 +154,7 @@ def test_invalid_layers_and_pokes_are_refused(what, changes):
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_displacement_is_the_sum_of_its_waves(base):
+def test_displacement_equals_the_sum_of_its_waves(base):
     h_m = 2e-3
     waves = layer.waves(layer.contact_of_depth(0.8e-3, thickness_m=h_m, tip_radius_m=3e-3, base=base), h_m, base)
     r_m, z_m = np.array([0.0, 0.4e-3, 2e-3, 40e-3]), np.array([1e-3, 2.1e-3, 0.0, 1.3e-3])

@@ -1,4 +1,7 @@
-"""Tests of the magnetising magnets against magpylib's Cuboid and Maxwell's equations, and of the magnetisation law."""
+"""Tests of the magnets that magnetise the skin, and of the resulting magnetisation.
+
+References are magpylib's Cuboid and Maxwell's equations.
+"""
 
 import magpylib
 import numpy as np
@@ -22,27 +25,27 @@ polarities = st.sampled_from(["checkerboard", "same"])
 
 
 @given(seeds, st.floats(1e-4, 1e-2))
-def test_cube_equals_magpylib_and_far_dipole(seed, side_m):
+def test_field_of_a_cube_equals_magpylib_and_far_away_a_dipole(seed, side_m):
     assert not broken([*laws.boxes(seed, side_m), laws.octupole()])
 
 
-def test_cuboid_equals_magpylib():
+def test_field_of_a_cuboid_equals_magpylib():
     sides_m = (6e-3, 4e-3, 3e-3)
     places_m = rng_for(0, "cuboid").uniform(-20e-3, 20e-3, (2000, 3)) * rng_for(1, "cuboid").uniform(size=(2000, 1))
     theirs_T = magpylib.magnet.Cuboid(polarization=(0, 0, 1.3), dimension=sides_m).getB(places_m)
     assert (np.abs(places_m) < np.array(sides_m) / 2).all(axis=1).sum() > 50
-    # tolerance: rounding of 24 logarithms, for fields of 1 T
+    # The tolerance is the rounding of a sum of 24 logarithms, for fields of 1 T.
     np.testing.assert_allclose(magnet.cuboid_field(places_m, 1.3, sides_m=sides_m), theirs_T, atol=1e-12)
 
 
 @settings(max_examples=10)
 @given(polarities, seeds)
-def test_array_equals_magpylib_and_maxwell(polarity, seed):
+def test_field_of_the_array_equals_magpylib_and_obeys_maxwell(polarity, seed):
     assert not broken(laws.array(polarity, THICKNESS_M, seed))
 
 
 @pytest.mark.parametrize("polarity", ["checkerboard", "same"])
-def test_sleeve_array_equals_magpylib(polarity):
+def test_field_of_the_array_for_a_sleeve_equals_magpylib(polarity):
     half_m = np.array([25.4e-3, 50.8e-3])
     places_m = np.column_stack([rng_for(0, "sleeve").uniform(-half_m, half_m, (60, 2)), np.linspace(1e-4, 1.9e-3, 60)])
     theirs_T = magpylib.getB(laws.cuboids(polarity, THICKNESS_M, (8, 16)), places_m, sumup=True)
@@ -51,7 +54,7 @@ def test_sleeve_array_equals_magpylib(polarity):
 
 
 @pytest.mark.parametrize(("side_mm", "n"), [(20.0, 4), (25.4, 4), (50.8, 8), (101.6, 16), (101.7, 17), (3.0, 1)])
-def test_magnets_cover_a_side_symmetrically(side_mm, n):
+def test_magnets_cover_a_side_of_the_skin_symmetrically(side_mm, n):
     side_m = 1e-3 * side_mm
     assert magnet.cubes_along(side_m) == n
     seams_m = magnet.seams_m(side_m)
@@ -62,16 +65,17 @@ def test_magnets_cover_a_side_symmetrically(side_mm, n):
 
 
 @given(places_m, polarities)
-def test_field_of_the_array_under_reflection(point_m, polarity):
-    # If the reflection x -> -x maps magnetic charges to equal charges, only Bx changes sign. On a checkerboard, the
-    # charges change sign as well.
+def test_reflected_array_of_magnets_has_the_reflected_field(point_m, polarity):
+    # The reflection x -> -x maps the magnetic charges of equal poles to equal charges, so only Bx changes sign. On a
+    # checkerboard, it exchanges the poles, so the charges change sign as well.
     sign = -1 if polarity == "checkerboard" else 1
     here_T, there_T = (magnet.array_field((point_m * (side, 1, 1))[None], THICKNESS_M, polarity)[0] for side in (1, -1))
     np.testing.assert_allclose(there_T, sign * here_T * (-1, 1, 1), atol=1e-12)
 
 
 def test_field_of_the_array_equals_the_specification():
-    # The field in the slab is 0.38-0.65 T: weaker at crossings of seams, stronger at the faces.
+    # The specified field in the slab is 0.38 to 0.65 T. It is weaker where seams cross, and stronger at the faces of
+    # the magnets.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 
@@ -81,44 +85,46 @@ def test_place_outside_the_slab_is_refused():
         magnet.array_field(np.array([[0.0, 0.0, 2.1e-3]]), THICKNESS_M, "same")
 
 
-def test_magnetisation_at_the_half_field():
+def test_magnetisation_at_the_half_field_is_half_of_saturation():
     for b_T in rng_for(0, "magnet").normal(size=(50, 3)):
         strength_T = float(np.linalg.norm(b_T))
         j_T = magnet.magnetise(b_T[None], saturation_T=0.17, half_field_T=strength_T)[0]
         np.testing.assert_allclose(j_T, 0.17 / 2 * b_T / strength_T, rtol=1e-12)
 
 
-def test_magnetisation_limits():
+def test_magnetisation_is_saturated_in_strong_fields_and_cubic_in_weak_fields():
     direction = np.array([[2.0, -1.0, 2.0]]) / 3
     strong_T, weak_T = (magnet.magnetise(b * direction, saturation_T=0.1, half_field_T=0.5) for b in (5e3, 5e-3))
-    np.testing.assert_allclose(strong_T, 0.1 * direction, rtol=1e-11)  # relative deviation from saturation: u^-3
-    np.testing.assert_allclose(weak_T, 0.1e-6 * direction, rtol=2e-6)  # relative deviation from a cubic law: u^3
+    # In a strong field u, the relative deviation from saturation is u^-3.
+    np.testing.assert_allclose(strong_T, 0.1 * direction, rtol=1e-11)
+    # In a weak field u, the relative deviation from a cubic law is u^3.
+    np.testing.assert_allclose(weak_T, 0.1e-6 * direction, rtol=2e-6)
 
 
-def test_zero_field_has_no_magnetisation():
+def test_magnetisation_without_field_is_zero():
     assert not magnet.magnetise(np.zeros((1, 3)), saturation_T=0.1, half_field_T=0.5).any()
 
 
 def test_mean_magnetisation_equals_the_specification():
-    # The specification has 22-28 mT for phi Br = 0.11 T and B_half = 0.8 T.
+    # The specified mean is 22 to 28 mT for a saturation (phi Br) of 0.11 T and a half field (B_half) of 0.8 T.
     rest = place_nodes(THICKNESS_M)
     b_T = magnet.array_field(rest.nodes_m, THICKNESS_M, "checkerboard")
     j_T = np.linalg.norm(magnet.magnetise(b_T, saturation_T=0.11, half_field_T=0.8), axis=1)
     assert 22e-3 <= np.average(j_T, weights=rest.volumes_m3) <= 28e-3
 
 
-def test_far_field_of_a_uniform_skin_is_a_dipole():
+def test_uniformly_magnetised_skin_has_the_far_field_of_a_dipole():
     rest = place_nodes(THICKNESS_M)
     j_T = np.tile([0.0, 0.0, 0.1], (len(rest.nodes_m), 1))
     above_m = np.array([[0.0, 0.0, 1.0]])
     b_T = field(rest.nodes_m, magnet.moments(j_T, rest.volumes_m3), above_m)
     moment = 0.1 * 20e-3**2 * THICKNESS_M / mu_0
-    # tolerance: the skin is 1 mm off centre at a distance of 1 m (0.3 %)
+    # The tolerance is 0.3 %, because the skin is 1 mm off centre at a distance of 1 m.
     np.testing.assert_allclose(b_T[0, 2], 2 * MU0_4PI * moment, rtol=5e-3)
 
 
 @pytest.mark.parametrize("polarity", ["checkerboard", "same"])
-def test_array_is_the_sum_of_its_cubes(polarity):
+def test_field_of_the_array_is_the_sum_of_the_fields_of_its_cubes(polarity):
     cubes_n, side_m = (3, 2), magnet.CUBE_SIDE_M
     truth_T = np.zeros_like(NODES_M)
     for i in range(cubes_n[0]):

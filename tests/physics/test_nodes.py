@@ -1,4 +1,7 @@
-"""Tests of the quadrature nodes of the skin: total volume, exact polynomials, cells end at the seams of the magnets."""
+"""Tests of the nodes at which integrals over the skin are computed, each with a weight (quadrature).
+
+The skin is divided into cells, which must fill it and end at the seams between the magnets.
+"""
 
 from itertools import pairwise, product
 
@@ -23,7 +26,7 @@ rules = st.builds(Quadrature, cell_m=st.floats(0.3e-3, 5e-3), layers_n=st.intege
 
 
 @given(st.floats(2e-4, 1e-2), rules)
-def test_cells_fill_the_skin(thickness_m, rule):
+def test_weights_of_all_nodes_sum_to_the_volume_of_the_skin(thickness_m, rule):
     rest = place_nodes(thickness_m, rule)
     volume_m3 = SKIN_SIDE_M**2 * thickness_m
     np.testing.assert_allclose(rest.volumes_m3.sum(), volume_m3, rtol=1e-12)
@@ -31,7 +34,7 @@ def test_cells_fill_the_skin(thickness_m, rule):
 
 
 @given(rules)
-def test_cells_have_at_most_the_given_width_and_end_at_seams(rule):
+def test_cells_end_at_seams_and_are_not_wider_than_the_given_width(rule):
     x_m = np.unique(place_nodes(THICKNESS_M, rule).nodes_m[:, 0])
     marks_m = np.array([-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2])
     for a_m, b_m in pairwise(marks_m):
@@ -41,7 +44,7 @@ def test_cells_have_at_most_the_given_width_and_end_at_seams(rule):
         np.testing.assert_allclose(inside_m, a_m + width_m * (0.5 + np.arange(len(inside_m))), atol=1e-12)
 
 
-def test_seams_are_those_of_the_magnet_array():
+def test_seams_between_cells_are_those_of_the_magnet_array():
     np.testing.assert_allclose(SEAMS_M, CUBE_SIDE_M * np.array([-1, 0, 1]))
 
 
@@ -54,7 +57,8 @@ def test_cells_fill_skins_of_any_size(x_m, y_m, rule):
         along_m = np.unique(rest.nodes_m[:, axis])
         for a_m, b_m in pairwise(marks_m):
             inside_m = along_m[(a_m < along_m) & (along_m < b_m)]
-            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first node is half a cell away from the edge
+            # The first node is half a cell away from the edge.
+            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))
             assert cells_n == len(inside_m)
             assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
 
@@ -68,14 +72,14 @@ def test_nodes_of_the_papers_skin_are_unchanged():
     np.testing.assert_array_equal(rest.nodes_m, naive_m)
 
 
-def test_six_layers_integrate_polynomials_of_degree_eleven():
+def test_six_layers_of_nodes_integrate_polynomials_of_degree_eleven_exactly():
     rest = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE)
     for power in range(12):
         mean = rest.volumes_m3 @ (rest.nodes_m[:, 2] / THICKNESS_M) ** power / rest.volumes_m3.sum()
         np.testing.assert_allclose(mean, 1 / (power + 1), rtol=1e-12)
 
 
-def test_error_falls_with_the_square_of_the_cell():
+def test_quadrature_error_falls_with_the_square_of_the_cell_size():
     def error(cell_m):
         rest = place_nodes(THICKNESS_M, Quadrature(cell_m, 1))
         wave = np.cos(300 * rest.nodes_m[:, 0]) * np.cos(200 * rest.nodes_m[:, 1])
@@ -83,8 +87,8 @@ def test_error_falls_with_the_square_of_the_cell():
         truth = 4 * np.sin(300 * half_m) / 300 * np.sin(200 * half_m) / 200 * THICKNESS_M
         return abs(rest.volumes_m3 @ wave / truth - 1)
 
-    # Cell sizes are 6.35 mm and 3.65 mm divided by powers of two, so every step halves all cells. Tolerance 5 %: the
-    # error of next order.
+    # Cell sizes are 6.35 mm and 3.65 mm divided by powers of two, so every step halves all cells. The tolerance of 5 %
+    # allows for the error of next order.
     coarse, fine = error(6.35e-3 / 8), error(6.35e-3 / 16)
     assert coarse / fine == pytest.approx(4, rel=0.05)
 
@@ -103,6 +107,6 @@ def test_nodes_are_symmetric_under_rotation_by_90_degrees():
     ("thickness_m", "cell_m", "layers_n"),
     [v for v in product((0.0, -1e-3, np.nan, 2e-3), (0.0, np.nan, 5e-4), (0, 6)) if v != (2e-3, 5e-4, 6)],
 )
-def test_empty_skin_or_rule_is_refused(thickness_m, cell_m, layers_n):
+def test_skin_or_quadrature_of_size_zero_is_refused(thickness_m, cell_m, layers_n):
     with pytest.raises(ParamsError, match="thickness, cell and layers must be above 0"):
         place_nodes(thickness_m, Quadrature(cell_m, layers_n))

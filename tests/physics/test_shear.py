@@ -1,4 +1,7 @@
-"""Tests of shear under a dragged tip against 50-digit arithmetic, a boundary value problem, published solutions."""
+"""Tests of the shear of the skin under a dragged tip.
+
+References are 50-digit arithmetic, a boundary value problem and published solutions.
+"""
 
 import mpmath
 import numpy as np
@@ -23,13 +26,19 @@ forces_N = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(np.array)
 
 
 def of_shape(chi, radius_m):
-    """Return a traction of radius a whose 2-D Fourier transform is the integral of chi(x / a) cos(k x) dx."""
+    """Return a traction on a contact of radius a, given by the function chi.
+
+    The two-dimensional Fourier transform of the traction is the integral of chi(x / a) cos(k x) dx.
+    """
     weights = layer.CONTACT_W * chi(layer.CONTACT_X)
     return Traction(radius_m, radius_m * layer.CONTACT_X, weights / weights.sum())
 
 
 def hertzian(radius_m=1.5e-3):
-    """Return q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2) for Q = 1; its transform is 3 (sin ka - ka cos ka) / (ka)^3."""
+    """Return the traction q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2) for Q = 1.
+
+    Its Fourier transform is 3 (sin ka - ka cos ka) / (ka)^3.
+    """
     return of_shape(lambda x: 1 - x**2, radius_m)
 
 
@@ -38,7 +47,7 @@ def sliding(depth_m=0.6e-3):
 
 
 def displacement_m(traction, places_m, thickness_m=H_M):
-    """Return the displacement in m for a force Q along x that equals the shear modulus G in value (Q / G = 1 m^2)."""
+    """Return the displacement in m at the given places for Q / G = 1 m^2 (Q: force along x, G: shear modulus)."""
     found = []
     for x, y, z in np.atleast_2d(places_m):
         r, f = np.hypot(x, y), np.arctan2(y, x)
@@ -72,7 +81,7 @@ def displace(
 
 
 @given(st.floats(0.01, 200), st.floats(0, 1))
-def test_response_of_the_layer_equals_50_digit_arithmetic(kh, share):
+def test_response_of_the_layer_to_a_wave_equals_50_digit_arithmetic(kh, share):
     with mpmath.workdps(250):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh * share)
         size = mpmath.cosh(a) ** 2 + a**2
@@ -90,13 +99,16 @@ def test_response_of_the_layer_equals_50_digit_arithmetic(kh, share):
         ]
     found = shear.wave_response(np.array([[kh * share]]), np.array([kh]))
     found = [found.w, found.w_slope, found.w_spin, found.v, found.v_slope]
-    # tolerance relative to a traction of 1; rounding of kz adds 1e-16 kh to the exponents
+    # The tolerance is relative to a traction of 1. Rounding of kz adds 1e-16 kh to the exponents.
     np.testing.assert_allclose([part[0, 0] for part in found], [float(part) for part in truth], atol=1e-13)
 
 
 @pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
-def test_response_solves_the_boundary_value_problem(kh):
-    """Reference: equilibrium and Hooke's law for k = G = 1, in the plane of the wave and perpendicular to it."""
+def test_response_of_the_layer_to_a_wave_solves_the_boundary_value_problem(kh):
+    """Reference: a numerical solution of equilibrium and Hooke's law for k = G = 1.
+
+    It has a part in the plane of the wave and a part perpendicular to this plane.
+    """
 
     def slopes(_z, state):
         along, up, shearing, normal, across, across_stress = state
@@ -118,30 +130,35 @@ def test_response_solves_the_boundary_value_problem(kh):
         "v_slope": across_stress,
     }
     for name, values in parts.items():
-        # 100 times the solver's tolerance
+        # The tolerance is 100 times that of the numerical solver.
         np.testing.assert_allclose(getattr(found, name)[:, 0], values, atol=1e-6, err_msg=name)
 
 
-def test_boundary_conditions_of_short_waves():
+def test_short_waves_satisfy_the_boundary_conditions():
     kh = np.geomspace(1e-3, 500, 40)
     base, top = shear.wave_response(np.zeros((1, 40)), kh), shear.wave_response(kh[None], kh)
     np.testing.assert_allclose([base.w, base.w_slope, base.v], 0, atol=1e-15)
-    np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)  # w'' + w = 2 is the stress T at the surface
+    # In terms of w, the condition that the shear stress at the surface is the traction T is w'' + w = 2.
+    np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
 
 
-def test_bettis_reciprocity_with_pressure():
-    """Betti: pressure does as much work on the displacement by traction as traction on the displacement by pressure."""
+def test_shear_and_pressure_satisfy_bettis_reciprocity_theorem():
+    """By Betti's theorem, two kinds of work are equal.
+
+    Pressure on the displacement by the traction does as much work as the traction on the displacement by the pressure.
+    """
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
 
 
 @pytest.mark.parametrize("radius_m", [0.6e-3, 1.5e-3])
-def test_surface_equals_johnsons_half_space_minus_the_effect_of_the_base(radius_m):
+def test_surface_displacement_equals_johnsons_half_space_minus_the_effect_of_the_base(radius_m):
     traction, r_m = hertzian(radius_m), np.linspace(0, radius_m, 12)
     found = shear.evaluate_map(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
-    # Johnson 1985, 3.91 at nu = 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 - 3.5 y^2), u_y = pi q0 / 32 G a x y
+    # Johnson, Contact Mechanics (1985), equation 3.91 for Poisson's ratio 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 -
+    # 3.5 y^2), u_y = pi q0 / 32 G a x y
     free = 3 / (64 * radius_m**3) * np.stack([6 * radius_m**2 - 3 * r_m**2, r_m**2 / 2])
 
     def held(k, r, order):
@@ -151,11 +168,11 @@ def test_surface_equals_johnsons_half_space_minus_the_effect_of_the_base(radius_
         return 3 * (np.sin(ka) - ka * np.cos(ka)) / ka**3 * missing * jv(order, k * r) / (8 * np.pi)
 
     base = [[quad(held, 1e-3, 25 / H_M, args=(r, order), limit=200)[0] for r in r_m] for order in (0, 2)]
-    # 1 % of the displacement in the middle: waves shorter than 0.3 mm are missing
+    # The tolerance is 1 % of the displacement in the middle, because waves shorter than 0.3 mm are omitted.
     np.testing.assert_allclose(found, free - np.array(base), atol=0.01 * found[0, 0])
 
 
-def test_traction_is_the_only_shear_stress():
+def test_shear_stress_at_the_surface_equals_the_traction():
     traction, step_m = hertzian(), 4e-6
     r_m, f = np.linspace(0, 0.9, 10) * traction.radius_m, np.linspace(0, 3, 10)
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full(10, H_M)], axis=1)
@@ -166,7 +183,7 @@ def test_traction_is_the_only_shear_stress():
         for e in step_m * np.eye(3)[:2]
     ]
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
-    # 2 % of the peak: waves shorter than 0.3 mm are missing
+    # The tolerance is 2 % of the peak, because waves shorter than 0.3 mm are omitted.
     np.testing.assert_allclose(along_z[:, 0] + slope[0], q_per_m2, atol=0.02 * q_per_m2[0])
     np.testing.assert_allclose(along_z[:, 1] + slope[1], 0, atol=0.02 * q_per_m2[0])
 
@@ -178,8 +195,8 @@ def test_every_horizontal_plane_carries_the_force(traction):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
         along = shear.evaluate_map(traction, r_m, z, thickness_m=H_M)[..., 0]
         slope = (-3 * along[:, 0] + 4 * along[:, 1] - along[:, 2]) / (2 * step_m)
-        # The integral of u_x,z; that of u_z,x is zero. At a distance of 12 h, shear has decayed to exp(-0.74 * 12)
-        # times the area.
+        # The force is G times the integral of u_x,z over the plane; the integral of u_z,x is zero. At a distance of 12
+        # h, shear has decayed to exp(-0.74 * 12) times the area.
         assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
 
 
@@ -187,46 +204,48 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
     traction, places_m = sliding(), random_places_m()
     grad = gradients(traction, places_m)
     size = np.abs(grad).max()
-    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # error of central differences
+    # The tolerance is the error of central differences.
+    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)
     truth = np.stack(
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
     table = shear.tabulate(traction, H_M)
     found = displace([YOUNG_PA / 3, 0], places_m, table, centre_m=(0, 0)).half_curl
-    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # error of central differences and of the table
+    # The tolerance is the error of central differences and of the table.
+    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)
 
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
-def test_table_equals_direct_integration(force):
+def test_tabulated_displacement_equals_direct_integration(force):
     traction, places_m = sliding(), random_places_m(top=1.0)
     found = displace(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
     truth_m = displacement_m(traction, places_m @ turn) @ turn.T
-    # the table has steps of 25 um
+    # The tolerance is the error of interpolation between places of the table, which are 25 um apart.
     np.testing.assert_allclose(found.displacement_m, truth_m, atol=1e-3 * np.abs(truth_m).max())
 
 
 @pytest.mark.parametrize("radius_m", [0.05e-3, 0.3e-3])
-def test_stiffness_on_thick_layers_equals_mindlin(radius_m):
+def test_stiffness_on_thick_layers_equals_mindlins_formula(radius_m):
     assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
     # u is the mean displacement, weighted by the traction q ~ sqrt(a^2 - r^2). The mean of 6 a^2 - 3 r^2 is 24/5 a^2,
     # so u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a.
     assert shear.tangential_stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 
 
-def test_thin_layer_shears_uniformly():
+def test_thin_layer_under_a_wide_contact_shears_uniformly():
     wide_m = np.array([4.0, 5.0, 6.0]) * H_M
     blocks_m = np.sqrt(
         [H_M / np.pi * shear.tangential_stiffness_m(shear.stick_traction(a_m, H_M), H_M) for a_m in wide_m]
     )
-    # The stiffness is k_t = pi G (a + seam)^2 / h, with an equal `seam` for all radii a, up to terms of (h / a)^2.
+    # The stiffness is k_t = pi G (a + seam)^2 / h, where `seam` is equal for all radii a, up to terms of (h / a)^2.
     np.testing.assert_allclose(np.diff(blocks_m), H_M, rtol=5e-3)
     seam = (blocks_m - wide_m) / H_M
     assert ((seam > 0.5) & (seam < 1)).all()
     middle_m = shear.evaluate_map(
         shear.stick_traction(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M
     )[0, :, 0]
-    # expected in the middle: u = q z / G, because the edges are 3 h away
+    # In the middle, the expected displacement is u = q z / G, because the edges of the contact are 3 h away.
     np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)
 
 
@@ -237,30 +256,33 @@ def test_sticking_contact_moves_rigidly():
             :, 0, :2
         ].T
         mean_per_m = 1 / shear.tangential_stiffness_m(traction, H_M)
-        # the traction is infinite at the edge, which waves of 0.3 mm do not resolve
+        # At the edge, the traction is infinite, which waves of 0.3 mm do not resolve. Therefore only the inner part is
+        # compared.
         np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)
-        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # error of assuming an axisymmetric traction
+        # The tolerance is the error of assuming that the traction is axisymmetric.
+        assert np.abs(parts[1]).max() < 0.05 * mean_per_m
 
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
-def test_traction_of_a_sticking_contact_is_the_stiffest(a_h, square, fourth):
-    """Thomson's theorem: of all tractions with equal total force, that of a rigid contact stores the least energy."""
+def test_traction_of_a_sticking_contact_has_the_greatest_stiffness(a_h, square, fourth):
+    """Of all tractions with equal total force, that of a rigid contact stores the least energy (Thomson's theorem)."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
 
 
-def test_stiffness_formula_is_at_most_5_percent_too_stiff():
+def test_stiffness_formula_overestimates_by_at_most_5_percent():
     a_m = np.geomspace(0.01, 6, 40) * H_M
     ratio = [shear.tangential_stiffness_m(shear.stick_traction(a, H_M), H_M) for a in a_m] / (
         16 / 3 * a_m + np.pi * a_m**2 / H_M
     )
-    # The formula is exact in both limits. The axisymmetric sticking contact is at most as stiff as the true one.
+    # The formula is exact for thick and for thin layers. An axisymmetric traction gives at most the stiffness of the
+    # true sticking contact.
     assert ratio.max() < 1
     assert ratio.min() == pytest.approx(0.955, abs=0.005)
 
 
-def test_sliding_is_19_to_20_percent_softer_than_sticking():
+def test_sliding_contact_is_19_to_20_percent_softer_than_a_sticking_one():
     tractions = [sliding(float(depth_m)) for depth_m in DEPTHS_M]
     ratio = [
         shear.tangential_stiffness_m(t, H_M) / shear.tangential_stiffness_m(shear.stick_traction(t.radius_m, H_M), H_M)
@@ -270,7 +292,7 @@ def test_sliding_is_19_to_20_percent_softer_than_sticking():
 
 
 @given(forces_N, forces_N, st.floats(-3, 3))
-def test_displacement_is_linear(one_N, other_N, times):
+def test_displacement_is_linear_in_the_force(one_N, other_N, times):
     nodes_m = random_places_m(30)
     both = displace(one_N + times * other_N, nodes_m)
     first, second = displace(one_N, nodes_m), displace(other_N, nodes_m)
@@ -287,16 +309,18 @@ def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
         displace(force_N, nodes_m, centre_m=(0, 0)),
         displace(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
-    # rounding may move a node at the edge of a table cell to the next cell, which has the same value there
+    # The node may be at the edge of a table cell, and rounding may move it to the next cell. Both cells have the same
+    # value there.
     np.testing.assert_allclose(rotated.displacement_m, unrotated.displacement_m @ turn.T, atol=1e-10)
     np.testing.assert_allclose(rotated.half_curl, unrotated.half_curl @ turn.T, atol=1e-9)
 
 
-def test_mirror_symmetry_along_the_force():
+def test_displacement_is_symmetric_under_reflection_along_the_force():
     nodes_m, mirror = random_places_m(), np.array([1, -1, 1])
     here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
-    np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)  # the curl is an axial vector
+    # The curl is an axial vector, so its components along the reflected plane change sign.
+    np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)
     back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
@@ -305,28 +329,28 @@ def test_skin_moves_with_the_tip_and_rotates_forward():
     middle = displace([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()
-    assert (middle.half_curl[:, 1] > 0).all()  # rotation from z towards x
+    assert (middle.half_curl[:, 1] > 0).all()  # The rotation is from z towards x.
     assert not middle.half_curl[:, [0, 2]].any()
 
 
 def test_base_and_far_nodes_do_not_move():
     base = displace([0.5, 0.3], random_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
-    assert base.half_curl.any()  # the material at the base shears and therefore rotates
+    assert base.half_curl.any()  # The material at the base shears, and therefore rotates, although it does not move.
     away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
     assert not away.displacement_m.any()
     assert not away.half_curl.any()
 
 
-def test_displacement_beyond_the_reach_is_below_half_a_percent():
+def test_displacement_beyond_the_range_of_the_table_is_below_half_a_percent():
     for depth_m in DEPTHS_M:
         table = shear.tabulate_depth(float(depth_m), **SKIN)
         assert np.abs(table.parts[-1, :, :3]).max() < 0.005 * table.parts[..., 0].max()
 
 
-@settings(max_examples=10, deadline=None)  # each example computes a table in 20 ms
+@settings(max_examples=10, deadline=None)  # Fewer examples than usual, because each computes a table in 20 ms.
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
-def test_displacement_scales_with_size_and_stiffness(size, hardness):
+def test_displacement_scales_with_the_size_and_the_inverse_stiffness(size, hardness):
     nodes_m = random_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
     here = displace([0.5, 0.2], nodes_m, centre_m=(0, 0))
@@ -341,9 +365,9 @@ def test_displacement_scales_with_size_and_stiffness(size, hardness):
     np.testing.assert_allclose(scaled.half_curl, here.half_curl, atol=1e-9)
 
 
-# tolerance: squares of numbers below 1e-150 lose digits
+# The absolute tolerance is for numbers below 1e-150, whose squares lose digits.
 @given(st.floats(-20, 20).filter(lambda amount: amount == 0 or abs(amount) > 1e-150), st.floats(-np.pi, np.pi))
-def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad):
+def test_rotation_in_simple_shear_equals_that_of_the_polar_decomposition(amount, towards_rad):
     ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
     truth, _ = polar(np.eye(3) + amount * np.outer(ahead, [0, 0, 1]))
     half_curl = amount / 2 * np.array([[-ahead[1], ahead[0], 0]])
@@ -355,18 +379,21 @@ def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad
     assert np.linalg.norm(axis) == pytest.approx(1)
 
 
-def test_mean_displacement_of_the_traction_is_force_over_stiffness():
+def test_mean_displacement_weighted_by_the_traction_is_force_over_stiffness():
     traction = hertzian()
     table, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
     surface_per_m = np.interp(r_m, table.r_m, table.parts[:, -1, 0])
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
     mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
-    # Tolerance: waves shorter than 0.3 mm are missing.
+    # The tolerance allows for waves shorter than 0.3 mm, which are omitted.
     assert mean_per_m == pytest.approx(1 / table.stiffness_m, rel=1e-3)
 
 
 def shear_in_many_steps(force_N, nodes_m, table, steps_n):
-    """Reference: apply the force in many small steps; each moves nodes and traction. The contact starts at 0."""
+    """Return a reference: the nodes after the force has been applied in many small steps.
+
+    Each step moves the nodes and the traction. The contact starts at 0.
+    """
     at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / table.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
@@ -375,9 +402,9 @@ def shear_in_many_steps(force_N, nodes_m, table, steps_n):
     return at_m - nodes_m
 
 
-def test_midpoint_steps_equal_many_small_steps():
+def test_midpoint_steps_equal_many_small_steps_of_force():
     nodes_m, over = [0.5, 0.5, 1] * random_places_m(200), []
-    # friction coefficients 0.8, 0.4, 0.8; the code takes 1, 1, 2 steps
+    # The friction coefficients are 0.8, 0.4 and 0.8. For them, the code takes 1, 1 and 2 midpoint steps.
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):
         table = shear.tabulate_depth(depth_m, **SKIN)
         truth_m = shear_in_many_steps([force_N, 0], nodes_m, table, 48)
@@ -389,20 +416,22 @@ def test_midpoint_steps_equal_many_small_steps():
         assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
     assert over[0] < 0.02
     assert over[2] < 0.05
-    assert over[1] < over[0] / 3  # below the 4 of a second-order method, because the interpolated table has kinks
+    # A second-order method would reduce the error to a quarter. The factor is smaller, because the interpolated table
+    # has kinks.
+    assert over[1] < over[0] / 3
 
 
-def test_small_force_needs_no_midpoint_step():
+def test_small_force_needs_no_midpoint():
     nodes_m = random_places_m()
     once, half_way = (
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
     )
     size_m = np.abs(once.displacement_m).max()
-    # tolerance: midpoints are displaced by half of 0.1 um, and the displacement field varies over 1 mm
+    # Tolerance: the midpoints differ by half of 0.1 um from the start, and the displacement field varies over 1 mm.
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
 
 
-def test_displacement_of_moved_nodes_rotates_with_the_force():
+def test_displacement_of_already_moved_nodes_rotates_with_the_force():
     nodes_m, turn = random_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     here = displace([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
     rotated = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
@@ -412,16 +441,16 @@ def test_displacement_of_moved_nodes_rotates_with_the_force():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
-def test_steepest_gradient_of_the_table(traction):
+def test_steepest_gradient_of_the_table_is_that_of_its_places(traction):
     table, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
     largest = np.linalg.norm(displace(force_N, places_m, table, (0, 0)).half_curl, axis=1).max()
-    # tolerance: rounding moves places off the points of the table
+    # Tolerance: rounding moves places away from the points of the table.
     assert table.steepest_per_m2 == pytest.approx(largest, rel=1e-6)
 
 
-def test_nodes_above_the_surface_move_with_it():
+def test_nodes_above_the_surface_move_with_the_surface():
     rim_m = np.array([[2e-3, 1e-3, 1.1 * H_M], [2e-3, 1e-3, H_M]])
     rim, surface = displace([0.5, 0.2], rim_m).displacement_m
     np.testing.assert_array_equal(rim, surface)
@@ -445,7 +474,8 @@ def test_midpoint_steps_conserve_volume(depth_m, force_N, loss):
         ]
         grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)
         losses.append(np.abs(np.linalg.det(np.eye(3) + grad) - 1))
-    assert losses[1].max() < loss  # the loss grows with the gradient; midpoint steps are of second order
+    # The loss of volume grows with the gradient of the displacement, because midpoint steps are of second order.
+    assert losses[1].max() < loss
     assert losses[0].max() > 4 * losses[1].max()
     assert losses[0].mean() > 4 * losses[1].mean()
 

@@ -1,4 +1,8 @@
-"""Tests of the field change by a poke against a naive loop; quadrature, symmetries, no contact, amplitude, sliding."""
+"""Tests of the field change by a poke.
+
+It is compared with a loop over all dipoles, and tested for symmetries, pokes without contact, its amplitude, and skins
+that slide.
+"""
 
 import numpy as np
 import pytest
@@ -19,12 +23,13 @@ from tests.physics.test_board import draw_board, no_spread, spreads
 EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
-PEAK_T = 1e-3  # magnitude of the fields; tolerances for rounding are relative to this value
-# COARSE: quadrature for tests of laws that hold with any quadrature. SPARSE: quadrature for tests with many skins.
+PEAK_T = 1e-3  # The order of magnitude of the fields. Tolerances for rounding are relative to this value.
+# Two quadratures (grids of nodes). COARSE is for tests of laws that hold with any quadrature. SPARSE is for tests with
+# many skins, which need speed.
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
-DEPTH_M = 0.6e-3  # the tested laws hold at any depth; a single depth needs only one table
+DEPTH_M = 0.6e-3  # The tested laws hold at any depth. All tests use the same depth, so that a single table is computed.
 places_m = st.floats(-8e-3, 8e-3)
-# No deadline: the first example computes the tables of all examples.
+# There is no deadline, because the first example computes the tables for all examples.
 patient = settings(max_examples=20, deadline=None)
 
 
@@ -62,7 +67,7 @@ def table_of(one, rest, depth_m):
 
 
 def change_by_loop(one, board, poke_m):
-    """Reference: sum the field differences of all moving nodes in a loop."""
+    """Return the reference: the sum of the field differences of all moving nodes, in a loop."""
     moved, total_T = move_dipoles(one, poke_m), np.zeros_like(board.chips_m)
     for i, place, after in zip(moved.i, *moved.after, strict=True):
         for chip_i, chip in enumerate(board.chips_m):
@@ -78,7 +83,7 @@ def one_dipole(position, moment, chip):
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_poke_equals_loop_over_rotated_dipoles(base):
+def test_field_change_by_a_poke_equals_a_loop_over_rotated_dipoles(base):
     one, poke_m = skin(UNEVEN, base=base), (1.1e-3, -2.3e-3, 0.7e-3)
     truth_T = change_by_loop(one, BOARD, poke_m)
     np.testing.assert_allclose(change(poke_m, one), truth_T, atol=1e-12 * PEAK_T)
@@ -101,10 +106,10 @@ def test_moments_beside_the_tip_rotate_towards_the_dent():
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.2e-3, 1.0e-3])
-def test_error_of_the_quadrature_in_use(depth_m, base):
-    # Compares field changes, not fields at rest. The magnet pattern is shifted, so that no symmetry hides errors. For a
-    # shallow indentation over a seam, 2 % would be below the resolution of a chip: there the limit is a tenth of the
-    # chip's noise of 3.3 uT.
+def test_error_of_the_default_quadrature_is_below_2_percent(depth_m, base):
+    # Field changes are compared with those of finer quadratures. The pattern of the magnets is shifted relative to the
+    # chips, so that no symmetry hides errors. For a shallow indentation over a seam, 2 % would be below the resolution
+    # of a chip: there the limit is a tenth of the chip's noise of 3.3 uT.
     rules = (
         DEFAULT_QUADRATURE,
         Quadrature(DEFAULT_QUADRATURE.cell_m / 2, DEFAULT_QUADRATURE.layers_n),
@@ -116,7 +121,7 @@ def test_error_of_the_quadrature_in_use(depth_m, base):
 
 
 def test_field_change_without_rotation_of_moments_is_wrong():
-    # Without rotation of the moments, the field change dB is wrong by 156-242 % for indentations on the grid.
+    # If the moments are moved but not rotated, the field change dB is wrong by 156 to 242 % for pokes on the grid.
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
         moved = move_dipoles(one, (*place, DEPTH_M))
@@ -127,14 +132,14 @@ def test_field_change_without_rotation_of_moments_is_wrong():
     assert np.sum(wrong) > np.sum(size)
 
 
-def test_field_at_rest_equals_loop_over_dipoles():
+def test_field_at_rest_equals_a_loop_over_dipoles():
     one = skin(UNEVEN)
     truth_T = sum(one_dipole(n, m, BOARD.chips_m[3]) for n, m in zip(one.nodes_m, one.moments_A_m2, strict=True))
     rest_T, _ = changes_of_field(BOARD, one, np.zeros((0, 3)))
     np.testing.assert_allclose(rest_T[3], truth_T, atol=1e-12 * PEAK_T)
 
 
-def test_change_equals_difference_of_sums():
+def test_field_change_equals_the_difference_of_two_fields():
     one, poke_m = skin(UNEVEN), (1.1e-3, -2.3e-3, 1e-3)
     moved = move_dipoles(one, poke_m)
     places_m, moments = one.nodes_m.copy(), one.moments_A_m2.copy()
@@ -154,12 +159,12 @@ def test_stability_cases_hold_for_extreme_skins_and_pokes(base):
         *stability.amplitude(BOARD, usual, bare, strong), stability.same_seed(usual, again, renamed),
     ]  # fmt: skip
     assert not broken(cases)
-    assert not change((1e-3, 2e-3, -usual.depth_zero_m), usual).any()  # the tip touches without indenting
+    assert not change((1e-3, 2e-3, -usual.depth_zero_m), usual).any()  # The tip touches the skin without indenting it.
 
 
 @patient
 @given(places_m, places_m, st.sampled_from(["checkerboard", "same"]), st.sampled_from(["bonded", "slipping"]))
-def test_symmetries_of_board_and_poke(x_m, y_m, polarity, base):
+def test_field_change_has_the_symmetries_of_board_and_skin(x_m, y_m, polarity, base):
     even = skin(polarity=polarity, base=base)
     assert not broken(mechanics.symmetries(BOARD, even, polarity, np.array([[x_m, y_m]])))
 
@@ -171,13 +176,13 @@ def test_change_is_proportional_to_magnetisation(x_m, y_m, factor):
     assert mechanics.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
 
 
-def test_high_tip_makes_no_contact():
+def test_tip_above_a_thin_skin_changes_nothing():
     high = next(s for s in (skin(UNEVEN, f"s{i}", SPARSE) for i in range(50)) if s.depth_zero_m < -0.05e-3)
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
 def test_shifting_skin_or_poke_and_board_is_equivalent():
-    # Shifting the skin is equivalent to shifting poke and chips in the opposite direction.
+    # Shifting the skin is equivalent to shifting the poke and the chips in the opposite direction.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
     shift_m = np.append(seated.seat_m, 0.0)
@@ -189,8 +194,8 @@ def test_shifting_skin_or_poke_and_board_is_equivalent():
 
 
 def test_wider_skin_changes_nothing_far_from_its_edges():
-    # 8 and 12 magnets are both even numbers, so the same poles are over the chips, which are 25 mm or more from the
-    # edges.
+    # Both numbers of magnets, 8 and 12, are even. Therefore the same poles are over the chips, which are at least 25 mm
+    # away from the edges.
     wide, wider = (
         draw_skin(design(), EXACT, seed=0, name="s0", rule=COARSE, sides_m=(side_m, side_m))
         for side_m in (50.8e-3, 76.2e-3)
@@ -203,7 +208,7 @@ def test_wider_skin_changes_nothing_far_from_its_edges():
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
 
-def test_pokes_are_accepted_up_to_the_edges():
+def test_pokes_up_to_the_edges_of_the_skin_are_accepted():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):
@@ -211,14 +216,14 @@ def test_pokes_are_accepted_up_to_the_edges():
             change((*place_m, DEPTH_M), large)
 
 
-def test_many_pokes_equal_single_pokes():
+def test_pokes_computed_together_equal_single_pokes():
     pokes_m = np.array([[0.0, 0.0, 1.1e-3], [3e-3, -8e-3, 0.23e-3], [1e-3, 1e-3, 0.0]])
     _, together = changes_of_field(BOARD, skin(), pokes_m)
     for poke_m, of_many in zip(pokes_m, together, strict=True):
         np.testing.assert_array_equal(of_many, change(poke_m))
 
 
-@pytest.mark.parametrize(  # covers each pair of base, thickness and kind of depth once
+@pytest.mark.parametrize(  # The four cases cover each pair of base, thickness and kind of depth once.
     ("base", "thickness_mm", "at", "error"),
     [
         ("bonded", 1.82, 0.0, 0.003),
@@ -227,10 +232,10 @@ def test_many_pokes_equal_single_pokes():
         ("slipping", 2.0, 0.0, 0.003),
     ],
 )
-def test_tables_equal_following_nodes(thickness_mm, at, error, base):
-    # A thickness of 1.82 mm is halfway between two tables. At tabulated depths, the error is that of interpolation in
-    # R/h and r. Between tabulated depths, the error is 0.6 %: the reference then ends with half a step of
-    # `deformation.STEP`, which changes dB by this much.
+def test_field_change_from_tables_equals_that_of_nodes_moved_in_steps(thickness_mm, at, error, base):
+    # A thickness of 1.82 mm is halfway between two tables. At the depths of the tables, the error is that of
+    # interpolation in R/h (radius of the tip divided by the thickness) and in r. Between these depths, the error is 0.6
+    # %: the reference then ends with half a step of `deformation.STEP`, which changes dB by this much.
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
@@ -239,7 +244,7 @@ def test_tables_equal_following_nodes(thickness_mm, at, error, base):
             (float(poke_m[2]),), layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base)
         )
         truth = mechanics.follow_dipoles(one, poke_m[:2], depths_m)
-        # On a bonded base, nothing moves beyond the reach of the table.
+        # On a bonded base, nothing moves beyond the range of the table.
         near = np.linalg.norm(
             one.nodes_m[:, :2] - poke_m[:2], axis=1, keepdims=True
         ) < one.thickness_m * deformation.reach(one.tip_radius_m / one.thickness_m, base)
@@ -249,9 +254,9 @@ def test_tables_equal_following_nodes(thickness_mm, at, error, base):
         assert np.linalg.norm(change(poke_m, one) - truth_T) < error * np.linalg.norm(truth_T)
 
 
-def test_draws_have_the_given_spreads():
+def test_drawn_skins_have_the_given_spreads():
     skins = [skin(UNEVEN, f"s{i}", SPARSE) for i in range(100)]
-    # 25 %: three and a half standard errors 1 / sqrt(2 n) for 100 skins
+    # The tolerance of 25 % is three and a half standard errors, which are 1 / sqrt(2 n) each for n = 100 skins.
     assert np.std([one.seat_m for one in skins]) == pytest.approx(0.25e-3, rel=0.25)
     np.testing.assert_allclose([one.nodes_m[:, :2].mean(axis=0) for one in skins], [one.seat_m for one in skins])
     assert np.std([one.depth_zero_m for one in skins]) == pytest.approx(0.05e-3, rel=0.25)
@@ -259,19 +264,20 @@ def test_draws_have_the_given_spreads():
     assert np.std(np.log([one.modulus_Pa for one in skins])) == pytest.approx(0.1, rel=0.25)
 
 
-def test_filler_and_amplitude_scale_the_moments():
-    # Nodes of a single layer are at half height, where the field is zero at crossings of seams but not at nodes.
+def test_random_filler_and_amplitude_scale_the_moments():
+    # The nodes are in a single layer at half the height. At this height, the field is zero where seams cross, but not
+    # at the nodes.
     exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
         moments = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
         factors = np.log(np.array(moments) / exact)
-        assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # three standard errors for 60 skins
+        assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # The tolerance is three standard errors for 60 skins.
         assert (np.std(factors, axis=1).min() > 0.01) == within
 
 
-def test_field_at_rest_has_the_magnitude_of_recordings():
-    # Recorded in-plane fields at rest are up to 3.6 mT. The tolerance is a factor of two, because the simulated skin
-    # has the nominal amplitude.
+def test_field_at_rest_has_the_magnitude_of_recorded_fields():
+    # Recorded in-plane fields at rest are up to 3.6 mT. The tolerance is a factor of two, because the amplitude of the
+    # recorded skins differs from the nominal one.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
@@ -279,14 +285,16 @@ def test_field_at_rest_has_the_magnitude_of_recordings():
 
 def test_slipping_skin_is_softer_and_reaches_farther():
     bonded, slipping = skin(), skin(base="slipping")
-    # at a depth of 1.2 mm, the bonded skin is 1.8 times as stiff as the slipping one
+    # At a depth of 1.2 mm, the bonded skin is 1.8 times as stiff as the slipping one.
     assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))
-    far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]  # chip 3, 15 mm away
+    # Chip 3 is 15 mm away from the poke.
+    far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]
     assert far[1] > 10 * far[0]
 
 
 def test_force_equals_the_specification():
-    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # the specification has two digits
+    # The specification gives this force with two digits.
+    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)
 
 
 @pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])
@@ -295,7 +303,7 @@ def test_poke_beside_the_skin_is_refused(place_m):
         change((*place_m, DEPTH_M))
 
 
-def test_edge_for_pokes_is_the_edge_of_the_skin():
+def test_pokes_are_limited_by_the_edge_of_the_skin():
     one = skin(SEATED)
     corner_m = np.append(one.seat_m + np.sign(one.seat_m) * 9.99e-3, 0.0)
     assert np.abs(corner_m).max() > 10e-3
@@ -310,10 +318,10 @@ def test_invalid_depth_is_refused(depth_m):
         change((0.0, 0.0, depth_m))
 
 
-def test_unverified_depths_are_counted():
+def test_pokes_deeper_than_the_verified_depth_are_counted():
     one = skin()
     high, low = (type(one)(**{**one.__dict__, "depth_zero_m": zero_m}) for zero_m in (-0.1e-3, 0.1e-3))
-    depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # the model is verified up to a true depth of 1.2 mm
+    depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # The model is verified up to a true depth of 1.2 mm.
     assert [count_beyond_verified(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
 
 
@@ -324,7 +332,7 @@ def held_skin(spread=UNEVEN, **changes):
     return skin(spread, base="slipping", hold=HELD | changes)
 
 
-def test_held_skin_slides_rigidly():
+def test_skin_held_by_springs_slides_as_a_rigid_body():
     one, free = skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=30), skin(UNEVEN, base="slipping")
     poke_m = np.array([[3e-3, -2e-3, 0.7e-3]])
     [(_, _, free_m)] = moved_dipoles(free, poke_m)
@@ -333,8 +341,8 @@ def test_held_skin_slides_rigidly():
     assert np.abs(apart_m[:, 2]).max() == 0
     distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
     np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
-    # Without the limit by friction, the skin at the poke would move by `taken_m` (formula of `press_displacement_m`).
-    # Friction allows the fraction `share` of this move.
+    # If friction did not limit the motion, the skin would move by `taken_m` at the place of the poke (formula of
+    # `press_displacement_m`). Friction allows the fraction `share` of this move.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
@@ -347,7 +355,7 @@ def test_held_skin_slides_rigidly():
     np.testing.assert_array_equal(change(poke_m[0], without_slide), change(poke_m[0], free))
 
 
-def test_force_needed_on_a_skin_held_by_springs():
+def test_force_on_a_skin_held_by_springs_grows_faster_with_depth():
     one, free = held_skin(EXACT), skin(base="slipping")
     depth_m = np.array([0.4e-3, 1.0e-3])
     stiffer = (1 - depth_m / one.thickness_m) ** -1.5
@@ -356,12 +364,12 @@ def test_force_needed_on_a_skin_held_by_springs():
     assert not broken(stability.modulus(BOARD, held_skin(), soft, hard))
 
 
-def test_bonded_skin_is_not_held():
+def test_bonded_skin_held_by_springs_is_refused():
     with pytest.raises(ValueError, match="hold must be null for a bonded skin"):
         skin(base="bonded", hold=HELD)
 
 
-def test_rotated_skin_equals_rotated_board():
+def test_rotated_skin_equals_a_board_rotated_in_the_opposite_direction():
     rotated = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
     first = skin(base="slipping").nodes_m
     angle = np.arctan2(rotated.nodes_m[0, 1], rotated.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])

@@ -1,4 +1,7 @@
-"""Tests of the sliding of a finite skin: least drag over pieces, closed forms on a square, no sliding without force."""
+"""Tests of the rigid sliding of a finite skin on its base, which a press away from the middle causes.
+
+References are the motion of least drag, found numerically, and closed forms for a square.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +26,10 @@ def motion_of(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
 
 
 def drag_matrix(pieces_n, sides_m):
-    """Reference: return the matrix of the quadratic drag of a rigid motion (f_x, f_y, theta), summed over pieces."""
+    """Return the matrix of the drag of a rigid motion (f_x, f_y, theta), which is quadratic in the motion.
+
+    It is summed over small pieces of the skin.
+    """
     drag = np.zeros((3, 3))
     for i in range(pieces_n):
         for j in range(pieces_n):
@@ -34,10 +40,10 @@ def drag_matrix(pieces_n, sides_m):
 
 
 @pytest.mark.parametrize("sides_m", [SQUARE, (20e-3, 50e-3)])
-def test_motion_minimises_the_drag(sides_m):
+def test_rigid_motion_minimises_the_drag(sides_m):
     place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
-    # Reference: least drag for a given displacement at the place, by Lagrange multipliers. With 80 pieces per side,
-    # the squared radius of gyration rho^2 has a relative error of 1/80^2.
+    # Reference: the motion of least drag among those with the given displacement at the place, by Lagrange multipliers.
+    # With 80 pieces per side, the squared radius of gyration rho^2 has a relative error of 1/80^2.
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
     equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
@@ -46,7 +52,7 @@ def test_motion_minimises_the_drag(sides_m):
     np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
 
 
-def test_pull_at_the_edge_of_a_square():
+def test_pull_at_the_edge_of_a_square_moves_and_rotates_it_as_in_the_closed_form():
     # A square of side L is displaced by D along y at the place (L/2, 0). Expected: displacement of its middle
     # f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, and rotation theta = 6 f (L/2) / L^2 = 3 f / L.
     move_m, spin_rad = motion_of((SIDE_M / 2, 0.0), (0.0, 1e-4))
@@ -55,14 +61,15 @@ def test_pull_at_the_edge_of_a_square():
 
 
 @given(places_m, displacements_m)
-def test_skin_at_the_place_moves_by_the_given_displacement(place_m, taken_m):
+def test_motion_has_the_given_displacement_at_the_place(place_m, taken_m):
     move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
 @given(places_m, displacements_m)
-def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
+def test_motion_rotates_with_pull_and_place(place_m, taken_m):
+    """A pull along the line through the middle causes no rotation."""
     (move_m, spin_rad), quarter = motion_of(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = motion_of(quarter @ place_m, quarter @ taken_m)
     np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
@@ -70,15 +77,16 @@ def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
     assert motion_of(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
 
 
-def test_displacement_follows_force_and_distance():
+def test_displacement_of_the_skin_follows_force_and_distance_from_the_middle():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
-    # 7 um/mm at 4 mm from the middle is 28 um at zero force, and 14 um at half the force at which this slide vanishes.
+    # The slide per distance is 7 um/mm. At 4 mm from the middle, this is 28 um at zero force, and 14 um at half the
+    # force at which the slide vanishes.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
 @given(places_m, st.floats(1e3, 1e5))
-def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
+def test_motion_on_uniform_springs_equals_force_over_stiffness(place_m, springs_N_per_m):
     # On uniform springs of stiffness k, a force f moves the skin by f / k and rotates the skin by moment / (k rho^2),
     # where rho is the radius of gyration.
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
@@ -90,8 +98,8 @@ def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
 
 
 @given(places_m, displacements_m, st.floats(1e-6, 20.0))
-@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # dividing a force by this displacement overflows
-def test_friction_bounds_the_slide(place_m, taken_m, force_N):
+@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # Dividing a force by this tiny displacement overflows.
+def test_friction_limits_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
     whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)
     found = slide.limit_by_friction(whole, np.array([force_N]), hold.grip_N_per_m)
@@ -99,14 +107,14 @@ def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
     assert x * whole_y == pytest.approx(y * whole_x, rel=1e-12, abs=1e-24)
-    if moves:  # friction limits displacement and rotation by the same factor, 1 - exp(-mu F / k u)
+    if moves:  # Friction multiplies displacement and rotation by the same factor, 1 - exp(-mu F / k u).
         with np.errstate(over="ignore"):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
         np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
 
 
-def test_firm_press_moves_the_skin_by_the_full_slide():
+def test_firm_press_moves_the_skin_by_the_full_displacement():
     whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
         found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)
@@ -114,7 +122,7 @@ def test_firm_press_moves_the_skin_by_the_full_slide():
         np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
 
-def test_zero_slide_leaves_the_flow_on_a_slipping_base():
+def test_press_without_slide_leaves_the_deformation_on_a_slipping_base_unchanged():
     rng = np.random.default_rng(0)
     heights = (0.2, 0.8)
     nodes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (60, 2)), H_M * rng.choice(heights, 60)])
@@ -134,7 +142,7 @@ def test_zero_slide_leaves_the_flow_on_a_slipping_base():
     )
 
 
-def test_dipoles_rotate_about_the_middle():
+def test_dipoles_rotate_about_the_middle_of_the_skin():
     rng = np.random.default_rng(1)
     nodes_m, moments = rng.normal(0, 5e-3, (7, 3)), rng.normal(0, 1e-6, (7, 3))
     motion = slide.RigidMotion(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
@@ -153,15 +161,16 @@ TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
 
 
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
-def test_depth_inverts_force(depth_m, modulus_Pa):
+def test_depth_at_a_force_inverts_the_force_at_a_depth(depth_m, modulus_Pa):
     layer_settings = TIP | {"modulus_Pa": modulus_Pa}
     found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **layer_settings), **layer_settings)
     assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
-def test_force_limits():
+def test_force_has_the_limits_of_small_and_great_depth():
     layer_settings = TIP | {"modulus_Pa": 2e5}
-    np.testing.assert_allclose(  # incompressible: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2)
+    # For small depths, the force is that of Hertz for an incompressible material: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2).
+    np.testing.assert_allclose(
         slide.force_at(np.array([0.0, 1e-9]), **layer_settings),
         [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5],
         rtol=2e-3,
@@ -172,7 +181,8 @@ def test_force_limits():
     )
     assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(slide.DEEPEST * H_M)
     assert slide.count_clipped(np.array([1.0, 1e6]), **layer_settings) == 1
-    assert slide.force_at(np.array([-1e-6]), **layer_settings)[0] == 0  # the tip is above the skin
+    # At a negative depth, the tip is above the skin.
+    assert slide.force_at(np.array([-1e-6]), **layer_settings)[0] == 0
     for wrong_m in (H_M, np.nan):
         with pytest.raises(ParamsError, match="poke: depth must be finite and below"):
             slide.force_at(np.array([wrong_m]), **layer_settings)
@@ -180,7 +190,7 @@ def test_force_limits():
         slide.depth_at(np.array([1.0]), **(layer_settings | {"modulus_Pa": 0.0}))
 
 
-def test_sharp_tip_is_limited_by_its_radius():
+def test_depth_of_a_sharp_tip_is_limited_by_its_radius():
     layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
     assert slide.depth_at(np.array([0.1]), **layer_settings)[0] < 0.5e-3
     assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(0.999 * 0.5e-3)

@@ -1,4 +1,4 @@
-"""Tests of the slipping layer against a dense 50-digit solution, limits, and the bonded layer."""
+"""Tests of the layer on a slipping base against a dense 50-digit solution, limits, and the bonded layer."""
 
 import mpmath
 import numpy as np
@@ -15,62 +15,65 @@ waves_kh = st.floats(0.01, 30)
 
 @settings(max_examples=20, deadline=None)
 @given(waves_kh, st.floats(0.05, 0.95))
-def test_profile_and_compliance_equal_dense_solve(kh, share):
+def test_profile_and_compliance_equal_a_50_digit_solution(kh, share):
     with mpmath.workdps(50):
         w, z = mechanics.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
-    # tolerance 1e-10: for long waves, the profile is a difference of numbers that are larger by a factor 1 / (kh)^2
+    # The tolerance is 1e-10: for long waves, the profile is a difference of numbers that are larger by the factor 1 /
+    # (kh)^2, so digits are lost.
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
     assert mechanics.sliding_compliance(np.array([kh])).holds
 
 
 @given(st.floats(1e-3, 300))
-def test_base_and_surface_are_free_of_shear(kh):
+def test_base_and_surface_have_no_shear_stress(kh):
     g, _, bend = layer.depth_profile(np.array([[0.0], [kh]]), np.array([kh]), "slipping")
     assert g[0, 0] == 0.0
     np.testing.assert_allclose((g + bend)[:, 0], 0.0, atol=1e-12 * max(1.0, float(np.abs(bend).max())))
     np.testing.assert_allclose(g[1], layer.slipping_compliance(np.array([kh])), rtol=1e-9)
 
 
-def test_compliance_limits():
+def test_compliance_has_the_limits_of_long_and_short_waves():
     found = layer.slipping_compliance(np.array([0.0, 1e-6, 1e-3, 20.0, 1e4, 1e150]))
-    # tolerance: the next term is (kh)^3 / 6 or smaller
+    # Tolerance: the next term of the series is (kh)^3 / 6 or smaller.
     np.testing.assert_allclose(found, [0, 5e-7, 5e-4, 1, 1, 1], rtol=1e-6)
 
 
-def test_far_motion_of_slipping_and_bonded_skins():
+def test_far_from_the_tip_a_slipping_skin_moves_more_than_a_bonded_skin():
     under = layer.contact_of_depth(0.2e-3, **SKIN, base="slipping")
     r_m, z_m = np.repeat([8e-3, 12e-3], 3), np.tile([0.0, 1e-3, 2e-3], 2)
     far = layer.displacement(r_m, z_m, layer.waves(under, SKIN["thickness_m"], "slipping"))
     volume_m3 = 2 * np.pi * r_m * SKIN["thickness_m"] * far.r_m
-    # Volume is conserved, so the displaced volume flows through every circle, uniformly over the thickness.
-    # tolerance 0.01: waves that have decayed to exp(-pi r / h) at r = 4 h
+    # Volume is conserved, so the displaced volume flows through every circle, uniformly over the thickness. The
+    # tolerance of 0.01 allows for waves that have decayed to exp(-pi r / h) at r = 4 h.
     np.testing.assert_allclose(volume_m3, volume_m3.mean(), rtol=0.01)
     assert volume_m3.mean() > 0
     bonded = layer.contact_of_depth(0.2e-3, **SKIN, base="bonded")
     held = layer.displacement(r_m, z_m, layer.waves(bonded, SKIN["thickness_m"], "bonded"))
-    # At 1.5 times the distance, the surface of a slipping skin moves 2/3 as far, that of a bonded skin less than 1/4 as
-    # far.
+    # At 1.5 times the distance, the surface of a slipping skin moves 2/3 as far, but the surface of a bonded skin moves
+    # less than 1/4 as far.
     assert far.r_m[5] == pytest.approx(far.r_m[2] * 2 / 3, rel=0.01)
     assert held.r_m[5] < held.r_m[2] / 4
 
 
-def test_thick_layers_on_both_bases_have_equal_forces():
+def test_thick_layers_on_both_kinds_of_base_have_equal_forces():
     depth_m = np.array([0.1e-3])
     deep = {"thickness_m": 0.5, "tip_radius_m": 3e-3, "modulus_Pa": 190e3}
     sliding, held = (layer.force(depth_m, **deep, base=base) for base in ("slipping", "bonded"))
-    np.testing.assert_allclose(sliding, held, rtol=0.005)  # tolerance: 1.1 chi, with chi = sqrt(R d) / h = 1e-3
+    # The base changes the force by the factor 1 + 1.1 chi, where chi = sqrt(R d) / h = 1e-3. This is less than the
+    # tolerance.
+    np.testing.assert_allclose(sliding, held, rtol=0.005)
 
 
-def test_slipping_base_is_1_8_times_softer():
+def test_skin_on_a_slipping_base_is_1_8_times_softer():
     press = {**SKIN, "modulus_Pa": 190e3}
     held, sliding = (layer.force(np.array([1.2e-3]), **press, base=base) for base in ("bonded", "slipping"))
-    assert held / sliding == pytest.approx(1.8, abs=0.05)  # the factor 1.8 is known to two digits
+    assert held / sliding == pytest.approx(1.8, abs=0.05)  # The factor 1.8 is known to two digits.
 
 
 @given(st.floats(0.05, 0.55))
 @settings(max_examples=20, deadline=None)
-def test_skin_on_a_bonded_base_is_always_stiffer(relative_depth):
+def test_skin_on_a_bonded_base_is_stiffer_at_all_depths(relative_depth):
     depth_m, press = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
     assert layer.force(depth_m, **press, base="bonded") > layer.force(depth_m, **press, base="slipping")

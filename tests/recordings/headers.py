@@ -1,4 +1,4 @@
-"""Helpers for tests: capture headers and the default fault policy."""
+"""Helpers for tests: headers of captures, and the default policy for faulty rows."""
 
 from pathlib import Path
 from typing import Any
@@ -14,5 +14,5 @@ DEFAULT_POLICY = parse(FaultPolicy, PARAMS["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:
-    """Return the header of a recorded lab capture with five chips; `changed` replaces and validates fields."""
+    """Return the header of a recorded lab capture with five chips. `changed` replaces fields and validates them."""
     return header.make_header("test", **({"capture": "a_capture"} | LAB | changed))

@@ -1,4 +1,4 @@
-"""Tests of the times of frames, interpolated between the arrival times of chunks of bytes."""
+"""Tests of the times of frames. They are interpolated between the arrival times of chunks of bytes."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ def arrivals_of(steps: Steps, first: tuple[int, float]) -> Arrivals:
 
 
 def naive_time_s(end_byte: int, table: Arrivals) -> float:
-    """Reference: go through the chunks one by one, as documented for `times_of`."""
+    """Return the reference: go through the chunks one by one, as documented for `times_of`."""
     rows = list(zip(table.byte_end.tolist(), table.t_s.tolist(), strict=True))
     if end_byte <= rows[0][0]:
         return rows[0][1] - (rows[0][0] - end_byte) * (rows[-1][1] - rows[0][1]) / (rows[-1][0] - rows[0][0])
@@ -34,11 +34,11 @@ def naive_time_s(end_byte: int, table: Arrivals) -> float:
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
-def test_frame_times_equal_naive_loop(steps: Steps, first: tuple[int, float]) -> None:
+def test_frame_times_equal_a_loop_over_chunks(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
     expected_s = [naive_time_s(int(byte), table) for byte in end_byte]
-    # Tolerance: sums of up to 31 doubles between 1e3 and 1e4.
+    # Tolerance: sums of up to 31 numbers between 1e3 and 1e4 in double precision.
     np.testing.assert_allclose(clocks.times_of(end_byte, table), expected_s, rtol=1e-12, atol=1e-9)
 
 
@@ -53,18 +53,18 @@ def test_times_never_decrease(steps: Steps, first: tuple[int, float]) -> None:
     assert (t_s >= table.t_s[chunk_i - 1] - 1e-9).all()
 
 
-def test_frame_after_the_last_chunk_has_no_time() -> None:
+def test_frame_that_ends_after_the_last_chunk_has_no_time() -> None:
     t_s = clocks.times_of(np.array([82, 400, 401], np.int64), clocks.parse(GOOD, "arrivals.csv"))
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 
 
-def test_constant_rate_divides_the_frame_number() -> None:
+def test_time_at_a_constant_rate_is_the_frame_number_divided_by_the_rate() -> None:
     t_s = clocks.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
     np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e9, 1e9)))
-def test_arrivals_round_trip(steps: Steps, first: tuple[int, float]) -> None:
+def test_written_arrival_times_are_read_unchanged(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     again = clocks.parse(clocks.render(table), "arrivals.csv")
     np.testing.assert_array_equal(again.byte_end, table.byte_end)
@@ -87,11 +87,11 @@ def test_arrivals_round_trip(steps: Steps, first: tuple[int, float]) -> None:
         (GOOD, "byte_end,t_s\n1,2\n3,2\n", "t_s is 2.0 in every row"),
     ],
 )
-def test_invalid_arrivals_name_their_line(old: str, new: str, message: str) -> None:
+def test_error_names_the_line_of_an_invalid_arrival_time(old: str, new: str, message: str) -> None:
     with pytest.raises(CaptureError, match=rf"^arrivals\.csv.*{message}"):
         clocks.parse(GOOD.replace(old, new, 1), "arrivals.csv")
 
 
-def test_missing_file_is_an_error(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="arrivals.csv: file not found"):
         clocks.parse(tmp_path / "arrivals.csv", "arrivals.csv")

@@ -1,4 +1,4 @@
-"""Test with a real recording that no-load readings before each contact keep a network accurate in later passes."""
+"""Test with a real recording that drifts: no-load readings before each contact keep a network accurate."""
 
 from pathlib import Path
 
@@ -12,10 +12,11 @@ from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Accuracies in % of a reference network, trained on pass 1 and tested on passes 2 to 5, with no-load readings before
-# each contact (FRESH) or only at the start (INITIAL).
+# Accuracies in % of a reference network on passes 2 to 5. It was trained on pass 1, with no-load readings before each
+# contact (FRESH) or only at the start (INITIAL).
 FRESH_PCT, INITIAL_PCT = (89, 88, 86, 84), (55, 19, 13, 10)
-# Tolerance in percentage points: the tested network and its number of training steps differ from the reference.
+# Tolerance in percentage points: the network of this test and its number of training steps differ from those of the
+# reference.
 TOLERANCE_PCT = 15
 
 
@@ -41,5 +42,5 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     assert "late" not in numbers
     assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
     of_trainings = [one["of_trainings"] for one in numbers["findings"]]
-    assert of_trainings == ["supported", "supported"]  # verdicts over three networks per policy
-    assert numbers["contact_every_s"] > 1  # seconds per contact; a real rig takes more than one
+    assert of_trainings == ["supported", "supported"]  # These are the verdicts over three networks per policy.
+    assert numbers["contact_every_s"] > 1  # The time is in seconds per contact. A real rig takes more than one second.

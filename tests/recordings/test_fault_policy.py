@@ -1,4 +1,7 @@
-"""Tests that faults are counted with their time span, and that the policy drops, flags or refuses faulty frames."""
+"""Tests that faults are counted with their span of time, and that the policy for faults is applied.
+
+The policy says for each fault whether faulty frames are dropped, flagged, or the capture is refused.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,7 +25,8 @@ from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# Injected fault, wire format, name of the fault in the log, number of faulty frames (None: counted in bytes).
+# Each case: an injected fault, the wire format, the name of the fault in the log, and the number of faulty frames. None
+# means that the fault is counted in bytes.
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -33,7 +37,7 @@ FAULTS = [
 
 
 def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy, wire: str = "binary"):
-    """Feed frames in chunks that end at `ends`, as stage ingest does; return fault log and mask of kept frames."""
+    """Feed frames in chunks that end at `ends`, as stage ingest does. Return fault log and mask of kept frames."""
     frame_bytes_n = None if wire.startswith("text") else record_type(wire, 5).itemsize
     detector = FaultDetector(frames.temperature_degC.shape[1], frame_bytes_n=frame_bytes_n)
     log, kept = FaultLog(policy, "stream.bin", "ms"), []
@@ -45,7 +49,7 @@ def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy
 
 
 def record_fault(name: str, wire: str, policy: FaultPolicy = DEFAULT_POLICY):
-    """Decode a stream with a fault, in two chunks; return the fault log and the mask of kept frames."""
+    """Decode a stream with a fault in two chunks. Return the fault log and the mask of kept frames."""
     script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     sent_byte = np.cumsum([len(piece) for piece in script.pieces])
@@ -54,14 +58,14 @@ def record_fault(name: str, wire: str, policy: FaultPolicy = DEFAULT_POLICY):
 
 
 @pytest.mark.parametrize("wire", SCRIPTS)
-def test_intact_stream_has_no_fault(wire):
+def test_stream_without_damage_has_no_fault(wire):
     log, kept = record_fault("none", wire)
     assert log.account() == {}
     assert kept.all()
 
 
 @pytest.mark.parametrize(("name", "wire", "fault", "frames_n"), FAULTS)
-def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
+def test_injected_faults_are_found_and_their_policy_is_applied(name, wire, fault, frames_n):
     for action in FaultPolicy.model_fields[fault].annotation.__args__:
         policy = override(DEFAULT_POLICY, [f"{fault}={action}"], "test")
         if action == "refuse":
@@ -75,18 +79,19 @@ def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
         assert found.count_n == pytest.approx(frames_n, rel=0.1) if frames_n else found.count_n > 500
         assert FROM_S - 0.01 <= found.first <= FROM_S + LASTS_S + 0.05
         assert found.last <= FROM_S + LASTS_S + 0.1
-        dropped = action == "drop" and fault not in ("torn", "wrong_baud")  # these faults leave no frames to drop
+        # After these faults, there are no frames that could be dropped.
+        dropped = action == "drop" and fault not in ("torn", "wrong_baud")
         assert (~kept).sum() == (found.count_n if dropped else 0)
 
 
-def test_silence_of_more_than_a_second_is_recorded_as_unplugging():
+def test_silence_of_more_than_a_second_counts_as_unplugging():
     script = SCRIPTS["binary"]
     frames = replace(script.frames, end_byte=82 * (1 + np.arange(len(script))))
     log, _ = record(frames, script.t_s + 1.5 * (script.t_s > 1.0), [], DEFAULT_POLICY)
     assert {name: (found.count_n, round(found.first, 1)) for name, found in log.records.items()} == {"unplug": (1, 2.5)}
 
 
-def test_chip_reset_is_refused_or_flagged():
+def test_chip_with_power_on_settings_is_refused_or_flagged():
     script = inject(make_script(pokes_n=2), parse_fault("chip-reset@2+5"))
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     with pytest.raises(CaptureError, match="the LSB of chip 1"):
@@ -97,7 +102,7 @@ def test_chip_reset_is_refused_or_flagged():
     assert 1.0 <= log.records["chip_reset"].first <= 3.0
 
 
-def test_fault_without_time_does_not_change_the_span():
+def test_fault_without_a_time_does_not_change_the_span_of_its_kind():
     mask, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
     log = FaultLog(DEFAULT_POLICY, "x", "ms")
     for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
@@ -109,7 +114,7 @@ def test_fault_without_time_does_not_change_the_span():
         FaultLog(override(DEFAULT_POLICY, ["stuck=refuse"], "t"), "x", "ms").record("stuck", mask, unknown_s * np.nan)
 
 
-def test_policy_applies_to_table_rows():
+def test_policy_is_applied_to_rows_of_a_table():
     rng = rng_for(0, "rows")
     b_uT, temperature_degC = rng.normal(300, 5, (200, 6)), np.full((200, 2), 25.0)
     temperature_degC[20:30, 1], b_uT[100] = 150.0, 0.0
@@ -125,7 +130,7 @@ def test_policy_applies_to_table_rows():
         check_rows(b_uT, temperature_degC, None, where="here", policy=override(DEFAULT_POLICY, ["zeros=refuse"], "t"))
 
 
-def test_invalid_overrides_are_refused():
+def test_invalid_changes_of_the_policy_are_refused():
     wrong = {
         "melted=drop": "Faults: .*stuck",
         "stuk=flag": "Did you mean stuck=flag",
@@ -144,7 +149,7 @@ CONSTANT = r"Bz of chip 0 \(.*\), Bz of chip 1 \(0 uT\) never changed in the who
 
 
 def constant_z(b_uT: np.ndarray) -> np.ndarray:
-    """Return fields in which z of chip 0 is constant and z of chip 1 is 0."""
+    """Return fields in which z of chip 0 is constant, and z of chip 1 is always 0."""
     changed = b_uT.copy()
     changed[:, 2], changed[:, 5] = b_uT[0, 2], 0.0
     return changed
@@ -164,7 +169,7 @@ def test_constant_channels_of_a_table_are_refused_or_flagged():
 
 
 @given(st.lists(st.integers(0, 400), max_size=4))
-def test_constant_channels_are_found_in_any_chunks(ends):
+def test_constant_channels_are_found_for_any_size_of_chunks(ends):
     frames = SCRIPTS["binary"].frames
     frames = replace(frames, b_uT=constant_z(frames.b_uT), end_byte=82 * (1 + np.arange(len(frames))))
     with pytest.raises(CaptureError, match=CONSTANT):
@@ -173,7 +178,7 @@ def test_constant_channels_are_found_in_any_chunks(ends):
     assert log.account()["fault_constant_channel_last_ms"] > 0
 
 
-def test_stuck_chips_and_unchanging_boards_have_no_constant_channel():
+def test_stuck_chips_and_boards_that_never_change_are_not_reported_as_constant_channels():
     channels = ConstantChannels(2)
     channels.feed(np.zeros((50, 6)))
     assert channels.describe() == []
@@ -181,14 +186,17 @@ def test_stuck_chips_and_unchanging_boards_have_no_constant_channel():
     moving[:, 3:] = rng_for(0, "still").normal(0, 5, (50, 3))
     channels = ConstantChannels(2)
     channels.feed(moving)
-    assert channels.describe() == []  # chip 0 is stuck
+    assert channels.describe() == []  # Chip 0 is stuck, which is another fault.
 
 
 CHIPS_N = 5
 
 
 def noisy_fields_uT(rows_n: int) -> np.ndarray:
-    """Return fields of five chips at GAIN_SEL 7: 300 uT with 5 uT of noise, rounded to multiples of the LSB."""
+    """Return fields of five chips at GAIN_SEL 7.
+
+    They are 300 uT with 5 uT of noise, rounded to multiples of the step (LSB).
+    """
     lsb_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N)
     b_uT = 300 + 5 * seeds.rng_for(2021, "fields").standard_normal((rows_n, 3 * CHIPS_N))
     return np.round(b_uT / lsb_uT) * lsb_uT
@@ -196,7 +204,7 @@ def noisy_fields_uT(rows_n: int) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(failed=st.sets(st.tuples(st.integers(0, 49), st.integers(0, CHIPS_N - 1))))
-def test_row_is_valid_if_no_chip_failed(failed: set[tuple[int, int]]) -> None:
+def test_row_is_valid_if_no_chip_has_failed(failed: set[tuple[int, int]]) -> None:
     b_uT, temperature_degC = noisy_fields_uT(50), np.full((50, CHIPS_N), 25.0)
     for row_i, chip_i in failed:
         b_uT[row_i, 3 * chip_i : 3 * chip_i + 3] = faults.FAILED_B_uT
@@ -207,7 +215,7 @@ def test_row_is_valid_if_no_chip_failed(failed: set[tuple[int, int]]) -> None:
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
-def test_row_with_a_zero_reading_is_invalid():
+def test_row_in_which_a_chip_reads_zeros_is_invalid():
     b_uT = noisy_fields_uT(50)
     b_uT[7, 3:6] = 0.0
     rows = check_rows(b_uT, np.full((50, CHIPS_N), 25.0), None, where="here", policy=DEFAULT_POLICY)
@@ -216,7 +224,7 @@ def test_row_with_a_zero_reading_is_invalid():
 
 
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
-def test_chip_with_another_lsb_is_named(chip_i: int) -> None:
+def test_chip_whose_steps_differ_from_those_of_the_other_chips_is_named(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
@@ -224,14 +232,14 @@ def test_chip_with_another_lsb_is_named(chip_i: int) -> None:
         check_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), None, where="here", policy=DEFAULT_POLICY)
 
 
-def test_fields_without_grid_are_accepted() -> None:
-    # For example, fields from a recorder that averages: there is no LSB to compare.
+def test_fields_that_are_not_multiples_of_a_step_are_accepted() -> None:
+    # An example is a recorder that averages its readings. There is no step to compare.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
     assert check_rows(b_uT, unknown_degC, None, where="here", policy=DEFAULT_POLICY).keep.all()
 
 
-def test_stuck_and_failed_rows_are_counted_separately() -> None:
+def test_rows_with_stuck_and_with_failed_chips_are_counted_separately() -> None:
     b_uT, temperature_degC = noisy_fields_uT(100), np.full((100, CHIPS_N), 25.0)
     b_uT[50:, 3:6] = b_uT[50, 3:6]
     b_uT[10, :3], temperature_degC[10, 0] = faults.FAILED_B_uT, faults.FAILED_TEMPERATURE_degC

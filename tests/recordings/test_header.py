@@ -1,4 +1,4 @@
-"""Tests of capture headers, and of opening a capture with the reader of its layout."""
+"""Tests of the headers of captures, and of opening a capture with the reader of its layout."""
 
 import hashlib
 import json
@@ -16,14 +16,14 @@ from tests.recordings.readers.test_lab import NAMES, PRESSES
 
 
 @given(st.floats(0.1, 1e5), st.lists(st.tuples(st.floats(0, 1e9), st.floats(0, 1e9)), max_size=3))
-def test_header_round_trip(rate_hz, marks):
+def test_written_header_is_read_unchanged(rate_hz, marks):
     clock = Clock(kind="rate", rate_hz=rate_hz, marks=tuple(marks))
     header = make_header(layout="native", wire="binary", clock=clock)
     assert parse(render(header), "header.json") == header
 
 
-def test_rate_is_optional():
-    """Headers of captures that were recorded before rates were measured are read, and written unchanged."""
+def test_frame_rate_in_a_header_is_optional():
+    """Headers of old captures have no frame rate, because it was not measured. They are read, and written unchanged."""
     before = render(make_header())
     assert "rate" not in json.loads(before)
     assert parse(before, "header.json").rate is None
@@ -57,13 +57,13 @@ def test_rate_is_optional():
         ({"clock": {"kind": "rate", "rate_hz": None, "marks": []}}, "rate_hz must be given for clock kind 'rate'"),
     ],
 )
-def test_invalid_field_is_named(changed, message):
+def test_error_names_the_invalid_field(changed, message):
     fields = json.loads(render(make_header())) | changed
     with pytest.raises(CaptureError, match=message):
         parse(json.dumps(fields), "header.json")
 
 
-def test_missing_field_is_an_error():
+def test_missing_field_is_reported():
     fields = json.loads(render(make_header()))
     del fields["skin"]
     with pytest.raises(CaptureError, match="skin: Field required; got nothing"):
@@ -77,12 +77,12 @@ def test_malformed_header_is_refused(text):
     assert "\n" not in str(caught.value)
 
 
-def test_renamed_folder_is_refused():
+def test_capture_in_a_renamed_folder_is_refused():
     with pytest.raises(CaptureError, match="capture must be the folder's name 'other'; got 'a_capture'"):
         check_same_capture(make_header(), "other")
 
 
-def test_header_has_checksums_of_all_files(tmp_path):
+def test_header_contains_checksums_of_all_files(tmp_path):
     (tmp_path / "source.csv").write_bytes(b"copied")
     header = write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "source.csv"})
     assert header.files == {
@@ -92,7 +92,7 @@ def test_header_has_checksums_of_all_files(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c0", "source.csv"]
 
 
-def test_missing_source_leaves_no_folder(tmp_path):
+def test_capture_of_a_missing_file_leaves_no_folder(tmp_path):
     with pytest.raises(FileNotFoundError):
         write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "none.csv"})
     assert list(tmp_path.iterdir()) == []
@@ -110,7 +110,7 @@ def test_capture_opens_with_the_reader_of_its_layout(tmp_path):
     assert sum(map(len, blocks)) == account["rows_n"] == 4
 
 
-def test_changed_file_is_refused(tmp_path):
+def test_capture_whose_file_was_changed_is_refused(tmp_path):
     folder = capture(tmp_path / "c0")
     with (folder / lab.READINGS).open("a") as stream:
         stream.write("\n")
@@ -138,12 +138,12 @@ def test_folder_without_header_is_refused(tmp_path):
         ({"logged_indentations_n": 10, "dropped_no_frame_indentations_n": 9}, "9 dropped_no_frame_indentations"),
     ],
 )
-def test_too_much_loss_is_refused(account, message):
+def test_capture_with_too_many_lost_frames_is_refused(account, message):
     with pytest.raises(CaptureError, match=message):
         check_losses(account, 0.05, "c0")
 
 
-def test_small_loss_and_frames_between_dwells_are_accepted():
+def test_few_lost_frames_and_frames_between_dwells_are_accepted():
     check_losses(
         {"bytes_n": 100, "skipped_resync_bytes_n": 5, "frames_n": 9, "dropped_between_dwells_frames_n": 8}, 0.05, "c0"
     )

@@ -1,4 +1,7 @@
-"""Tests of matching frames with dwells, against a double loop: any block size, and every frame is counted."""
+"""Tests of matching frames with dwells, the stops of the tip during which a label is valid.
+
+The reference is a double loop. Frames come in blocks of any size, and every frame is counted.
+"""
 
 import dataclasses
 import tracemalloc
@@ -20,12 +23,16 @@ from tests.recordings.headers import make_header
 CHIPS_N = 2
 CLOCK = ClockMap(offset_s=-5.0, rate=1.25, residual_s=0.0, explained=1.0)
 HEADER = make_header(chips_n=CHIPS_N, contacts_before_n=100)
-# Dwells of an indentation: (gap before, length) in halves of a frame period, so that some frames are on edges.
+# The dwells of an indentation, as pairs (gap before the dwell, length). They are in halves of a frame period, so that
+# some frames are on the edge of a dwell.
 DWELLS = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), min_size=1, max_size=3)
 
 
 def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
-    """Return a probe log of these dwells; the first of each indentation is without contact, the others in contact."""
+    """Return a probe log of these dwells.
+
+    The first dwell of each indentation is without contact, the others are in contact.
+    """
     rows = [
         (number, dwell_i > 0, *dwell) for number, one in enumerate(indentations) for dwell_i, dwell in enumerate(one)
     ]
@@ -37,7 +44,10 @@ def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
 
 
 def timed_of(frames_n: int, faults: dict[int, str] | None = None) -> TimedFrames:
-    """Return frames at intervals of 1 s (probe time), from 2 s before the log; `faults` maps frames to their fault."""
+    """Return frames at intervals of 1 s of probe time, which begin 2 s before the log.
+
+    `faults` maps the numbers of faulty frames to the kinds of fault.
+    """
     rng = rng_for(0, "frames", frames_n)
     b_uT = rng.normal(0, 100, (frames_n, 3 * CHIPS_N)).astype(np.float32)
     temperature_degC = rng.normal(25, 1, (frames_n, CHIPS_N)).astype(np.float32)
@@ -64,7 +74,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
 
 
 def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Join all blocks with the log; return the readings as concatenated columns, and the account of frames."""
+    """Join all blocks of frames with the log. Return the readings as columns, and the account of frames."""
     account: dict[str, int] = {}
     parts = list(join(blocks, log, CLOCK, HEADER, account))
     empty = Joiner(log, CLOCK, HEADER).close()
@@ -75,7 +85,10 @@ def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.
 
 
 def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
-    """Reference: compare every frame with every dwell; a frame on a common edge belongs to the later dwell."""
+    """Return the reference: compare every frame with every dwell.
+
+    A frame on the common edge of two dwells belongs to the later one.
+    """
     noload: dict[int, list[np.ndarray]] = {}
     contact: list[tuple[int, int]] = []
     for frame_i, t_s in enumerate(timed.t_s.tolist()):
@@ -113,7 +126,7 @@ FAULTS = st.dictionaries(st.integers(0, 60), st.sampled_from(["failed", "stuck",
 
 
 @given(indentations=st.lists(DWELLS, min_size=1, max_size=6), frames_n=st.integers(0, 60), faults=FAULTS)
-def test_readings_equal_double_loop(
+def test_readings_equal_those_of_a_double_loop(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -122,7 +135,7 @@ def test_readings_equal_double_loop(
     assert len(actual["indentation"]) == len(expected)
     for row_i, row in enumerate(expected):
         for name, value in row.items():
-            # tolerance: the mean is computed in float64; all other values are copied
+            # The tolerance is for the mean, which is computed in double precision. All other values are copied.
             np.testing.assert_allclose(
                 actual[name][row_i], value, rtol=1e-6 if name == "noload_uT" else 0, err_msg=name
             )
@@ -134,7 +147,7 @@ def test_readings_equal_double_loop(
     faults=FAULTS,
     ends=st.lists(st.integers(0, 60), max_size=60),
 )
-def test_readings_do_not_depend_on_blocks(
+def test_readings_do_not_depend_on_the_size_of_blocks(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], ends: list[int]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -151,7 +164,7 @@ def test_readings_do_not_depend_on_blocks(
     faults=FAULTS,
     untimed_n=st.integers(0, 5),
 )
-def test_frames_and_indentations_are_accounted_for(
+def test_every_frame_and_every_indentation_is_counted(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], untimed_n: int
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -166,23 +179,25 @@ def test_frames_and_indentations_are_accounted_for(
     assert min(account.values()) >= 0
 
 
-def test_losses_are_counted_by_reason() -> None:
-    # Frames are at -2, -1, 0, ... s of probe time; dwells are at 0-2, 3-4 | 5-6, 7-8 | 9-9.5 s, and after the stream.
+def test_dropped_frames_are_counted_by_reason() -> None:
+    # Frames are at -2, -1, 0, ... s of probe time; the dwells of three indentations are at 0-2 and 3-4 s, at 5-6 and
+    # 7-8 s, and at 9-9.5 s. Those of the fourth indentation are after the end of the stream.
     log = log_of([[(0, 4), (2, 2)], [(2, 2), (2, 2)], [(2, 1), (1, 1)], [(60, 2), (2, 2)]])
     timed = timed_of(13, {2: "failed", 3: "field", 7: "field", 8: "failed"})
     timed.t_s[12:] = np.nan
     rows, account = join_blocks([timed], log)
     assert account == {
         "frames_n": 13,
-        "frames_noload_n": 1,  # at 2 s
-        "frames_contact_n": 2,  # at 3 and 4 s
+        "frames_noload_n": 1,  # The frame at 2 s.
+        "frames_contact_n": 2,  # The frames at 3 and 4 s.
         "dropped_no_time_frames_n": 1,
         "dropped_not_finite_frames_n": 2,
         "dropped_failed_read_frames_n": 2,
         "dropped_stuck_chip_frames_n": 0,
-        "dropped_between_dwells_frames_n": 2,  # at -2 and -1 s
-        "dropped_no_noload_frames_n": 2,  # at 7 and 8 s: the no-load dwell of this indentation has no valid frame
-        "dropped_no_contact_frames_n": 1,  # at 9 s
+        "dropped_between_dwells_frames_n": 2,  # The frames at -2 and -1 s.
+        # The frames at 7 and 8 s, because the no-load dwell of their indentation has no valid frame.
+        "dropped_no_noload_frames_n": 2,
+        "dropped_no_contact_frames_n": 1,  # The frame at 9 s.
         "indentations_n": 1,
         "dropped_no_noload_indentations_n": 1,
         "logged_indentations_n": 4,
@@ -197,11 +212,11 @@ def test_readings_are_released_when_the_next_indentation_begins() -> None:
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)
     rows_n = [len(joiner.feed(block)) for block in cut(timed, list(range(400)))]
-    assert max(rows_n) == 4  # a dwell of 3 s has four frames, one on each edge
+    assert max(rows_n) == 4  # A dwell of 3 s has four frames, because one frame is on each edge.
     assert len(joiner.close()) <= 4
 
 
-def test_memory_does_not_grow_with_the_stream() -> None:
+def test_memory_does_not_grow_with_the_length_of_the_stream() -> None:
     block = timed_of(4000)
 
     def peak_bytes_n(blocks_n: int) -> int:
@@ -214,4 +229,4 @@ def test_memory_does_not_grow_with_the_stream() -> None:
         tracemalloc.stop()
         return peak
 
-    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # 10 %: counters and the allocator
+    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # The tolerance of 10 % is for counters and the memory allocator.

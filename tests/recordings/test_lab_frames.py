@@ -1,6 +1,7 @@
-"""Tests of the chip rotations in the scenes: recorded field changes against simulated ones, without any fit.
+"""Tests of the chip rotations that are stated in the scenes.
 
-Label axes and board axes have the same x axis and opposite y axes.
+Recorded field changes are compared with simulated ones, without any fit. The axes of the labels and of the board have
+the same x axis and opposite y axes.
 """
 
 from pathlib import Path
@@ -23,8 +24,9 @@ from tests.physics.test_board import SPREADS, as_tuples
 from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-DEPTH_M = 0.8e-3  # the recordings have no depth; at 0.6 and 1 mm, the field directions are the same
-LABEL_TO_BOARD = np.diag([1.0, -1.0])  # from label axes to board axes
+# The recordings do not state the depth. The directions of field changes are the same at 0.6 and at 1 mm.
+DEPTH_M = 0.8e-3
+LABEL_TO_BOARD = np.diag([1.0, -1.0])  # Converts places from the axes of the labels to those of the board.
 MIDDLE_MM = 8.0
 
 
@@ -37,18 +39,22 @@ def design() -> BoardDesign:
 
 @pytest.fixture(scope="module")
 def recorded_uT(shared_data, tmp_path_factory) -> np.ndarray:
-    """Return recorded field changes [file, place, chip, axis] in chip axes, at the places of `simulated_uT`."""
+    """Return recorded field changes [file, place, chip, axis], along the axes of the chips.
+
+    The places are those of `simulated_uT`.
+    """
     return np.stack([_change_uT(_readings(name, shared_data, tmp_path_factory)) for name in LAB])
 
 
 @pytest.fixture(scope="module")
 def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
-    """Return simulated field changes in the axes of the board: [place, chip, axis]."""
+    """Return simulated field changes [place, chip, axis], along the axes of the board."""
     readings = _readings(LAB[0], shared_data, tmp_path_factory)
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ LABEL_TO_BOARD * milli, np.full(65, DEPTH_M)])
     no_spread = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
-    values = nominal("skin") | {"hold": None}  # without `hold`, which was fitted to these recordings
+    # The setting `hold` is not used, because it was fitted to these recordings.
+    values = nominal("skin") | {"hold": None}
     skin = draw_skin(parse(SkinDesign, values, "test"), no_spread, seed=0, name="nominal")
     _, changes_T = changes_of_field(draw_board(design, no_spread, seed=0, name="nominal"), skin, pokes_m)
     return changes_T / micro
@@ -62,7 +68,7 @@ def _change_uT(readings: Readings) -> np.ndarray:
     return (readings.b_uT - readings.noload_uT).reshape(65, 100, 5, 3).mean(axis=1)
 
 
-def test_chip_rotations_equal_those_of_the_scenes(recorded_uT, simulated_uT, design):
+def test_chip_rotations_fitted_to_recordings_equal_those_of_the_scenes(recorded_uT, simulated_uT, design):
     # Rotations are fitted to all files together. From a single file, a rotation would be wrong by up to 40 degrees, or
     # even mirrored.
     for chip_i, turn_deg in enumerate(design.chips_turn_deg):
@@ -70,13 +76,15 @@ def test_chip_rotations_equal_those_of_the_scenes(recorded_uT, simulated_uT, des
         found, _ = orthogonal_procrustes(read_uT, np.tile(simulated_uT[:, chip_i], (len(LAB), 1)))
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         assert np.linalg.det(found) > 0, f"chip {chip_i} is mirrored"
-        # A wrong quarter turn would give 1. Smaller differences are caused by offset and sliding skins.
+        # A wrong quarter turn would give a difference of 1. Smaller differences are due to the positions of skins on
+        # their boards, and to skins that slide.
         assert np.abs(found.T - turn).max() < 0.35, f"chip {chip_i}"
 
 
-def test_nominal_skin_has_the_recorded_direction(recorded_uT, simulated_uT, design):
+def test_field_changes_of_the_nominal_skin_have_the_recorded_directions(recorded_uT, simulated_uT, design):
     turn = Rotation.from_euler("z", np.array(design.chips_turn_deg)[:, None], degrees=True).as_matrix()
     seen_uT = np.einsum("kij,dnkj->dnki", turn, recorded_uT)
     along = (seen_uT * simulated_uT).sum(axis=(2, 3))
     cosine = along / np.linalg.norm(seen_uT, axis=(2, 3)) / np.linalg.norm(simulated_uT, axis=(1, 2))
-    assert (cosine.mean(axis=1) > 0.65).all()  # measured: 0.69 to 0.83; with two swapped chips at most 0.59
+    # Measured cosines are 0.69 to 0.83. If two chips were exchanged, they would be at most 0.59.
+    assert (cosine.mean(axis=1) > 0.65).all()

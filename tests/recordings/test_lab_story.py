@@ -1,4 +1,7 @@
-"""Tests of real recordings, from `reskin add` to leave-one-board-out scores; a board is added and removed."""
+"""Tests of real recordings, from `reskin add` to the scores on held-out boards.
+
+A board is added to the scene and removed again.
+"""
 
 import json
 import re
@@ -15,7 +18,7 @@ from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
 from tests.stages.checkout import copy_checkout, run
 
-REPRO_LOG = "repro.log"  # output of DVC's first run
+REPRO_LOG = "repro.log"  # The output of the first run of DVC.
 pytestmark = pytest.mark.timeout(1800)
 
 
@@ -27,7 +30,8 @@ def lab(tmp_path_factory, shared_data, empty_store) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    settings |= {"experiments": ["lobo"], "split": {}}  # only one experiment: scene ci tests the others
+    # A single experiment is enough, because scene ci tests the others.
+    settings |= {"experiments": ["lobo"], "split": {}}
     recorded = ("compare", "universal", "reference_methods", "random_presses", "mounting", "recorded_limits")
     for section in ("few_labels", "audit", *recorded):
         del settings[section]
@@ -53,7 +57,7 @@ def boards_in_folds(root: Path) -> set[str]:
     return {board for fold in folds for board in fold["test_boards"]}
 
 
-def test_two_boards_give_two_folds(lab):
+def test_scene_with_two_boards_has_two_folds(lab):
     boards = by_board(lab)
     assert sorted(boards) == ["board1", "board2"]
     for parts in boards.values():
@@ -61,15 +65,15 @@ def test_two_boards_give_two_folds(lab):
         assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f"}
 
 
-def test_stages_run_in_the_order_of_the_list(lab):
+def test_stages_run_in_the_order_of_the_generated_list(lab):
     order = json.loads((lab / ".reskin/order.json").read_text())["stages"]
     assert re.findall("^Running stage '(.*)':", (lab / REPRO_LOG).read_text(), re.MULTILINE) == order
 
 
-def test_adding_and_removing_a_board(lab, shared_data):
-    file = str(shared_data / "lab/board1_depth1.csv")  # used as the recording of a third board
+def test_board_can_be_added_and_removed(lab, shared_data):
+    file = str(shared_data / "lab/board1_depth1.csv")  # This file serves as the recording of a third board.
     run(lab, "reskin", "add", file, "--layout", "lab", "--board", "board3", "--skin", "skin3", "--scene", "lab")
-    output = run(lab, "dvc", "repro", "split@lab").stdout  # stage split is the first that combines boards
+    output = run(lab, "dvc", "repro", "split@lab").stdout  # Stage split is the first stage that combines boards.
     assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in output
     assert boards_in_folds(lab) == {"board1", "board2", "board3"}
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")

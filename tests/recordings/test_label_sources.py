@@ -1,4 +1,7 @@
-"""Tests that each label source (program, prompts, gauge, robot's table) writes a probe log."""
+"""Tests that each source of labels writes a probe log.
+
+Sources are a program, prompts in the terminal, a force gauge, and the growing table of a robot.
+"""
 
 import re
 import threading
@@ -27,7 +30,7 @@ from reskin.recordings.labels import Label, ProbeLogWriter
 from reskin.seeds import rng_for
 
 DWELL_s = 0.002
-LONG_S = 120.0  # time limit in s that a passing test never reaches
+LONG_S = 120.0  # A time limit in s, which a passing test never reaches.
 
 
 @pytest.fixture
@@ -51,7 +54,7 @@ def prompts(lines, *, scan="random", forces=None, text="grid:3x2:4", dwell_s=DWE
     return prompter, printed
 
 
-def test_program_yields_moves_and_labels(context, tmp_path):
+def test_program_that_moves_a_robot_yields_labels(context, tmp_path):
     def pokes():
         for x_mm in (4.0, 12.0):
             yield Label(False)
@@ -64,13 +67,13 @@ def test_program_yields_moves_and_labels(context, tmp_path):
     assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
 
 
-def test_function_is_called_until_it_returns_none(context, tmp_path):
+def test_label_function_is_called_until_it_returns_none(context, tmp_path):
     labels = [None, Label(True, 1.0, 1.0), Label(False)]
     from_program(labels.pop, DWELL_s).run(context)
     assert len(log_of(tmp_path)) == 2
 
 
-def test_invalid_label_and_failing_robot_end_the_labels(context):
+def test_invalid_label_or_failing_robot_ends_the_labels(context):
     def pokes():
         yield Label(False)
         raise RuntimeError("the robot is in its limits")
@@ -90,7 +93,7 @@ def test_recording_does_not_wait_for_a_hanging_program(context):
     hung.set()
 
 
-def test_prompted_places_are_shuffled_in_each_pass(context, tmp_path):
+def test_prompts_name_the_places_in_another_order_in_each_pass(context, tmp_path):
     prompter, printed = prompts([""] * 24 + ["q"])
     prompter.run(context)
     log = log_of(tmp_path)
@@ -103,7 +106,7 @@ def test_prompted_places_are_shuffled_in_each_pass(context, tmp_path):
     assert "then place" in shown[0]
 
 
-def test_prompts_accept_index_force_and_skip(context, tmp_path):
+def test_answer_to_a_prompt_may_be_an_index_a_force_or_skip(context, tmp_path):
     lines = ["", "4", "", "0.8N", "", "2 1.5 n", "", "99", "what", "s", "", "q"]
     prompter, printed = prompts(lines, scan="snake", text="line:5:2@1,8")
     prompter.run(context)
@@ -118,7 +121,7 @@ def test_prompts_accept_index_force_and_skip(context, tmp_path):
     ("line", "x_mm", "force_N"),
     [("12N", 0, 12), ("10N", 0, 10), ("10.5N", 0, 10.5), ("3 2.5N", 3, 2.5), ("3", 3, np.nan), ("12", 12, np.nan)],
 )
-def test_force_is_never_split_into_place_and_force(context, tmp_path, line, x_mm, force_N):
+def test_force_with_its_unit_is_never_read_as_place_and_force(context, tmp_path, line, x_mm, force_N):
     prompter, printed = prompts(
         ["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", line, "", "q"], scan="snake", text="line:13:1"
     )
@@ -128,7 +131,7 @@ def test_force_is_never_split_into_place_and_force(context, tmp_path, line, x_mm
     assert len([line for line in printed if "is neither a place" in line]) == 5
 
 
-def test_prompts_in_snake_order_and_invalid_places():
+def test_prompts_in_snake_order_reverse_every_second_row():
     assert parse_places("grid:3x2:4").order("snake", rng_for(0, "x")) == [0, 1, 2, 5, 4, 3]
     assert parse_places("robot.csv") is None
     for wrong in ("grid:0x2:4", "line:5:0", "grid:9999x9999:1"):
@@ -144,7 +147,7 @@ def wait_until(condition):
 
 
 class FakeGauge:
-    """Fake serial port of a force gauge that sends these chunks and is then unplugged."""
+    """The serial port of a force gauge, which sends these chunks of bytes and is then unplugged."""
 
     def __init__(self, chunks):
         self.chunks, self.sent_n, self.gone = iter(chunks), 0, False
@@ -176,7 +179,7 @@ def fake_gauge(monkeypatch):
 
 
 class GaugeContext(LabelContext):
-    """Label context in which a label lasts until the gauge has sent data or is unplugged, instead of a fixed time."""
+    """The context of a label. A label lasts until the gauge has sent data or is unplugged, instead of a fixed time."""
 
     gauge: FakeGauge
 
@@ -192,7 +195,7 @@ def with_gauge(context, gauge):
     return gauge_context
 
 
-def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
+def test_force_of_a_touch_is_the_mean_of_the_gauges_readings(context, tmp_path, fake_gauge):
     gauge = fake_gauge(repeat(b"0.4\n0.6\n"))
     prompter, _ = prompts(["", "", "q"], forces=ForceGauge("gauge", 9600))
     assert prompter.run(with_gauge(context, gauge)) == ""
@@ -200,7 +203,7 @@ def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
     assert log.Fz_N[log.contact] == pytest.approx(0.5)
 
 
-def test_touches_without_gauge_data_are_counted(context, fake_gauge):
+def test_touches_during_which_the_gauge_sends_nothing_are_counted(context, fake_gauge):
     fake_gauge(repeat(b""))
     prompter, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
     assert prompter.run(context) == "2 touches during which the gauge at gauge sent no force"
@@ -214,9 +217,9 @@ def test_labels_continue_after_the_gauge_is_unplugged(context, fake_gauge):
     assert context.writer.touches_n == 2
 
 
-def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
+def test_gauge_without_other_labels_detects_touches_by_their_force(context, tmp_path, fake_gauge):
     fake_gauge([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
-    # simulated clock: with a real clock, a stalled machine would split a touch of 0.5 s into several touches
+    # The clock is simulated. With a real clock, a busy machine would split a touch of 0.5 s into several touches.
     ticks = count()
     context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
     label_thread = LabelThread(from_gauge("gauge", 9600), context)
@@ -231,7 +234,10 @@ def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
 
 
 class PollCounter(threading.Event):
-    """Stop event that counts its waits. The follower of a table waits on this event once per poll."""
+    """A stop event that counts how often a program waits for it.
+
+    The reader of a growing table waits for this event once per poll.
+    """
 
     def __init__(self):
         super().__init__()
@@ -243,7 +249,7 @@ class PollCounter(threading.Event):
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_growing_table_is_followed(context, tmp_path, exists):
+def test_rows_that_are_appended_to_a_table_are_read(context, tmp_path, exists):
     file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
     rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
     if exists:
@@ -254,7 +260,7 @@ def test_growing_table_is_followed(context, tmp_path, exists):
     with file.open("a") as stream:
         stream.write(rows if exists else old + rows)
     before_n = poll_counter.polls_n
-    # two polls, because the first may have begun before the append
+    # Two polls are awaited, because the first one may have begun before the rows were appended.
     wait_until(lambda: poll_counter.polls_n > before_n + 1)
     assert label_thread.end(LONG_S) == "1 touches labelled"
     log = log_of(tmp_path)
@@ -267,7 +273,7 @@ def test_growing_table_is_followed(context, tmp_path, exists):
     ("interruption", "problem"),
     [("replaced", "replaced"), ("cut", r"shortened to \d+ bytes, but \d+ were read"), ("removed", "removed")],
 )
-def test_interrupted_table_ends_the_labels(context, tmp_path, interruption, problem):
+def test_labels_end_when_reading_the_table_is_interrupted(context, tmp_path, interruption, problem):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
     label_thread = LabelThread(from_table(file), context)
@@ -275,7 +281,7 @@ def test_interrupted_table_ends_the_labels(context, tmp_path, interruption, prob
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
-        if context.marks:  # there is a mark as soon as the source has skipped the existing rows
+        if context.marks:  # There is a mark as soon as the source has skipped the rows that existed before.
             break
     if interruption == "replaced":
         (tmp_path / "new.csv").write_text(header)

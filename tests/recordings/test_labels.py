@@ -1,4 +1,4 @@
-"""Tests that labels become the same dwells in any chunks, and that the probe log is always valid."""
+"""Tests that labels become the same dwells (stops of the tip) for chunks of any size, and the probe log is valid."""
 
 import math
 
@@ -26,14 +26,15 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
                   st.floats(0, 100), st.floats(0.001, 5))  # fmt: skip
 
 
-def test_touch_is_written_after_its_noload_dwell(tmp_path):
+def test_touch_is_written_if_a_no_load_dwell_comes_before_it(tmp_path):
     writer = ProbeLogWriter(tmp_path)
-    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # skipped: no no-load dwell before it
+    # This dwell is skipped, because no no-load dwell comes before it.
+    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))
     writer.write(Dwell(Label(False), 1.0, 2.0))
     assert len((tmp_path / PROBE_FILE).read_text().splitlines()) == 1
     writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.5, pass_i=1), 3.0, 4.0))
-    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # a longer dwell of the same touch
-    writer.write(Dwell(Label(False), 4.5, 5.5))  # skipped: begins before the touch has ended
+    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # This is a later dwell of the same touch.
+    writer.write(Dwell(Label(False), 4.5, 5.5))  # This dwell is skipped, because it begins before the touch has ended.
     log = probe.parse(tmp_path / PROBE_FILE, "log")
     assert log.indentation.tolist() == [0, 0, 0]
     assert log.contact.tolist() == [False, True, True]
@@ -42,10 +43,11 @@ def test_touch_is_written_after_its_noload_dwell(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # skipped: a late label from a program that hangs
+    # This dwell is skipped, because it is the late label of a program that hangs.
+    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))
 
 
-def test_touch_that_moves_without_lift_is_skipped(tmp_path):
+def test_touch_that_moves_to_another_place_without_a_lift_is_skipped(tmp_path):
     writer = ProbeLogWriter(tmp_path)
     places = [(4.0, 8.0), (4.001, 8.0), (5.0, 8.0), (4.0, 9.0), (math.nan, 8.0), (4.0, 8.0)]
     writer.write(Dwell(Label(False), 0.0, 1.0))
@@ -59,7 +61,7 @@ def test_touch_that_moves_without_lift_is_skipped(tmp_path):
 
 @settings(max_examples=60)
 @given(st.lists(DWELL, max_size=12))
-def test_any_labels_make_a_readable_log(tmp_path_factory, dwells):
+def test_log_of_any_sequence_of_labels_can_be_read(tmp_path_factory, dwells):
     folder = tmp_path_factory.mktemp("labels")
     writer = ProbeLogWriter(folder)
     for dwell in dwells:
@@ -96,7 +98,7 @@ def dwells_of(text: str, chunk_n: int = 10**6) -> tuple[list[Dwell], SampleTable
     return [*found, *dwells.close()], table
 
 
-def test_one_dwell_per_phase():
+def test_each_phase_of_a_table_becomes_one_dwell():
     text = HEAD + rows("noload", 0, 30, 1) + rows("moving", 3, 5, 2) + rows("contact", 4, 4, 3, 0.5)
     (rest, touch), _ = dwells_of(text)
     assert (rest.label.contact, rest.t_start_s, rest.t_end_s) == (False, 0.0, 2.9)
@@ -104,7 +106,7 @@ def test_one_dwell_per_phase():
     assert touch.label.Fz_N == 0.5
 
 
-def test_long_touch_or_new_place_starts_a_new_dwell():
+def test_long_touch_is_divided_into_dwells_and_a_new_place_starts_a_new_one():
     text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
     found, _ = dwells_of(text)
     assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)
@@ -115,15 +117,15 @@ def test_long_touch_or_new_place_starts_a_new_dwell():
 
 @settings(max_examples=40)
 @given(st.integers(1, 60))
-def test_chunks_do_not_matter(chunk_n):
+def test_dwells_do_not_depend_on_the_size_of_chunks(chunk_n):
     text = HEAD + rows("noload", 0, 9, 1) + "noise\n\n1,2\n" + rows("contact", 4, 9, 3, 0.5)
     whole, parts = dwells_of(text), dwells_of(text, chunk_n)
-    assert repr(whole[0]) == repr(parts[0])  # compared as text, because NaN != NaN
+    assert repr(whole[0]) == repr(parts[0])  # Results are compared as text, because NaN is not equal to itself.
     assert whole[1].bad_n == parts[1].bad_n == 2
     assert parts[1].first_bad == "noise"
 
 
-def test_force_threshold_replaces_phase():
+def test_table_without_phases_is_divided_by_a_threshold_of_the_force():
     forces_N = [0, 0.01] * 3 + [0.03] + [0.4] * 3
     text = "t_s,Fz_N\n" + "".join(f"{0.1 * i},{force_N}\n" for i, force_N in enumerate(forces_N))
     (rest, touch), table = dwells_of(text)
@@ -138,7 +140,7 @@ def test_invalid_columns_are_refused(head):
         SampleTable("log").feed(head.encode() + b"\n")
 
 
-def test_gauge_lines_have_one_or_three_numbers():
+def test_lines_of_a_gauge_contain_one_or_three_numbers():
     gauge = GaugeLines()
     found = gauge.feed(b"0.50\r\n0.1 -0.2; 0.7\n1,2\nERR\n0.", 3.0) + gauge.feed(b"9\n", 4.0)
     assert [(one.t_s, one.label.Fz_N) for one in found] == [(3.0, 0.5), (3.0, 0.7), (4.0, 0.9)]
@@ -146,7 +148,7 @@ def test_gauge_lines_have_one_or_three_numbers():
     assert (gauge.bad_n, gauge.first_bad) == (2, "1,2")
 
 
-def test_endless_line_is_dropped():
+def test_line_that_never_ends_is_dropped():
     lines = LineBuffer()
     for _ in range(1000):
         lines.feed(b"9" * 100)
@@ -159,7 +161,8 @@ def test_too_short_touches_are_counted():
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
     assert dwells.summary().startswith("2 touches left out: a touch needs 0.05 s")
-    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: one dwell, and a rest of 0.01 s
+    # The touch lasts 0.52 s. This is one dwell, and a rest of 0.01 s that is too short for another dwell.
+    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
     assert dwells.short_n == 2
     list(dwells.feed(table.feed(b"7,contact,4,8\n8,noload,4,8\n")))

@@ -1,4 +1,4 @@
-"""Tests of `reskin.load_recording`: each kind of recording gives the readings that the project's readers return."""
+"""Tests of `reskin.load_recording`, which must return the same readings as the readers of each kind of recording."""
 
 import sys
 
@@ -26,11 +26,12 @@ from tests.test_io import readings
 
 RATE_HZ, FRAMES_N, CHIPS_N = 100.0, 120, 2
 CHANNELS = ["bx0_uT", "by0_uT", "bz0_uT", "bx1_uT", "by1_uT", "bz1_uT"]
-PLACES_MM = (2.0, 6.0, 10.0)  # x of the three contacts; each lasts 0.2 s, after 0.2 s without contact
+# The x coordinates of three contacts. Each lasts 0.2 s, and comes after 0.2 s without contact.
+PLACES_MM = (2.0, 6.0, 10.0)
 
 
 def frames_of_board() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times, fields (two decimals) and temperatures of frames with three contacts."""
+    """Return the times, fields (with two decimals) and temperatures of frames with three contacts."""
     t_s = (1 + np.arange(FRAMES_N)) / RATE_HZ
     in_contact = (t_s % 0.4 > 0.2)[:, None]
     b_uT = 900 + 300 * in_contact + 3 * rng_for(0, "frames").standard_normal((FRAMES_N, 3 * CHIPS_N))
@@ -38,7 +39,7 @@ def frames_of_board() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def labels() -> str:
-    """Return the labels of the contacts, on the clock of the stream."""
+    """Return the labels of the contacts, with times on the clock of the stream."""
     rows = [",".join(probe.TYPES)]
     for i, x_mm in enumerate(PLACES_MM):
         start_s = 0.4 * i
@@ -48,7 +49,10 @@ def labels() -> str:
 
 
 def write_stream(folder, files=None):
-    """Write the frames to a capture's folder, as `reskin record` does, with further files such as labels."""
+    """Write the frames to the folder of a capture, as `reskin record` does.
+
+    Further files, such as labels, are added.
+    """
     t_s, b_uT, temperature_degC = frames_of_board()
     stream = encode(Frames(b_uT, temperature_degC, t_s, np.zeros(FRAMES_N, np.int64)), "binary")
     ends = record_type("binary", CHIPS_N).itemsize * np.arange(FRAMES_N + 1)
@@ -66,7 +70,7 @@ def check_units(frame):
     assert all(unit == "1" for name, unit in numeric.items() if not name.endswith(f"_{unit}"))
 
 
-def test_logs_of_all_kinds_have_the_same_frames(tmp_path):
+def test_frames_of_all_kinds_of_logs_are_the_same(tmp_path):
     t_s, b_uT, temperature_degC = frames_of_board()
     folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
     (tmp_path / "log.csv").write_text(sd_card.render(t_s, b_uT, temperature_degC))
@@ -89,7 +93,7 @@ def test_logs_of_all_kinds_have_the_same_frames(tmp_path):
     assert set(stream["board"]) == {"board1"}
 
 
-def test_labelled_capture_has_the_rows_of_the_ingested_capture(tmp_path):
+def test_labelled_capture_has_the_rows_that_stage_ingest_makes(tmp_path):
     folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
     _, blocks, counts = open_capture(folder, DEFAULT_POLICY)
     io.write_readings(tmp_path / "run1.parquet", blocks, counts)
@@ -108,15 +112,16 @@ def test_labelled_capture_has_the_rows_of_the_ingested_capture(tmp_path):
     np.testing.assert_array_equal(frame[CHANNELS], expected.b_uT)
     np.testing.assert_array_equal(frame.filter(like="noload_"), expected.noload_uT)
     np.testing.assert_array_equal(frame.filter(like="db"), expected.b_uT - expected.noload_uT)
-    assert frame["dbx0_uT"].between(290, 310).all()  # contacts add 300 uT; three sd of the noise are 9 uT
+    # Contacts add 300 uT. The tolerance of 10 uT is about three standard deviations of the noise.
+    assert frame["dbx0_uT"].between(290, 310).all()
     assert sorted(frame["x_mm"].unique()) == list(PLACES_MM)
 
 
-def test_faults_are_handled_as_in_ingestion():
+def test_faults_are_handled_as_in_stage_ingest():
     assert STANDARD_POLICY == DEFAULT_POLICY
 
 
-def test_table_is_read_as_a_capture_of_this_layout(tmp_path):
+def test_table_file_is_read_like_a_capture_of_its_layout(tmp_path):
     t_s, b_uT, _ = frames_of_board()
     contact = t_s % 0.4 > 0.2
     columns = {"phase": np.where(contact, "contact", "noload"), "t_s": t_s, "Fz_N": np.where(contact, 1.5, np.nan)}
@@ -128,7 +133,8 @@ def test_table_is_read_as_a_capture_of_this_layout(tmp_path):
     frame = reskin.load_recording(tmp_path / "my table.csv")
 
     check_units(frame)
-    # tolerance: the CSV has as few digits as float32 needs, so the means of no-load fields differ by rounding
+    # Tolerance: the CSV has only as many digits as single precision needs, so the means of no-load fields differ by
+    # rounding.
     pd.testing.assert_frame_equal(frame, reskin.load_recording(tmp_path / "my table.parquet"), rtol=1e-6, atol=1e-4)
     np.testing.assert_array_equal(frame[CHANNELS], b_uT[contact])
     assert (set(frame["capture"]), set(frame["board"])) == ({"my_table"}, {"unnamed"})
@@ -138,7 +144,7 @@ def test_table_is_read_as_a_capture_of_this_layout(tmp_path):
         reskin.load_recording(tmp_path / "my table.csv", frames=True)
 
 
-def test_other_files_are_errors_that_name_the_file(tmp_path):
+def test_error_for_another_file_names_the_file(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     io.write_table(tmp_path / "other.parquet", pa.table({"x": [1.0]}))
@@ -158,13 +164,13 @@ def test_other_files_are_errors_that_name_the_file(tmp_path):
         reskin.load_recording(stream / STREAM_FILE)
 
 
-def test_recorded_layout_is_named(shared_data):
+def test_layout_that_is_needed_is_named_in_the_error(shared_data):
     for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
         with pytest.raises(ReskinError, match=f"This is layout {layout}: run `reskin add`"):
             reskin.load_recording(shared_data / name)
 
 
-def test_missing_pandas_is_an_error_that_names_the_extra(tmp_path, monkeypatch):
+def test_error_names_the_extra_to_install_if_pandas_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(
         ParamsError, match=r"load_recording: the Python package `pandas` is not installed.*'\.\[learn\]'"

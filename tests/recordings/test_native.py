@@ -1,4 +1,7 @@
-"""Tests of native captures: indentations are recovered, and every byte and frame is in a reading or counted as lost."""
+"""Tests of captures in our own format, whose bytes are decoded.
+
+Indentations are recovered, and every byte and frame is in a reading or counted as lost.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -21,9 +24,10 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 RATE_HZ = 100.0
-OFFSET_S = 40.0  # probe time minus stream time
+OFFSET_S = 40.0  # The time of the probe minus the time of the stream.
 INDENTATIONS_N = 60
-NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5  # frames per phase of an indentation: no load, moving (down and up), contact
+# The number of frames in each phase of an indentation: without load, while the tip moves down or up, and in contact.
+NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5
 CHIPS_N = 5
 
 
@@ -45,7 +49,8 @@ def simulate_presses() -> tuple[Frames, ProbeLog]:
         )
         parts.append(share[:, None] * rng.normal(0, 200, 15))
         pressed = begin + NOLOAD_N + down_n
-        # Frame i ends at (i + 1) / RATE_HZ; dwells extend half a frame beyond their first and last frame.
+        # Frame i ends at (i + 1) / RATE_HZ. Dwells begin half a frame before their first frame, and end half a frame
+        # after their last one.
         rows.append((number, False, begin + 0.5, begin + NOLOAD_N + 0.5))
         rows.append((number, True, pressed + 0.5, pressed + CONTACT_N + 0.5))
         begin += len(share)
@@ -72,7 +77,10 @@ def header_of(wire: Wire, kind: str = "arrivals", marks: tuple[tuple[float, floa
 
 
 def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> Path:
-    """Write the files of a capture; bytes arrive in chunks of 1 to 7 frames, at the end of the chunk's last frame."""
+    """Write the files of a capture.
+
+    Bytes arrive in chunks of 1 to 7 frames, at the time at which the last frame of the chunk ends.
+    """
     whole = encode(frames, wire)
     rows = np.arange(len(frames))
     ends = np.cumsum([len(encode(frames.where(rows == row_i), wire)) for row_i in rows])
@@ -97,7 +105,7 @@ def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def expected_readings() -> dict[str, np.ndarray]:
-    """Return the expected readings, by a loop over dwells and the frames before encoding."""
+    """Return the expected readings. They are computed by a loop over dwells, from the frames before encoding."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("indentation", "reading_i", "x_mm", "b_uT", "noload_uT", "t_s")
     }
@@ -124,20 +132,20 @@ def test_indentations_are_recovered(
 ) -> None:
     found, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
     for name, column in expected_readings().items():
-        # Means of no-load readings are rounded to float32. The time of a text frame is estimated from its position in
-        # the bytes; as lines have different lengths, it is wrong by up to half a frame.
+        # Tolerances: means of no-load readings are rounded to single precision. The time of a text frame is estimated
+        # from its position in the bytes; as lines have different lengths, it is wrong by up to half a frame.
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
         np.testing.assert_allclose(found[name], column, rtol=0, atol=atol, err_msg=name)
     assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N
     assert account["frames_n"] == len(FRAMES)
 
 
-def test_bytes_of_a_damaged_stream_are_accounted_for(tmp_path: Path) -> None:
+def test_every_byte_of_a_damaged_stream_is_counted(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
     b_uT[20:23, 3:6], temperature_degC[20:23, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[40] = np.nan
     whole = encode(dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC), "binary")
-    broken = whole[: 82 * 100 + 30] + whole[82 * 101 :]  # 52 bytes of a frame are missing
+    broken = whole[: 82 * 100 + 30] + whole[82 * 101 :]  # A part of one frame, 52 bytes, is missing.
     _, account = read(write(tmp_path, "binary", stream=broken), header_of("binary", "rate"))
     assert account["bytes_n"] == len(broken)
     skipped = [key for key in account if key.startswith("skipped_") and key.endswith("_bytes_n")]
@@ -157,7 +165,7 @@ def with_chip_1(rows: slice, values_uT: np.ndarray) -> Frames:
 
 
 @pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
-def test_stuck_chip_loses_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
+def test_frames_with_a_stuck_chip_are_dropped(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
     begin = len(FRAMES) // 3
     frozen = with_chip_1(slice(begin, None), FRAMES.b_uT[begin, 3:6])
     _, account = read(write(tmp_path, "binary", frozen), header_of("binary", marks=marks))
@@ -167,7 +175,7 @@ def test_stuck_chip_loses_its_frames(tmp_path: Path, marks: tuple[tuple[float, f
     assert account["frames_n"] == used + sum(account[key] for key in dropped)
 
 
-def test_reset_chip_is_named(tmp_path: Path) -> None:
+def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
     b_uT = FRAMES.b_uT.copy()
     steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
     b_uT = np.round(b_uT / steps_uT) * steps_uT
@@ -186,8 +194,11 @@ def test_stream_in_another_unit_is_refused(tmp_path: Path, factor: float) -> Non
 
 
 @pytest.mark.parametrize(("sent", "declared"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
-@pytest.mark.parametrize("scale", [1.0, 0.05])  # with 0.05, field values in uT are as small as temperatures in degC
-def test_wrong_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wire, scale: float) -> None:
+# With a scale of 0.05, fields in uT are numbers as small as temperatures in degC.
+@pytest.mark.parametrize("scale", [1.0, 0.05])
+def test_stream_whose_columns_have_another_order_is_refused(
+    tmp_path: Path, sent: Wire, declared: Wire, scale: float
+) -> None:
     frames = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(scale))
     with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {declared} .* Is the wire format {sent}\?"):
         read(write(tmp_path, sent, frames), header_of(declared))
@@ -199,7 +210,7 @@ def test_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
         read(folder, header_of("binary"))
 
 
-def test_readings_do_not_depend_on_the_block_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readings_do_not_depend_on_the_size_of_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header = header_of("binary")
     whole, whole_account = read(write(tmp_path, "binary"), header)
     monkeypatch.setattr(ingest, "BLOCK_BYTES_N", 1000)
@@ -211,7 +222,7 @@ def test_readings_do_not_depend_on_the_block_size(tmp_path: Path, monkeypatch: p
 
 def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
-    # a failed read in a frame without a time
+    # One of the frames without an arrival time has a failed read.
     b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
     folder = write(tmp_path, "binary", frames)
@@ -224,7 +235,7 @@ def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
     assert "fault_failed_read_first_ms" not in account
 
 
-def test_parquet_round_trip(tmp_path: Path) -> None:
+def test_readings_written_to_parquet_are_read_unchanged(tmp_path: Path) -> None:
     blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), DEFAULT_POLICY)
     io.write_readings(tmp_path / "c.parquet", blocks, account)
     assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
@@ -247,7 +258,9 @@ def test_parquet_round_trip(tmp_path: Path) -> None:
         ({}, "recording", "clock.kind must be 'arrivals' or 'rate'"),
     ],
 )
-def test_broken_capture_is_refused(tmp_path: Path, files: dict[str, bytes], kind: str, message: str) -> None:
+def test_capture_with_damaged_files_is_refused(
+    tmp_path: Path, files: dict[str, bytes], kind: str, message: str
+) -> None:
     write(tmp_path, "binary", **files)
     for marks in (MARKS, ()):
         with pytest.raises(CaptureError, match=message):
@@ -255,7 +268,7 @@ def test_broken_capture_is_refused(tmp_path: Path, files: dict[str, bytes], kind
 
 
 @pytest.mark.parametrize("name", [STREAM_FILE, ARRIVALS_FILE, PROBE_FILE])
-def test_missing_file_is_an_error(tmp_path: Path, name: str) -> None:
+def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
     (write(tmp_path, "binary") / name).unlink()
     with pytest.raises(CaptureError, match=f"{name}: file not found"):
         read(tmp_path, header_of("binary"))

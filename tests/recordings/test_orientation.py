@@ -1,4 +1,4 @@
-"""Tests that swapped, mirrored and rotated labels are detected by comparison with captures of other skins."""
+"""Tests that exchanged, mirrored and rotated axes of labels are detected by comparison with captures of other skins."""
 
 import shutil
 
@@ -15,7 +15,7 @@ DEPARTURES = [name for name in ORIENTATIONS if name != "as they are"]
 
 
 def board(name: str, presses_n: int = 60) -> Presses:
-    """Return presses of a skin with noise and random gains of the channels."""
+    """Return presses of a skin, with noise and random gains of the channels."""
     rng = rng_for(0, "orientation", name)
     place_mm = rng.uniform(-8, 8, (presses_n, 2))
     db_uT = fields_uT(place_mm, rng.uniform(1, 5, presses_n)) * rng.normal(1, 0.1, 15)
@@ -33,11 +33,11 @@ def inverse_of(way: str) -> str:
 
 
 @pytest.mark.parametrize("way", DEPARTURES)
-def test_departure_is_the_inverse_of_the_change_of_labels(way):
+def test_reported_departure_is_the_inverse_of_the_change_of_labels(way):
     assert other_orientation(relabel(board("one"), way), board("other")) == inverse_of(way)
 
 
-def test_correct_or_uninformative_labels_raise_no_alarm():
+def test_correct_labels_and_captures_without_information_raise_no_alarm():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
     assert other_orientation(relabel(board("few", 19), "with x mirrored"), other) is None
@@ -48,7 +48,10 @@ def test_correct_or_uninformative_labels_raise_no_alarm():
 
 
 def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
-    """The test uses depth 2. Of all 18 pairs, one is inconclusive: board 2 at depth 3 with board 1 at depth 1."""
+    """The recordings at depth 2 are used.
+
+    Of all 18 pairs of recordings, one is inconclusive: board 2 at depth 3 compared with board 1 at depth 1.
+    """
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)

@@ -1,4 +1,4 @@
-"""Tests of reading and writing the probe log (CSV); errors name the row."""
+"""Tests of reading and writing the probe log, a CSV file with the labels. Errors name the row."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ def assert_same(one: ProbeLog, other: ProbeLog) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-def test_log_round_trip() -> None:
+def test_written_log_is_read_unchanged() -> None:
     log = probe.parse(GOOD, "probe.csv")
     assert log.indentation.tolist() == [0, 0, 1, 1]
     assert log.contact.tolist() == [False, True, False, True]
@@ -38,12 +38,12 @@ def test_log_round_trip() -> None:
     assert log.Fz_N[3] == 2.5
 
 
-def test_column_order_does_not_matter() -> None:
+def test_order_of_columns_does_not_matter() -> None:
     swapped = "\n".join(",".join(reversed(row.split(","))) for row in GOOD.splitlines()) + "\n"
     assert_same(probe.parse(swapped, "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
 
-def test_file_reads_like_its_text(tmp_path: Path) -> None:
+def test_log_is_read_from_a_file_as_from_its_text(tmp_path: Path) -> None:
     (tmp_path / "probe.csv").write_text(GOOD, encoding="utf-8")
     assert_same(probe.parse(tmp_path / "probe.csv", "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
@@ -53,7 +53,7 @@ def test_file_reads_like_its_text(tmp_path: Path) -> None:
     begin_s=st.floats(-1e9, 1e9),
     label=st.floats(-(2.0**100), 2.0**100, width=32) | st.just(float("nan")),
 )
-def test_round_trip_is_exact(lengths: list[float], begin_s: float, label: float) -> None:
+def test_numbers_are_written_without_rounding(lengths: list[float], begin_s: float, label: float) -> None:
     edges_s = begin_s + np.cumsum(lengths)
     labels = {name: np.array([np.nan, label], np.float32) for name in LABELS}
     number = np.zeros(2, np.int32)
@@ -87,13 +87,13 @@ def test_round_trip_is_exact(lengths: list[float], begin_s: float, label: float)
         (GOOD, "\n\n", "CSV|row 1"),
     ],
 )
-def test_invalid_log_names_the_row(old: str, new: str, message: str) -> None:
+def test_error_names_the_row_of_an_invalid_log(old: str, new: str, message: str) -> None:
     assert old in GOOD
     with pytest.raises(CaptureError, match=rf"^probe\.csv.*({message})"):
         probe.parse(GOOD.replace(old, new, 1), "probe.csv")
 
 
-def test_random_bytes_raise_capture_error(tmp_path: Path) -> None:
+def test_random_bytes_raise_a_capture_error(tmp_path: Path) -> None:
     noise = rng_for(0, "noise").bytes(4096)
     (tmp_path / "probe.csv").write_bytes(noise)
     with pytest.raises(CaptureError):

@@ -1,6 +1,6 @@
 """Tests that the public recordings contain what data/README.md describes.
 
-Each recording is copied into a capture folder as `reskin add` does, and read by the reader of its layout.
+Each recording is copied into the folder of a capture as `reskin add` does, and read by the reader of its layout.
 """
 
 import shutil
@@ -24,7 +24,7 @@ SCREW = "ini/b20_artillery_AFG_board2_50_screw.txt"
 
 
 def ingest(reader: ModuleType, recording: Path, folder: Path, **changed: object) -> tuple[Readings, dict[str, int]]:
-    """Copy a recording into a capture folder as `reskin add` does; return its readings and account."""
+    """Copy a recording into the folder of a capture as `reskin add` does. Return its readings and their account."""
     files = reader.collect(recording)
     for name, source in files.items():
         shutil.copyfile(source, folder / name)
@@ -59,7 +59,7 @@ def test_lab_file_has_65_presses_of_100_readings(shared_data: Path, tmp_path: Pa
     assert readings.Fz_N.max() < 9.6
 
 
-def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None:
+def test_forces_of_lab_recordings_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None:
     soft, _ = ingest(lab, shared_data / "lab/board1_depth1.csv", tmp_path)
     hard, _ = ingest(lab, shared_data / "lab/board2_depth3.csv", tmp_path)
     assert 0.6 < soft.Fz_N.min() < 0.7
@@ -68,26 +68,28 @@ def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # The tip pushes the skin. From fields alone, experiment compare finds a move of 48 um along the +x axis of the
-    # labels.
+    # The tip pushes the skin along x while it presses. From the fields alone, experiment compare finds that the skin
+    # moves by 48 um along the +x axis of the labels.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
 
 @pytest.mark.parametrize("name", LAB)
-def test_lab_noise_matches_the_data_sheet(shared_data: Path, name: str) -> None:
-    # Noise about the mean of each press: 65 x 9 degrees of freedom per channel give a standard error of 3 %.
+def test_noise_of_lab_recordings_equals_that_of_the_data_sheet(shared_data: Path, name: str) -> None:
+    # The noise is the deviation from the mean of each press. With 65 x 9 degrees of freedom per channel, its standard
+    # error is 3 %.
     trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
     names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
     columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
     b_uT = np.array([[float(row[i]) for i in columns] for row in rows]).reshape(65, 10, 15)
     sd_uT = np.sqrt(b_uT.var(axis=1, ddof=1).mean(axis=0)).reshape(5, 3)
-    # All recordings have 3.0-3.3 uT (x, y) and 4.4-5.0 uT (z); single channels scatter by the standard error of 3 %.
+    # In all recordings, the noise is 3.0 to 3.3 uT (x, y) and 4.4 to 5.0 uT (z). Single channels deviate by the
+    # standard error of 3 %.
     assert ((sd_uT[:, :2] > 2.9) & (sd_uT[:, :2] < 3.5)).all()
     assert ((sd_uT[:, 2] > 4.3) & (sd_uT[:, 2] < 5.3)).all()
 
 
-def test_lab_skins_are_magnetised_to_millitesla(shared_data: Path, tmp_path: Path) -> None:
+def test_fields_of_lab_skins_are_a_few_millitesla(shared_data: Path, tmp_path: Path) -> None:
     noload = [ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)[0].noload_uT for name in LAB]
     strength_uT = np.linalg.norm(np.concatenate(noload).reshape(-1, 5, 3), axis=2)
     assert 3600 < strength_uT.max() < 3800
@@ -96,7 +98,7 @@ def test_lab_skins_are_magnetised_to_millitesla(shared_data: Path, tmp_path: Pat
 def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> None:
     readings, account = ingest(ini, shared_data / SCREW, tmp_path)
     assert account["rows_read_n"] == 23_300
-    assert account["rows_n"] == 23_299  # fields are one row late, which leaves one row without a partner
+    assert account["rows_n"] == 23_299  # The fields are one row late. Therefore one row has no partner.
     assert account["passes_n"] == 50
     assert np.bincount(readings.pass_i).tolist() == [466] * 49 + [465]
     touching = np.isfinite(readings.x_mm)
@@ -107,15 +109,15 @@ def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> No
     assert readings.Fz_N.max() == np.float32(4.1)
 
 
-def test_ini_centre_is_one_of_the_places(shared_data: Path, tmp_path: Path) -> None:
+def test_centre_of_the_ini_grid_is_one_of_its_places(shared_data: Path, tmp_path: Path) -> None:
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path)
     centre = (readings.x_mm == 10) & (readings.y_mm == 10)
     assert centre.sum() == 6 * 50
     assert (readings.Fz_N[centre] > 0).all()
 
 
-def test_ini_fields_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
-    # Known fault of these recordings: the field in a row belongs to the force in the previous row.
+def test_fields_of_ini_recordings_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
+    # This is a known fault of these recordings: the field in a row belongs to the force in the previous row.
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path, options={"rows_late": "0"})
     change_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     same_row = np.corrcoef(readings.Fz_N[:-1], change_uT[:-1])[0, 1]
@@ -131,7 +133,7 @@ def test_ini_fields_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
         ("piezo", "0.98"),
     ],
 )
-def test_broken_ini_recordings_are_refused(shared_data: Path, tmp_path: Path, name: str, expected: str) -> None:
+def test_incomplete_ini_recordings_are_refused(shared_data: Path, tmp_path: Path, name: str, expected: str) -> None:
     with pytest.raises(CaptureError, match=expected) as caught:
         ingest(ini, shared_data / "ini/faults" / f"b20_artillery_{name}.head400.txt", tmp_path)
     assert "\n" not in str(caught.value)
@@ -156,13 +158,14 @@ def test_eflesh_gauge_recorded_ten_strokes(shared_data: Path, tmp_path: Path, na
     assert 0.48 < account["no_new_force_rows_n"] / account["rows_n"] < 0.49
     assert set(readings.x_mm) == set(readings.y_mm) == {0.0}
     assert 11.9 < readings.depth_mm.max() < 12.1
-    # gauge readings of 3.3 and 3.5 kg at the greatest depth
+    # The readings of the gauge are 3.3 and 3.5 kg at the greatest depth.
     assert 32 < np.nanmax(readings.Fz_N) < 34.5
 
 
 @pytest.mark.parametrize("name", [NORMAL, SHEAR])
-def test_each_eflesh_pass_is_one_stroke(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # Passes are found from new baselines; the robot's z, which the reader does not use for that, agrees.
+def test_each_pass_of_the_eflesh_gauge_is_one_stroke(shared_data: Path, tmp_path: Path, name: str) -> None:
+    # Passes are found from new baselines. The z coordinate of the robot, which the reader does not use for this
+    # purpose, gives the same passes.
     readings, account = ingest(eflesh, shared_data / name, tmp_path, options={"force_axis": "z"})
     assert account["passes_n"] == 10
     for pass_i in range(10):
@@ -184,7 +187,7 @@ def test_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: Path)
     ("name", "places", "zero_rows_n", "force_max_N"),
     [("position_1_20251028_003401", {1}, 18, 3.5), ("multi_touch_2_7_20251109_234435", {2, 7}, 41, 12.7)],
 )
-def test_eflash7_places_are_numbered_and_zeros_dropped(
+def test_eflash7_places_are_numbered_and_rows_of_zeros_are_dropped(
     shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, force_max_N: float
 ) -> None:
     readings, account = ingest(eflash7, shared_data / "eflash7" / f"{name}.csv", tmp_path)
@@ -194,7 +197,7 @@ def test_eflash7_places_are_numbered_and_zeros_dropped(
     np.testing.assert_allclose(readings.Fz_N.max(), force_max_N, atol=0.1)
 
 
-def test_eflash7_starts_without_touch_with_a_changed_no_load_field(shared_data: Path, tmp_path: Path) -> None:
+def test_later_eflash7_recordings_start_with_another_no_load_field(shared_data: Path, tmp_path: Path) -> None:
     files = sorted((shared_data / "eflash7").glob("*.csv"))
     assert len(files) == 19
     rest_uT, read_n = [], 0
@@ -205,4 +208,5 @@ def test_eflash7_starts_without_touch_with_a_changed_no_load_field(shared_data: 
         rest_uT.append(np.linalg.norm(readings.noload_uT[0]))
         read_n += account["rows_read_n"]
     assert read_n == 7351
-    assert 270 < max(rest_uT) < 280  # in the ninth single touch, 12 minutes after the first
+    # The largest change is in the ninth recording of single touches, 12 minutes after the first one.
+    assert 270 < max(rest_uT) < 280

@@ -1,4 +1,4 @@
-"""Tests of reading and writing SD card logs; faults and errors."""
+"""Tests of reading and writing the logs that a board writes to an SD card, with faults and errors."""
 
 import numpy as np
 import pytest
@@ -31,18 +31,18 @@ def lines(file):
 
 
 @given(chips_n=st.integers(1, 8))
-def test_log_round_trip(tmp_path_factory, chips_n):
+def test_written_log_is_read_unchanged(tmp_path_factory, chips_n):
     t_s, b_uT, temperature_degC = random_log(chips_n=chips_n)
     file = tmp_path_factory.mktemp("card") / "log.csv"
     file.write_text(render(t_s, b_uT, temperature_degC))
     read_s, read_uT, read_degC, account = read_log(file)
-    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # times have four decimals
-    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # fields have two decimals
+    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # Tolerance: times are written with four decimals.
+    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # Tolerance: fields are written with two decimals.
     np.testing.assert_allclose(read_degC, temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == account["rows_read_n"] == 60
 
 
-def test_header_is_that_of_the_text_firmware(log):
+def test_header_line_is_that_of_the_firmware_that_writes_text(log):
     assert column_names(2) == ["t_s", "T0", "Bx0", "By0", "Bz0", "T1", "Bx1", "By1", "Bz1"]
     assert lines(log)[0] == "t_s,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1\n"
 
@@ -82,14 +82,14 @@ def test_temperatures_may_be_missing(log):
         (lambda _: [], "the file is empty"),
     ],
 )
-def test_broken_log_is_refused(log, change, message):
+def test_log_with_invalid_content_is_refused(log, change, message):
     log.write_text("".join(change(lines(log))))
     with pytest.raises(CaptureError, match=message) as refused:
         read_log(log)
     assert "\n" not in str(refused.value)
 
 
-def test_missing_log_is_an_error(tmp_path):
+def test_missing_log_is_reported(tmp_path):
     with pytest.raises(CaptureError, match="file not found"):
         read_log(tmp_path / "log.csv")
 
@@ -101,10 +101,10 @@ def test_missing_frames_are_counted(log):
     assert (account["gaps_n"], account["gap_frames_n"]) == (2, 4)
 
 
-def test_failed_reads_and_stuck_chips_are_dropped(log):
+def test_frames_with_failed_reads_and_stuck_chips_are_dropped(log):
     t_s, b_uT, temperature_degC = random_log()
     b_uT[3, :3], temperature_degC[3, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
-    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 equal frames: from the 20th on, the chip counts as stuck
+    b_uT[30:, 3:] = b_uT[30, 3:]  # There are 30 equal frames. From the 20th of them on, the chip counts as stuck.
     log.write_text(render(t_s, b_uT, temperature_degC))
     read_s, _, _, account = read_log(log)
     assert account["dropped_failed_read_rows_n"] == 1
@@ -113,7 +113,7 @@ def test_failed_reads_and_stuck_chips_are_dropped(log):
     assert not np.isclose(read_s, t_s[3]).any()
 
 
-def test_reset_chip_is_refused(log):
+def test_chip_with_power_on_settings_is_refused(log):
     t_s, b_uT, temperature_degC = random_log(frames_n=400, chips_n=3)
     b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
     log.write_text(render(t_s, b_uT, temperature_degC))
@@ -134,7 +134,7 @@ def test_time_in_another_unit_is_refused(log, factor, rate):
         read_log(log)
 
 
-def test_byte_order_mark_changes_nothing(log):
+def test_byte_order_mark_is_ignored(log):
     plain = read_log(log)
     log.write_bytes(b"\xef\xbb\xbf" + log.read_bytes())
     marked = read_log(log)

@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = make_frames(100, 5, 0)
-LONG_s = 120.0  # time limit in s that a passing test never reaches
+LONG_s = 120.0  # A time limit in s, which a passing test never reaches.
 SETTINGS = PortSettings(
     baud=115200, wire="binary", chips_n=5, duration_s=LONG_s, bytes_max_n=None, silence_s=LONG_s, no_frame_s=LONG_s
 )
@@ -39,14 +39,14 @@ SETTINGS = PortSettings(
 
 @dataclass
 class Board:
-    """The board's end of a pseudo-terminal; the bytes that it sends arrive at the port `name`."""
+    """The board's end of a pseudo-terminal. The bytes that it sends arrive at the port `name`."""
 
     board_fd: int
     port_fd: int
     name: str
 
     def send(self, *chunks: bytes) -> None:
-        with suppress(OSError):  # fails if the port is no longer open
+        with suppress(OSError):  # Sending fails if the port is no longer open.
             for chunk in chunks:
                 os.write(self.board_fd, chunk)
 
@@ -68,7 +68,7 @@ def board() -> Iterator[Board]:
 
 @dataclass
 class ManualClock:
-    """A clock for the recorder that only the test advances, independent of the load of the machine."""
+    """A clock for the recorder that only the test advances, so that results do not depend on the machine's load."""
 
     s: float = 0.0
 
@@ -81,7 +81,7 @@ def clock(monkeypatch) -> ManualClock:
 
 
 def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
-    """Record from a board; `act` runs in a thread as soon as the recorder has opened the port."""
+    """Record from a board. `act` runs in a thread as soon as the recorder has opened the port."""
 
     def begin() -> None:
         assert listening.wait(LONG_s)
@@ -118,7 +118,7 @@ def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
     assert recording.account["frames_n"] == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
 
 
-def test_recording_ends_after_duration(board, clock, tmp_path):
+def test_recording_ends_after_its_duration(board, clock, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -133,7 +133,7 @@ def test_recording_ends_after_duration(board, clock, tmp_path):
     check_files(tmp_path, recording, data)
 
 
-def test_report_counts_frames(board, tmp_path):
+def test_report_contains_the_number_of_frames(board, tmp_path):
     seen: list[int] = []
     data = encode(FRAMES, "binary")
     settings = replace(SETTINGS, bytes_max_n=len(data))
@@ -149,7 +149,7 @@ def test_report_counts_frames(board, tmp_path):
     assert seen[-1] >= 1
 
 
-def test_arrival_times_contain_a_pause(board, clock, tmp_path):
+def test_arrival_times_show_a_pause_of_the_board(board, clock, tmp_path):
     data, pause_s = encode(FRAMES, "binary"), 0.4
 
     def act(_: threading.Event) -> None:
@@ -164,7 +164,7 @@ def test_arrival_times_contain_a_pause(board, clock, tmp_path):
     assert arrived_s[1] - arrived_s[0] == pytest.approx(pause_s, abs=1e-5)
 
 
-def test_byte_limit_is_exact(board, tmp_path):
+def test_recording_ends_exactly_at_the_limit_of_bytes(board, tmp_path):
     data = encode(FRAMES, "binary")
     recording = record(board, tmp_path, lambda _: board.send(data), bytes_max_n=1000)
     assert recording.ended == "bytes"
@@ -172,7 +172,7 @@ def test_byte_limit_is_exact(board, tmp_path):
     assert recording.account["skipped_truncated_bytes_n"] == 1000 % 82
 
 
-def test_unplugging_keeps_received_bytes(board, tmp_path):
+def test_received_bytes_are_kept_when_the_board_is_unplugged(board, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -186,7 +186,7 @@ def test_unplugging_keeps_received_bytes(board, tmp_path):
     check_files(tmp_path, recording, data[:-7])
 
 
-def test_stop_event_keeps_received_bytes(board, tmp_path):
+def test_received_bytes_are_kept_when_the_recording_is_stopped(board, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(stop: threading.Event) -> None:
@@ -199,7 +199,7 @@ def test_stop_event_keeps_received_bytes(board, tmp_path):
     check_files(tmp_path, recording, data)
 
 
-def test_silence_ends_recording(board, clock, tmp_path):
+def test_recording_ends_when_the_board_is_silent(board, clock, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -222,7 +222,7 @@ print(stream_recorder.record(sys.argv[1], Path(sys.argv[2]), settings=settings, 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_keeps_received_bytes(board, tmp_path, number):
+def test_received_bytes_are_kept_when_a_signal_ends_the_process(board, tmp_path, number):
     data = encode(FRAMES, "binary")
     command = [sys.executable, "-c", RECORD, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
@@ -237,7 +237,7 @@ def test_signal_keeps_received_bytes(board, tmp_path, number):
     assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
 
 
-def test_kill_loses_no_byte_that_was_read(board, tmp_path):
+def test_killed_process_loses_no_byte_that_it_has_read(board, tmp_path):
     data = encode(FRAMES, "binary")
     with subprocess.Popen([sys.executable, "-c", RECORD, board.name, str(tmp_path)], cwd=ROOT) as process:
         written = tmp_path / STREAM_FILE
@@ -252,10 +252,10 @@ def test_waiting_uses_no_processor_time(board, tmp_path):
     before_s = time.process_time()
     with pytest.raises(CaptureError):
         record(board, tmp_path, lambda _: None, silence_s=1.0)
-    assert time.process_time() - before_s < 0.3  # a busy wait would use the whole second
+    assert time.process_time() - before_s < 0.3  # A busy wait would use the whole second.
 
 
-def test_partial_first_line_is_dropped(board, clock, tmp_path):
+def test_incomplete_first_line_is_dropped(board, clock, tmp_path):
     data = encode(FRAMES, "text-xyzt")
     first_n = data.index(b"\n") + 1
 
@@ -269,13 +269,14 @@ def test_partial_first_line_is_dropped(board, clock, tmp_path):
     assert (tmp_path / STREAM_FILE).read_bytes() == data[first_n:2000]
 
 
-def test_socket_is_recorded_like_a_port(tmp_path):
+def test_network_socket_is_recorded_like_a_serial_port(tmp_path):
     data = encode(FRAMES, "binary")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def send() -> None:
             with server.accept()[0] as end:
-                wait_until((tmp_path / STREAM_FILE).exists)  # bytes sent before the port is opened are discarded
+                # Bytes that were sent before the port is opened are discarded.
+                wait_until((tmp_path / STREAM_FILE).exists)
                 end.sendall(data)
 
         sender = threading.Thread(target=send)
@@ -294,11 +295,11 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # writing more fail
 
 
 def test_full_disk_keeps_a_readable_recording(board, tmp_path):
-    # Option -B: otherwise, Python would write truncated .pyc files on the full disk.
+    # Without option -B, Python would write truncated .pyc files on the full disk.
     command = [sys.executable, "-B", "-c", FULL_DISK + RECORD, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
-        os.set_blocking(board.board_fd, False)  # otherwise, writing would block after the recorder has ended
+        os.set_blocking(board.board_fd, False)  # Otherwise, writing would block after the recorder has ended.
 
         def ended() -> bool:
             board.send(encode(FRAMES, "binary")[:820])
@@ -313,34 +314,34 @@ def test_full_disk_keeps_a_readable_recording(board, tmp_path):
 
 
 class TestErrors:
-    def test_absent_port(self, tmp_path):
+    def test_missing_port_is_reported(self, tmp_path):
         with pytest.raises(CaptureError, match="/dev/tty-none: cannot open the port: .*orts?.*found"):
             stream_recorder.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
         assert list(tmp_path.iterdir()) == []
 
-    def test_file_is_not_a_port(self, tmp_path):
+    def test_path_of_a_file_is_not_accepted_as_a_port(self, tmp_path):
         file = tmp_path / "no_port"
         file.touch()
         for name, reason in {file: "it is a file.* reskin predict", tmp_path: "it is a folder"}.items():
             with pytest.raises(CaptureError, match=f"{name}: cannot open the port: {reason}"):
                 stream_recorder.record(str(name), tmp_path, settings=SETTINGS, stop=threading.Event())
 
-    def test_port_of_another_program(self, board, tmp_path):
+    def test_port_that_another_program_uses_is_reported(self, board, tmp_path):
         other = "another program uses it"
         with open_port(board.name, 115200), pytest.raises(CaptureError, match=f"cannot open the port: {other}"):
             stream_recorder.record(board.name, tmp_path, settings=SETTINGS, stop=threading.Event())
 
-    def test_silent_port(self, board, clock, tmp_path):
+    def test_port_that_sends_nothing_is_reported(self, board, clock, tmp_path):
         with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Is the"):
             record(board, tmp_path, lambda _: setattr(clock, "s", 0.7), silence_s=0.6)
 
-    def test_port_unplugged_before_first_byte(self, board, tmp_path):
+    def test_port_unplugged_before_the_first_byte_is_reported(self, board, tmp_path):
         with pytest.raises(CaptureError, match="no bytes arrived"):
             record(board, tmp_path, lambda _: board.unplug())
 
-    def test_no_frame_suggests_wrong_baud_rate(self, board, tmp_path):
+    def test_bytes_without_any_frame_suggest_a_wrong_baud_rate(self, board, tmp_path):
         noise = bytes(range(128)) * 4
-        os.set_blocking(board.board_fd, False)  # otherwise, writing would block while the error is prepared
+        os.set_blocking(board.board_fd, False)  # Otherwise, writing would block while the error message is prepared.
 
         def act(stop: threading.Event) -> None:
             while not stop.wait(0.05) and board.board_fd >= 0:
@@ -358,7 +359,7 @@ class TestErrors:
             stop.set()
             actor.join()
 
-    def test_error_suggests_fewer_chips(self, board, clock, tmp_path):
+    def test_error_suggests_a_smaller_number_of_chips(self, board, clock, tmp_path):
         data = encode(make_frames(30, 4, 0), "binary")
 
         def act(_: threading.Event) -> None:
@@ -369,7 +370,7 @@ class TestErrors:
         with pytest.raises(CaptureError, match="It fits binary with 4 chips"):
             record(board, tmp_path, act, no_frame_s=0.5)
 
-    def test_existing_stream_is_not_overwritten(self, board, tmp_path):
+    def test_existing_recording_is_not_overwritten(self, board, tmp_path):
         (tmp_path / STREAM_FILE).write_bytes(b"old")
         with pytest.raises(FileExistsError):
             stream_recorder.record(

@@ -1,4 +1,7 @@
-"""Synthetic cards of trained networks and synthetic numbers of every experiment, for tests of the report."""
+"""Synthetic results for tests of the report.
+
+They are model cards (records of trained networks with their scores), and the numbers that each experiment would write.
+"""
 
 import xml.etree.ElementTree as ET
 from typing import Any
@@ -23,7 +26,7 @@ def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
 
 
 def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
-    """Return a summary over boards whose 95 % confidence interval is (low, high)."""
+    """Return a summary of scores over boards, whose 95 % confidence interval is (low, high)."""
     reach, middle = (high - low) / 2, (low + high) / 2
     se = reach / t.ppf(0.975, n - 1)
     stat = {"mean": middle, "sd": se * n**0.5, "n": n, "ci95": [low, high]}
@@ -31,7 +34,7 @@ def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
 
 
 def difference(low: float = 0.5, high: float = 1.5) -> dict:
-    """Return a paired difference with the 95 % interval (low, high) for every metric."""
+    """Return a paired difference, whose 95 % confidence interval is (low, high) for every metric."""
     by_board = {board: dict.fromkeys(METRICS, (low + high) / 2) for board in ("b0", "b1")}
     return {name: over_boards(low, high) for name in METRICS} | {"by_board": by_board}
 
@@ -125,7 +128,7 @@ SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]
 
 
 def card(experiment: str, fold: str, scores: dict, recipe: str = "paper", seed_i: int = 0, **changes: Any) -> dict:
-    """Return the card of a trained network (for adapted networks: adapted to 390 pokes)."""
+    """Return the model card of a trained network. Adapted networks were adapted to 390 pokes."""
     values = {
         "question": experiment, "recipe_name": recipe, "recipe": dict(RECIPE), "fold": fold, "seed_i": seed_i,
         "scores": scores, "train_skins": ["s8", "s9"], "train_rows_n": 100,
@@ -135,7 +138,7 @@ def card(experiment: str, fold: str, scores: dict, recipe: str = "paper", seed_i
 
 
 def adapted_card(fold: str, skin: str, seed_i: int, *, off_mm: float = 1.0, force: bool = True) -> dict:
-    """Return the card of a network adapted to a skin; place errors are about `off_mm`."""
+    """Return the model card of a network that was adapted to a skin. Its place errors are about `off_mm`."""
     rng = rng_for(seed_i, "adapted", fold, skin)
     true = rng.uniform(0, 16, (10, 3))
     predicted = true + rng.normal(0, off_mm, true.shape)
@@ -146,5 +149,5 @@ def adapted_card(fold: str, skin: str, seed_i: int, *, off_mm: float = 1.0, forc
 
 
 def adapted_cards(**changes: Any) -> list[dict]:
-    """Return cards of adapted networks: three seeds, two boards, two skins per board."""
+    """Return the model cards of adapted networks: three seeds, two boards, two skins per board."""
     return [adapted_card(fold, skin, seed_i, **changes) for seed_i in range(3) for fold, skin in SKINS]

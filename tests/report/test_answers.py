@@ -30,14 +30,15 @@ def scene(accuracy: dict, r2: dict, source: str = "simulated") -> dict:
     ("accuracy", "reached"),
     [
         (over(95.0, 91.0, 98.0), YES),
-        (over(95.0, 85.0, 98.0), PARTLY),  # the interval includes the requirement
+        (over(95.0, 85.0, 98.0), PARTLY),  # The interval includes the required accuracy.
         (over(78.7, 72.1, 84.2), PARTLY),
         (over(30.0, 20.0, 60.0), NO),
         ({"mean": 92.0, "n": 2, "values": [91.0, 93.0]}, YES),
-        ({"mean": 92.0, "n": 2, "values": [89.0, 95.0]}, PARTLY),  # one board does not reach it
+        # One of the two boards does not reach the required accuracy.
+        ({"mean": 92.0, "n": 2, "values": [89.0, 95.0]}, PARTLY),
     ],
 )
-def test_answer_on_the_place_depends_on_the_whole_interval(accuracy, reached):
+def test_answer_on_places_depends_on_the_whole_interval(accuracy, reached):
     place = answers(scene(accuracy, over(0.8, 0.7, 0.9))).place
     assert place.level == reached
     assert ("not reached" in " ".join(place.sentences)) == (
@@ -48,15 +49,15 @@ def test_answer_on_the_place_depends_on_the_whole_interval(accuracy, reached):
 @pytest.mark.parametrize(
     ("r2", "reached"), [(over(0.95, 0.92, 0.97), YES), (over(0.76, 0.6, 0.85), PARTLY), (over(0.2, 0.1, 0.3), NO)]
 )
-def test_answer_states_that_a_force_is_not_usable(r2, reached):
+def test_answer_says_that_a_force_with_low_r2_is_not_usable(r2, reached):
     force = answers(scene(over(80.0, 70.0, 90.0), r2)).force
     assert (force.level, force_level(r2)) == (reached, reached)
     assert ("not usable" in force.short) == (reached == NO)
     assert "rms error 0.50 N" in force.short
-    assert "1.4 N" in force.short  # of the mean force
+    assert "1.4 N" in force.short  # The mean force is 1.4 N.
 
 
-def test_answer_uses_the_best_model_without_labels():
+def test_answer_is_about_the_best_model_that_needs_no_labels():
     found = answers(scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9)))
     assert found.place.short.startswith("80.0 % [70.0, 88.0] of readings are within 1 mm")
     assert f"Paper: {TABLE_2['adapted']['accuracy_pct'][0]:g} %" in " ".join(found.place.sentences)
@@ -70,7 +71,7 @@ def labelled(method: str, labels_n: int, accuracy: float, r2: float) -> dict:
     return {"method": method, "inputs": "raw", "labels_n": labels_n, "as_labelled": few}
 
 
-def test_scores_with_labels_are_shown_beside_the_answer_without_labels():
+def test_scores_with_labels_are_given_after_the_answer_without_labels():
     rows = [("network", 0, 31.0, -2.0), ("network", 40, 55.0, 0.1), ("universal, alone", 0, 71.0, 0.2)]
     rows += [("universal, alone", 10, 79.0, 0.4), ("universal, alone", 40, 91.0, 0.6)]
     found = answers(all_experiments("recorded") | {"labels": [labelled(*one) for one in rows]})
@@ -92,7 +93,8 @@ def pressed(method: str, labels: str, accuracy: float, presses_n: int = 65) -> d
     return {"tested": TESTED, "presses_n": presses_n, "method": method, "labels": labels} | scores | place
 
 
-def test_presses_at_other_places_than_the_labels_answer_first():
+def test_answer_uses_experiment_random_presses_if_it_was_run():
+    """In this experiment, tested presses are at other places than the labels."""
     rig, shipped = WAYS
     rows = [pressed(rig, "0", 65.0), pressed(rig, "10", 77.0), pressed(rig, "40", 87.0), pressed(rig, "0", 60.0, 12)]
     rows += [pressed(shipped, "0", 43.0), pressed(shipped, "40", 76.0), pressed(rig, "weight", 70.0)]
@@ -101,12 +103,13 @@ def test_presses_at_other_places_than_the_labels_answer_first():
     assert found.place.short.startswith("65.0 % (64.0; 66.0)")
     assert found.place.second == f"Universal model (ours), {WAYS[shipped]}: 43.0 % (42.0; 44.0) within 1 mm."
     assert "With 40 labelled presses: 87.0 % (86.0; 88.0) within 1 mm." in found.place.sentences
-    assert found.force.short.startswith("not usable; rms error 1.5 N")  # the mean of the boards' roots
+    # This is the mean of the rms errors of the two boards.
+    assert found.force.short.startswith("not usable; rms error 1.5 N")
     assert "needs of the new skin: 65 presses without labels." in found.tested
 
 
 @pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
-def test_universal_model_leads_in_scenes_without_the_whole_of_table_2(dropped, leads):
+def test_answer_is_about_the_universal_model_if_table_2_is_incomplete(dropped, leads):
     numbers = scene(over(78.0, 73.8, 81.7), over(0.6, 0.4, 0.8))
     numbers["table2"]["single"] = row(over(40.0, 30.0, 50.0), over(0.2, 0.1, 0.3))
     numbers["table2"] = {name: scores for name, scores in numbers["table2"].items() if name != dropped}
@@ -117,7 +120,7 @@ def test_universal_model_leads_in_scenes_without_the_whole_of_table_2(dropped, l
     assert ("Universal model" in found.place.second) == (dropped == "")
 
 
-def test_boards_and_skins_are_counted_without_the_protocol():
+def test_boards_and_skins_are_counted_without_the_recorded_protocol():
     numbers = scene(over(86.0, 78.0, 91.5), over(0.8, 0.7, 0.9))
     numbers["described"] = {"grid": {"over_skins": {"rest_changes_in_1_uT": {"mean": 5.0, "n": 18}}}}
     del numbers["protocol"]
@@ -125,7 +128,7 @@ def test_boards_and_skins_are_counted_without_the_protocol():
     assert answers(numbers).tested.startswith("Tested on 6 simulated boards with 18 skins")
 
 
-def test_scene_without_held_out_boards_tests_no_new_skin():
+def test_scene_without_held_out_boards_has_no_answer_on_new_skins():
     alone = {name: value for name, value in all_experiments("recorded").items() if name != "table2"}
     found = answers(alone)
     assert (found.place.level, found.force.level, found.efforts) == (UNTESTED, UNTESTED, ())
@@ -136,7 +139,7 @@ def test_scene_without_held_out_boards_tests_no_new_skin():
     assert answers(bare).place.sentences == ()
 
 
-def test_recordings_without_forces_have_no_answer_for_the_force():
+def test_recordings_without_forces_have_no_answer_on_forces():
     numbers = scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9), "recorded")
     for name in ("mse_f_N2", "r2_f"):
         del numbers["table2"]["adapted"][name]
@@ -145,7 +148,7 @@ def test_recordings_without_forces_have_no_answer_for_the_force():
     assert found.efforts[-1].cells["force: rms error"] == "–"
 
 
-def test_simulated_scenes_are_no_evidence_about_real_skins():
+def test_answer_from_a_simulated_scene_says_that_it_is_no_evidence_about_real_skins():
     simulated, recorded = (
         answers(scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9), source)).tested
         for source in ("simulated", "recorded")
@@ -154,10 +157,10 @@ def test_simulated_scenes_are_no_evidence_about_real_skins():
     assert "no evidence" not in recorded
 
 
-def test_rms_has_no_standard_deviation():
+def test_rms_error_is_given_without_a_standard_deviation():
     assert rms({"mean": 4.0, "n": 2, "sd": 1.0, "values": [1.0, 9.0]}) == {"mean": 2.0, "n": 2, "values": [1.0, 3.0]}
     assert rms(None) is None
 
 
-def test_level_without_interval_follows_the_mean():
+def test_answer_without_an_interval_depends_on_the_mean():
     assert [level({"mean": value, "n": 1}, 90.0, 50.0) for value in (90.0, 89.9, 49.9)] == [YES, PARTLY, NO]

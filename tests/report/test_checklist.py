@@ -58,7 +58,7 @@ def judge_value(
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
-def test_every_row_resolves_to_a_number(one):
+def test_every_row_refers_to_an_existing_number(one):
     assert one.ours is None or resolve(all_experiments(), one.ours) is not None
     assert one.stage is None or one.stage in STAGES
     assert (one.paper is None) != (one.says is None)
@@ -69,7 +69,7 @@ def test_every_number_of_the_paper_is_in_the_checklist():
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
     used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
     assert printed - used == set()
-    assert len(printed) > 30  # the set is not empty by mistake
+    assert len(printed) > 30  # This shows that the set is not empty by mistake.
 
 
 def test_every_figure_and_table_of_the_paper_has_a_row():
@@ -81,12 +81,12 @@ def test_every_figure_and_table_of_the_paper_has_a_row():
 
 
 def line(numbers: dict, name: str) -> dict[str, str]:
-    """Return the row of the checklist for these numbers and this id."""
+    """Return the row of the checklist with this id, for these numbers."""
     (one,) = [one for one in ROWS if one.id == name]
     return checklist(numbers, [one]).to_dict("records")[0]
 
 
-def test_missing_experiment_is_not_run():
+def test_row_of_a_missing_experiment_says_that_it_was_not_run():
     numbers = all_experiments()
     del numbers["shear"]
     shear = line(numbers, "shear-mse_xy_mm2")
@@ -97,25 +97,26 @@ def test_missing_experiment_is_not_run():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_number_is_met_within_the_sd_of_the_paper_or_ten_percent(mean, sd, ours, path):
+def test_number_is_met_within_the_papers_standard_deviation_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
     alone = judge_value(stat(ours), mean, ours=f"a.{path}")
     assert (alone.criterion, alone.met) == (
         "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
     )  # fmt: skip
-    assert judgement.verdict == alone.verdict == NO_INTERVAL  # the standard deviation is not an interval over boards
+    # There is no verdict, because a standard deviation is not an interval over boards.
+    assert judgement.verdict == alone.verdict == NO_INTERVAL
 
 
 @pytest.mark.parametrize(("printed", "verdict"), [(80.0, AGREES), (70.0, DIFFERS), ((85.0, 3.0), DIFFERS)])
-def test_number_is_judged_by_whether_our_interval_includes_it(printed, verdict):
+def test_number_agrees_with_the_paper_if_our_interval_includes_it(printed, verdict):
     assert judge_value(over_boards(75.0, 84.0), printed).verdict == verdict
     few = {"mean": 80.0, "n": 2, "values": [75.0, 85.0]}
     assert judge_value(few, printed).verdict == FEW_BOARDS
 
 
 @pytest.mark.parametrize(("bias_N", "meaning"), [(-0.02642, "under-estimated"), (0.02642, "over-estimated")])
-def test_sign_of_a_bias_is_explained(bias_N, meaning):
+def test_row_explains_the_sign_of_a_bias(bias_N, meaning):
     numbers = all_experiments()
     numbers["drift"]["late"]["bias_N"] = bias_N
     bias = line(numbers, "figure-5b")
@@ -123,12 +124,12 @@ def test_sign_of_a_bias_is_explained(bias_N, meaning):
     assert bias["met"] == ("yes" if bias_N > 0 else "no")
 
 
-def test_our_protocol_is_beside_that_of_the_paper():
+def test_row_states_our_protocol_beside_that_of_the_paper():
     numbers = all_experiments()
     assert line(numbers, "single-accuracy_pct")["note"].startswith(
         f"{SHORT_OF}7,020 training readings (paper: {paper.SINGLE_TRAIN_N:,})"
     )
-    del numbers["protocol"]  # results of an earlier version
+    del numbers["protocol"]  # Results of an earlier version do not contain the protocol.
     assert "readings" not in line(numbers, "single-accuracy_pct")["note"]
 
 
@@ -145,7 +146,7 @@ def test_limits_are_compared_with_the_mean(rule, ours, paper, criterion, met):
     assert (judgement.verdict, judgement.criterion, judgement.met) == (FEW_BOARDS, criterion, met)
 
 
-def test_finding_has_the_verdict_from_the_experiment():
+def test_row_of_a_finding_has_the_verdict_of_its_experiment():
     judgement = judge_value({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
     assert (judgement.verdict, judgement.met) == ("undecided", "yes")
     assert judge_value(False).met == "no"
@@ -160,13 +161,13 @@ def test_finding_has_the_verdict_from_the_experiment():
         ("positive", 0.1, 3.0, SUPPORTED), ("positive", -3.0, -0.1, CONTRADICTED), ("positive", -1.0, 3.0, UNDECIDED),
     ],
 )  # fmt: skip
-def test_claims_are_judged_by_interval_over_boards(rule, low, high, verdict):
+def test_claims_are_judged_by_the_interval_over_boards(rule, low, high, verdict):
     assert judge_value(over_boards(low, high), rule=rule).verdict == verdict
     assert judge_value({"mean": (low + high) / 2, "n": 1}, rule=rule).verdict == FEW_BOARDS
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
-def test_lower_and_upper_limits_are_judged_symmetrically(low, width, limit):
+def test_verdicts_on_at_least_and_at_most_a_limit_are_opposite(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judge_value(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
@@ -187,17 +188,17 @@ def test_decrease_of_an_error_counts_as_gain():
         (-4.0, 2.9, CONTRADICTED, False),
     ],
 )
-def test_sizeable_gain_is_at_least_half_of_the_papers(low, high, verdict, equivalent):
+def test_sizeable_gain_must_be_at_least_half_of_the_papers_gain(low, high, verdict, equivalent):
     judgement = judge_value(over_boards(low, high), 5.97, rule="sizeable")
     assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98, half of the paper's")
     assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
-def test_repeats_on_one_skin_are_too_few_boards_for_a_verdict():
+def test_repeats_on_one_skin_are_not_enough_for_a_verdict():
     assert judge_value(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
-def test_rule_over_counts_fails_if_one_count_fails():
+def test_rule_over_several_counts_fails_if_it_fails_at_one_count():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
@@ -208,7 +209,7 @@ def test_rule_over_counts_fails_if_one_count_fails():
     assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
 
-def test_value_to_which_the_simulation_is_calibrated_is_not_evidence():
+def test_number_to_which_the_simulation_was_calibrated_is_not_evidence():
     target = {"ours": "table2.single.accuracy_pct", "rule": "target"}
     assert judge_value(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
     assert judge_value(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
@@ -235,7 +236,7 @@ def test_every_claim_has_a_verdict():
     }
 
 
-def test_claim_beyond_the_range_of_a_sweep_is_not_reached():
+def test_claim_about_counts_that_were_not_tried_is_not_reached():
     numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
     assert line(numbers, "plateau")["note"] == NOT_REACHED
@@ -243,13 +244,13 @@ def test_claim_beyond_the_range_of_a_sweep_is_not_reached():
     assert line(numbers, "plateau")["note"] == NOT_RUN
 
 
-def test_single_training_skin_is_not_compared_with_pooled_training():
+def test_networks_of_one_training_skin_are_not_compared_as_pooled_training():
     item = {"ours": "table2.multi.accuracy_pct"}
     assert judge_value(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
     assert judge_value(stat(90.0), (85.0, 1.0), **item).met == "no"
 
 
-def test_reason_is_shown_only_if_our_number_differs():
+def test_reason_for_a_difference_is_shown_only_if_there_is_one():
     numbers = all_experiments()
     rows = [row(ours="single_random.accuracy_pct", why="Because.")]
     assert checklist(numbers, rows)["note"][0] == "Because."
@@ -257,7 +258,7 @@ def test_reason_is_shown_only_if_our_number_differs():
     assert checklist(numbers, rows)["note"][0] == "–"
 
 
-def test_short_run_is_noted_as_not_reached():
+def test_note_says_that_a_shorter_run_has_not_reached_the_papers_protocol():
     numbers = all_experiments()
     assert line(numbers, "figure-5b")["note"] == "45,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["contacts_n"] = 18_000
@@ -276,13 +277,13 @@ def test_settings_of_a_simulated_rig_are_not_judged(name):
     assert line(all_experiments("recorded"), name)["met"] in ("yes", "–")
 
 
-def test_flexible_bias_is_judged_after_adaptation():
+def test_bias_on_flexible_boards_is_judged_after_adaptation():
     numbers = all_experiments()
     numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
     assert line(numbers, "flexible-bias")["met"] == "no"
 
 
-def test_reasons_about_simulation_are_only_in_simulated_scenes():
+def test_reasons_about_the_simulation_are_shown_only_in_simulated_scenes():
     simulation = ("simulat", "assumed", "a possible reason")
     for source in ("simulated", "recorded"):
         notes = checklist(all_experiments(source))["note"]
@@ -292,11 +293,11 @@ def test_reasons_about_simulation_are_only_in_simulated_scenes():
     assert not any(word in one.why for one in ROWS for word in simulation)
 
 
-def test_reason_contains_numbers():
+def test_reason_contains_the_numbers_of_the_run():
     assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
-def test_equal_numbers_are_no_reason():
+def test_equal_numbers_are_not_given_as_a_reason():
     numbers = all_experiments()
     numbers["flexible"]["gap_less_pct"] = 80.0
     assert "a possible reason" not in line(numbers, "flexible-accuracy_pct")["note"]
@@ -305,33 +306,34 @@ def test_equal_numbers_are_no_reason():
 @pytest.mark.parametrize(
     ("ours", "within"),
     [
-        # without a summary over boards, there is no interval
+        # Without a summary over boards, there is no interval.
         (over_boards(95.0, 99.7), "yes"), (over_boards(95.0, 99.5), "no"), (stat(99.0, 6.0, 5), "–"),
         ({"mean": 99.0, "n": 1}, "–"),
     ],
 )  # fmt: skip
-def test_papers_number_is_compared_with_our_interval(ours, within):
+def test_papers_number_is_inside_or_outside_our_interval(ours, within):
     numbers = all_experiments() | {"a": {"accuracy_pct": ours}}
     assert checklist(numbers, [row(ours="a.accuracy_pct")])["paper in our interval"][0] == within
 
 
 def with_p(p: float, mean: float = 1.0) -> dict:
-    """Return a paired difference over boards with the two-sided p-value p."""
+    """Return a paired difference over boards whose two-sided p-value is p."""
     se = mean / t.isf(p / 2, 5)
     return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
 
 
-def test_p_values_of_a_family_of_claims_are_corrected_by_holm():
+def test_p_values_of_related_claims_are_corrected_by_holms_method():
     claim = {"what": "claim: x", "paper": None, "says": "claimed", "rule": "gain"}
     rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
-    # Three claims: 0.01 becomes 0.03; 0.03 and 0.04 become 0.06, not significant, although the intervals exclude 0.
+    # There are three claims. Their p-value of 0.01 becomes 0.03. Those of 0.03 and 0.04 become 0.06, which is not
+    # significant, although the intervals exclude 0.
     assert table["verdict"].tolist() == [SUPPORTED, INCONCLUSIVE, INCONCLUSIVE, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
 
-def test_claims_table_lists_only_judged_claims():
+def test_table_of_claims_lists_only_claims_with_a_verdict():
     claims = claims_table(checklist(all_experiments()))
     assert len(claims) > 15
     assert not claims["claim"].str.startswith("claim").any()
@@ -341,25 +343,25 @@ def test_claims_table_lists_only_judged_claims():
     assert all(name.endswith("accuracy_pct") or name.startswith(("pokes", "sensors")) for name in family)
 
 
-def test_unknown_constant_is_an_error():
+def test_name_of_an_unknown_number_of_the_paper_is_refused():
     with pytest.raises(SchemaError, match="SHEARS.x.* is neither a constant of pipeline.report.paper"):
         look_up({}, "SHEARS.x")
 
 
-def test_resolve_picks_list_items_by_value():
+def test_path_of_a_number_can_select_list_items_by_a_value():
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
     assert resolve(all_experiments(), "paired.of=adapted,over=multi.over") == "multi"
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
 
 
-def test_p_value_of_a_claim_of_several_parts():
+def test_p_value_of_a_claim_of_several_parts_is_that_of_the_first_part():
     claim = row(rule="each", ours="x.accuracy_pct")
 
     def parts(*means: float) -> list[dict]:
         return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
 
     alone = [claim_p_value(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
-    # the p-value of the first part; that of the second would be 0.85
+    # This is the p-value of the first part. That of the second part would be 0.85.
     assert claim_p_value(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])
     assert claim_p_value(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
     assert claim_p_value(claim, None, []) is None

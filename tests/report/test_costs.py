@@ -1,4 +1,4 @@
-"""Tests of figures and tables of error against run time."""
+"""Tests of figures and tables that compare errors with run times."""
 
 import re
 from dataclasses import asdict
@@ -48,7 +48,7 @@ INTEGRATORS = [
 
 
 def with_times(rows: list[Precision]) -> list[dict]:
-    """Return the rows of a study with run times added, except for failed and reference rows."""
+    """Return the rows of a study with run times. Failed rows and the row of the reference have none."""
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
     return [asdict(row) | times.get(row.key, {}) for row in rows]
@@ -62,7 +62,7 @@ def draw_integrators(rows=INTEGRATORS) -> str:
     return integrators(with_times(rows))
 
 
-def test_quadrature_figure_labels():
+def test_figure_of_quadratures_has_labels():
     text = texts_of(draw_quadratures())
     for label in (
         "median time per indentation / ms",
@@ -78,13 +78,13 @@ def test_quadrature_figure_labels():
     assert "upper bound of the reference's own error" in text
 
 
-def test_rule_in_use_is_marked_if_no_rule_meets_the_limit():
+def test_rule_in_use_is_marked_even_if_no_rule_meets_the_limit():
     text = texts_of(draw_quadratures(error_max=1e-6))
     assert "cheapest" not in text
     assert "in use: 0.5 mm x 6" in text
 
 
-def test_integrator_figure_labels():
+def test_figure_of_integrators_has_labels():
     text = texts_of(draw_integrators())
     for label in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
         assert label in text
@@ -93,7 +93,7 @@ def test_integrator_figure_labels():
             assert label in text
 
 
-def test_failures_are_grouped_by_method_and_kind():
+def test_failures_are_listed_by_method_and_kind():
     diverged, stopped = failures(with_times(INTEGRATORS))
     assert diverged == (
         "Failed: explicit Euler, diverged: relaxation, stiffness 1e+03 (1e-02 s, 1e-03 s);"
@@ -103,7 +103,7 @@ def test_failures_are_grouped_by_method_and_kind():
     assert failures(with_times(QUADRATURES)) == []
 
 
-def test_failed_and_untimed_rows_are_not_drawn():
+def test_rows_without_an_error_or_a_time_are_not_drawn():
     # Each point is a <use> element that refers to a marker.
     done = [row for row in INTEGRATORS if row.failure is None]
     assert count_marks(draw_integrators()) == count_marks(draw_integrators(done))
@@ -115,7 +115,7 @@ def test_failed_and_untimed_rows_are_not_drawn():
     assert count_marks(untimed) == count_marks(without)
 
 
-def test_pages_match_the_studies_of_the_scene():
+def test_pages_contain_the_studies_of_the_scene():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
     assert set(cost_pages(stages | {"integrators": with_times(INTEGRATORS)}, "simulated")) == {
@@ -123,7 +123,7 @@ def test_pages_match_the_studies_of_the_scene():
     }  # fmt: skip
 
 
-def test_stage_costs_columns():
+def test_table_of_stage_costs_has_its_columns():
     (line,) = stage_costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
     assert line == {
         "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "last run, CPU s": "–",
@@ -131,7 +131,7 @@ def test_stage_costs_columns():
     }  # fmt: skip
 
 
-def test_figure_bytes_depend_only_on_rows():
+def test_equal_rows_give_equal_figures():
     assert draw_quadratures() == draw_quadratures()
     stiff = draw_integrators()
     assert draw_integrators() == stiff
@@ -142,7 +142,7 @@ def test_figure_bytes_depend_only_on_rows():
 
 
 @given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))
-def test_points_on_the_front_dominate_all_others(points):
+def test_each_other_point_is_slower_or_less_accurate_than_one_on_the_front(points):
     kept = front(points)
     assert set(kept) <= set(points)
     times, errors = np.array(kept).reshape(-1, 2).T
@@ -152,7 +152,7 @@ def test_points_on_the_front_dominate_all_others(points):
         assert any(t <= time and e <= error for t, e in kept)
 
 
-def test_seven_methods_differ_in_colour_and_marker():
+def test_seven_methods_have_different_colours_and_markers():
     assert len(set(COLOURS)) == len(set(MARKERS)) == 7
 
 
@@ -171,7 +171,8 @@ PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, m
 
 
 @given(PLACES)
-def test_labelled_points_are_not_dominated(places):
+def test_only_points_on_the_front_have_labels(places):
+    """A point is on the front if no other point is both faster and more accurate."""
     points = trade_off_points(rows_of(places), "train_s")
     naive = set()
     for place in places:
@@ -185,7 +186,7 @@ def test_labelled_points_are_not_dominated(places):
 
 
 @given(PLACES)
-def test_labels_are_in_the_order_of_the_front(places):
+def test_labels_of_points_are_in_the_order_of_the_front(places):
     members = [point for point in trade_off_points(rows_of(places), "train_s") if point.label]
     numbered = {int(point.label): point.position for point in members}
     assert sorted(numbered) == list(range(1, len(numbered) + 1))
@@ -195,7 +196,7 @@ def test_labels_are_in_the_order_of_the_front(places):
         assert error > next_error
 
 
-def test_trade_off_figure_lists_every_method():
+def test_figure_of_errors_and_times_lists_every_method():
     text = texts_of(trade_off(rows_of([(1, 3), (2, 2), (3, 2.5)]), "train_s", title="t", cost="c"))
     for label in ("1  m0 (raw)", "2  m1 (raw)", "m2 (raw)", "Pareto front"):
         assert label in text
@@ -210,7 +211,7 @@ def test_front_is_drawn_as_steps():
     assert corner[0] == last[0]
 
 
-def test_raw_and_other_inputs_differ_in_fill():
+def test_markers_of_methods_with_input_raw_are_filled_differently():
     raw_row, other_row = rows_of([(1, 3), (2, 2)])
     rows = [raw_row | {"method": "ridge"}, other_row | {"method": "ridge", "inputs": "shape"}]
     raw, shape = (point.look for point in trade_off_points(rows, "train_s"))
@@ -218,7 +219,7 @@ def test_raw_and_other_inputs_differ_in_fill():
     assert shape["markerfacecolor"] == "white"
 
 
-def test_49_methods_have_different_styles():
+def test_styles_of_49_methods_are_different():
     assert len({(look_of(i)["color"], look_of(i)["marker"]) for i in range(49)}) == 49
 
 
@@ -249,7 +250,7 @@ def costs() -> dict[str, str]:
     return cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated")
 
 
-def test_cost_pages_have_no_figure_of_untimed_rows(costs):
+def test_methods_that_were_not_timed_have_no_figure(costs):
     assert set(costs) == {"training.svg", "inference.svg", "learning.md", "adaptation.md"}
     untimed = [{key: value for key, value in one.items() if key != "train_s"} for one in LEARNING]
     assert set(cost_pages({"learning": untimed}, "simulated")) == {"inference.svg", "learning.md"}
@@ -258,7 +259,7 @@ def test_cost_pages_have_no_figure_of_untimed_rows(costs):
     assert cost_pages({"choice": {}}, "simulated") == {}
 
 
-def test_untimed_method_is_only_in_the_table():
+def test_method_that_was_not_timed_is_only_in_the_table():
     untimed = {key: value for key, value in LEARNING[2].items() if key != "train_s"}
     pages = cost_pages({"learning": [*LEARNING[:2], untimed, *LEARNING[3:]]}, "simulated")
     assert "kNN" not in texts_of(pages["training.svg"])
@@ -267,7 +268,7 @@ def test_untimed_method_is_only_in_the_table():
     assert [cell.strip() for cell in line.split("|")][3] == "–"
 
 
-def test_cost_figures_have_units_and_source():
+def test_figures_of_costs_have_units_and_name_their_source():
     pages = cost_pages({"learning": LEARNING}, "recorded")
     for name, unit in (("training", " / s"), ("inference", " / µs")):
         text = texts_of(pages[f"{name}.svg"])
@@ -276,23 +277,23 @@ def test_cost_figures_have_units_and_source():
         assert "recorded" in text
 
 
-def test_each_point_adds_one_mark(costs):
+def test_each_additional_point_adds_one_mark(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
-    # Each point has a mark in the panel and a mark in the legend; ticks are marks too.
+    # Each point is a mark in the panel and has a mark in the legend. Ticks are marks too.
     assert count_marks(all_) - ticks["all"] - (count_marks(few) - ticks["few"]) == 2
 
 
-def test_cost_pages_are_reproducible(costs):
+def test_equal_results_give_equal_cost_pages(costs):
     assert cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated") == costs
 
 
 def count_marks(svg: str) -> int:
-    """Return the number of marks in a figure (SVG): <use> elements that refer to a path."""
+    """Return the number of marks in a figure (SVG), which are <use> elements that refer to a path."""
     return len(re.findall("<use ", svg))
 
 
-def test_untimed_cells_are_dashes():
+def test_cells_of_methods_that_were_not_timed_are_dashes():
     timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
     untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
     rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
@@ -302,7 +303,7 @@ def test_untimed_cells_are_dashes():
     assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
 
 
-def test_reference_methods_have_times_and_errors():
+def test_table_gives_times_and_errors_of_reference_methods():
     methods = [
         {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
         for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))

@@ -1,4 +1,4 @@
-"""Tests of the SVG titles of marks in figures, which browsers show as tooltips with the values."""
+"""Tests of the titles of marks in figures (SVG). Browsers show them as tooltips with the values of the mark."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -27,7 +27,7 @@ def draw(plot, **labels) -> str:
         return svg(figure)
 
 
-def test_title_of_a_mark_has_label_and_values():
+def test_title_of_a_mark_has_its_label_and_values():
     text = draw(lambda axes: axes.plot([1, 2], [30, 45.5], "o-", label="ours"), xlabel="pokes", ylabel="accuracy / %")
     assert titles(text) == [
         ["ours", "pokes = 1", "accuracy / % = 30"],
@@ -37,29 +37,29 @@ def test_title_of_a_mark_has_label_and_values():
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=12))
-def test_titles_increase_with_position(points):
+def test_values_in_titles_increase_with_the_position_of_marks(points):
     x, y = np.array(points).round(1).T
     text = draw(lambda axes: axes.plot(x, y, "s"), xlabel="x", ylabel="y")
     marks = [use for use in ET.fromstring(text).iter(f"{SVG}use") if use.find(f"{SVG}title") is not None]
     shown = [float(mark.find(f"{SVG}title").text.split("\n")[0].removeprefix("x = ")) for mark in marks]
     x_positions = [float(mark.get("x")) for mark in marks]
     assert shown == pytest.approx(x)
-    # tolerance: positions in the SVG have two decimals
+    # Tolerance: positions in the SVG are written with two decimals.
     assert np.all(np.diff(np.array(x_positions)[np.argsort(shown, kind="stable")]) >= -0.02)
 
 
 def test_title_of_a_bar_has_both_ends():
     text = draw(lambda axes: axes.errorbar([1, 2], [5, 6], [[1, 0], [2, 0]], fmt="o", label="ours"))
-    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # the second bar has length 0
+    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # The second bar has the length 0.
     text = draw(lambda axes: axes.errorbar([5, 6], [1, 2], xerr=[1, 2], fmt="o", capsize=3))
     assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 6", "bar from 4 to 8"]
 
 
-def test_errorbar_without_bars_has_titles():
+def test_points_of_an_errorbar_plot_without_bars_have_titles():
     assert len(titles(draw(lambda axes: axes.errorbar([1, 2], [5, 6], None, fmt="o")))) == 2
 
 
-def test_titles_use_the_names_of_ticks():
+def test_titles_use_the_texts_of_ticks():
     def plot(axes):
         axes.plot([3.1, 3.2], [0.9, 2.1], "o")
         axes.set_yticks([1, 2], ["one\nskin", "two skins"])
@@ -68,7 +68,7 @@ def test_titles_use_the_names_of_ticks():
     assert titles(draw(plot, xlabel="n")) == [["n = 3.1", "one skin"], ["n = 3.2", "two skins"]]
 
 
-def test_shared_axis_uses_its_label():
+def test_titles_on_a_shared_axis_use_its_label():
     with drawing(4.0, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         left.set(ylabel="accuracy / %")
@@ -76,7 +76,7 @@ def test_shared_axis_uses_its_label():
         assert titles(svg(figure)) == [["x = 1", "accuracy / % = 2"]]
 
 
-def test_colour_values_are_in_titles():
+def test_titles_contain_values_that_are_shown_by_colour():
     def plot(axes):
         points = axes.scatter([1, 2], [3, 4], c=[0.25, 0.5])
         axes.figure.colorbar(points, label="error / mm")
@@ -84,7 +84,7 @@ def test_colour_values_are_in_titles():
     assert titles(draw(plot)) == [["x = 1", "y = 3", "error / mm = 0.25"], ["x = 2", "y = 4", "error / mm = 0.5"]]
 
 
-def test_line_without_marks_has_only_its_label():
+def test_title_of_a_line_without_marks_is_its_label():
     text = draw(lambda axes: (axes.plot([1, 2], [3, 4], label="a & b"), axes.axhline(3)))
     assert titles(text) == [["a & b"]]
     ET.fromstring(text)
@@ -95,7 +95,7 @@ def test_line_without_marks_has_only_its_label():
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
     ids=["too many", "one not drawn"],
 )
-def test_too_many_or_missing_values_have_no_titles(values):
+def test_plots_with_too_many_or_missing_values_have_no_titles(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []
     assert titles(draw(lambda axes: axes.scatter(values, values))) == []
 

@@ -1,4 +1,4 @@
-"""Tests of the report's figures: marks, units, source, numbers of the paper, reproducible files."""
+"""Tests of the figures in the report: marks, units, source, the paper's numbers, and reproducible files."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def draw_grid(error_mm: float = 0.5) -> str:
     return error_grid(PLACES_MM, PLACES_MM + error_mm, title="lab (recorded), lobo")
 
 
-def test_error_grid_has_units_and_source():
+def test_figure_of_place_errors_has_units_and_source():
     text = draw_grid()
     ET.fromstring(text)
     for label in ("x / mm", "y / mm", "mean position error / mm", "recorded"):
@@ -50,27 +50,29 @@ def test_each_place_is_drawn_once():
     assert draw_grid().count("<title>x / mm") == 4
 
 
-def test_skin_and_chips_are_drawn_only_on_the_papers_grid():
+def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # More elements: five chips, a skin, two legend entries; fewer: two spines of the axes.
+    # On the paper's grid, there are more elements: five chips, the skin and two entries of the legend. There are fewer
+    # spines of the axes, by two.
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
 
 
-def test_outline_of_another_board_replaces_that_of_the_paper():
+def test_outline_of_another_board_replaces_that_of_the_papers_board():
     outline = Outline((10.0, 4.0), (30.0, 20.0), ((20.0, 10.0), (25.0, 15.0)))
     text = error_grid(PLACES_MM + 12, PLACES_MM + 12, title="mine", outline=outline)
-    assert draw_grid().count('id="patch_') - text.count('id="patch_') == 5 - 2  # chips
+    # The paper's board has five chips, the other board two.
+    assert draw_grid().count('id="patch_') - text.count('id="patch_') == 5 - 2
 
 
-def test_title_states_the_place_with_the_largest_error():
+def test_title_of_the_figure_states_the_place_with_the_largest_error():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
     assert "worst 3.00 mm at x = 2, y = 2" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
 
 
-def test_svg_is_reduced_but_text_keeps_its_digits():
+def test_svg_is_made_smaller_without_changing_digits_in_texts():
     with drawing(3.0, 2.0) as figure:
         axes = figure.subplots()
         axes.plot([0, 1], [0.123456, 2], "o")
@@ -83,7 +85,7 @@ def test_svg_is_reduced_but_text_keeps_its_digits():
     assert re.search(r"^ ", text, re.MULTILINE) is None
 
 
-def test_formula_fonts_have_a_fallback():
+def test_fonts_of_formulas_have_an_alternative():
     with drawing(3.0, 2.0) as figure:
         figure.subplots().set_yscale("log")
         families = re.findall(r"font-family: ([^\";]*)", svg(figure))
@@ -91,7 +93,7 @@ def test_formula_fonts_have_a_fallback():
     assert all(family.endswith("sans-serif") for family in families)
 
 
-def test_error_grid_is_reproducible():
+def test_equal_errors_give_an_equal_figure():
     assert draw_grid() == draw_grid()
     assert draw_grid() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
 
@@ -112,13 +114,13 @@ SENSORS = [
 ]
 
 
-def test_sweep_pokes_labels():
+def test_figure_of_the_number_of_pokes_has_labels():
     labels = texts_of(sweep_pokes(POKES, "simulated"))
     for label in ("0", "65", "3900", "simulated", "%", "mm²", "paper's table 2: mean ± standard deviation", "pokes"):
         assert label in labels
 
 
-def test_sweep_sensors_has_a_line_for_each_method():
+def test_figure_of_the_number_of_sensors_has_a_line_for_each_method():
     labels = texts_of(sweep_sensors(SENSORS, "recorded"))
     for label in ("multi-sensor + triplet", "adapted", "training skins", "recorded"):
         assert label in labels
@@ -141,12 +143,12 @@ def test_error_bars_end_at_possible_scores():
         ({"sd_seeds": 1.5, "n": 1}, 1.5, 1.5), ({"n": 1}, 0.0, 0.0),
     ],
 )  # fmt: skip
-def test_bar_lengths_by_available_spread(spread, down, up):
+def test_meaning_of_bars_depends_on_the_spread_that_is_known(spread, down, up):
     _, lengths = bars([row(50.0, **spread)], "accuracy_pct")
     np.testing.assert_array_equal(lengths, [[down], [up]])
 
 
-def test_only_sweeps_with_numbers_are_drawn():
+def test_only_sweeps_that_were_run_are_drawn():
     assert [name for name, _ in learning_figures({"sweep_pokes": POKES}, "simulated")] == ["sweep_pokes.svg"]
     both = dict(learning_figures({"sweep_pokes": POKES, "sweep_sensors": SENSORS}, "simulated"))
     assert list(both) == ["sweep_pokes.svg", "sweep_sensors.svg"]
@@ -154,14 +156,14 @@ def test_only_sweeps_with_numbers_are_drawn():
 
 
 @pytest.mark.parametrize("draw", [sweep_pokes, sweep_sensors])
-def test_sweeps_are_reproducible(draw):
+def test_equal_sweeps_give_equal_figures(draw):
     rows = POKES if draw is sweep_pokes else SENSORS
     figure, again, other = (draw(sweep, "simulated") for sweep in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
     assert figure == again != other
     ET.fromstring(figure)
 
 
-def test_headline_figure_has_all_rows_of_table_2():
+def test_figure_of_table_2_has_all_its_rows():
     numbers = all_experiments()
     labels = texts_of(headline_figures(numbers, "simulated")[HEADLINE])
     for name in numbers["table2"]:
@@ -170,14 +172,14 @@ def test_headline_figure_has_all_rows_of_table_2():
         assert label in labels
 
 
-def test_headline_figures_have_place_and_force():
+def test_figures_of_table_2_are_about_place_and_force():
     figures = headline_figures(all_experiments(), "simulated")
     assert "MSE_F / N²" in texts_of(figures[FORCE])
     assert "R² of F" in texts_of(figures[FORCE])
     assert "MSE_xy / mm²" in texts_of(figures[HEADLINE])
 
 
-def test_headline_figure_is_reproducible():
+def test_equal_numbers_give_an_equal_figure_of_table_2():
     numbers = all_experiments()
     assert headline_figures(numbers, "simulated") == headline_figures(numbers, "simulated")
     assert headline_figures({name: numbers[name] for name in ("provenance",)}, "recorded") == {}
@@ -191,7 +193,7 @@ def lab() -> dict:
     return numbers
 
 
-def test_labels_figure_has_each_method(lab):
+def test_figure_of_labels_has_a_line_for_each_method(lab):
     labels = texts_of(headline_figures(lab, "recorded")[LABELS])
     assert all(f"{row['method']} ({row['inputs']})" in labels for row in lab["labels"])
     assert "recorded" in labels
@@ -203,7 +205,7 @@ def titles(svg: str) -> list[str]:
 
 
 @pytest.mark.parametrize("large", [True, False])
-def test_unseen_boards_show_each_board_and_the_paper(lab, large):
+def test_figure_of_unseen_boards_shows_each_board_beside_the_paper(lab, large):
     shown = titles(unseen_boards(lab, "recorded", large=large))
     rows = boards_rows(lab)
     assert {row["labels"] for row in rows} >= {"0", "10", "40"}
@@ -221,7 +223,7 @@ def test_unseen_boards_show_each_board_and_the_paper(lab, large):
         assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
 
 
-def test_title_of_unseen_boards_has_two_short_lines(lab):
+def test_title_of_the_figure_of_unseen_boards_has_two_short_lines(lab):
     text = headline_figures(lab, "recorded")[HEADLINE]
     lines = [line for line in text.splitlines() if "Boards never seen" in line or "each mark is one board" in line]
     assert [re.sub("<[^>]*>", "", line).strip() for line in lines] == [
@@ -237,7 +239,7 @@ def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
     assert FORCE_LABEL not in texts_of(figures[HEADLINE])
 
 
-def test_caption_names_rows_with_another_kind_of_bar():
+def test_caption_names_the_rows_whose_bars_have_another_meaning():
     scores = {"single": row(40.0), "multi": row(80.0, ci95=[70, 90]), "adapted": row(85.0, ci95=[80, 90])}
     assert spread_of(scores) == "95 % interval over boards; single: standard deviation"
     del scores["single"]

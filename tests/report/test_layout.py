@@ -1,4 +1,4 @@
-"""Tests of the layout of figures for narrow screens."""
+"""Tests of the layout of figures on narrow screens."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -33,7 +33,7 @@ def draw_row(figure):
     figure.suptitle(TITLE, x=0.01, ha="left")
 
 
-def test_a_row_of_panels_becomes_a_column():
+def test_row_of_panels_becomes_a_column_on_a_narrow_screen():
     figure = laid_out(draw_row, height_in=5.0)
     boxes = [axes.get_window_extent() for axes in figure.axes]
     assert figure.get_figwidth() == WIDTH_IN
@@ -65,19 +65,19 @@ def test_labels_of_y_axes_are_no_longer_than_their_panels():
         assert panel.y0 - 1 < label.y0 < label.y1 < panel.y1 + 1
 
 
-def test_figures_with_rows_and_columns_keep_them():
+def test_panels_in_rows_and_columns_keep_their_arrangement():
     figure = laid_out(lambda figure: figure.subplots(2, 2), width_in=8.0)
     assert figure.get_figwidth() == 8.0
     assert len({round(axes.get_window_extent().x0) for axes in figure.axes}) == 2
 
 
-def test_panels_stay_side_by_side_if_requested():
+def test_panels_stay_beside_each_other_if_this_is_requested():
     figure = laid_out(lambda figure: figure.subplots(1, 2), column=False)
     assert figure.get_figwidth() == 9.0
     assert len({round(axes.get_window_extent().y0) for axes in figure.axes}) == 1
 
 
-def test_overlapping_labels_are_turned():
+def test_labels_that_would_overlap_are_turned():
     def draw(figure):
         axes = figure.subplots()
         axes.set_xticks(range(15), [f"B{i}" * 3 for i in range(15)])
@@ -90,7 +90,7 @@ def test_overlapping_labels_are_turned():
     ("limits", "shown"),
     [((1e-3, 1e2), {"0.001", "0.1", "10"}), ((1e-9, 1e-3), {"10⁻⁸", "10⁻⁴"}), ((150, 700), {"200", "500"})],
 )
-def test_logarithmic_axes_have_readable_numbers(limits, shown):
+def test_numbers_on_logarithmic_axes_are_readable(limits, shown):
     with drawing(4.0, 3.0) as figure:
         figure.subplots().set(xscale="log", xlim=limits)
         text = svg(figure)

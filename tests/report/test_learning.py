@@ -1,4 +1,4 @@
-"""Tests of the tables on training with many skins, and of the blocks in README and docs with these tables."""
+"""Tests of the tables about training with many skins, and of the blocks in README and docs that contain them."""
 
 from itertools import pairwise
 
@@ -53,14 +53,14 @@ PAIRED = [
 NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIRED}
 
 
-def test_paired_boards_table_lists_each_board():
+def test_table_of_paired_differences_lists_each_board():
     table = paired_boards_table(NUMBERS, "simulated")
     rows = table[table["difference"] == "adapted − multi-sensor + triplet"]
     assert rows["held-out board"].tolist() == ["b0", "b1"]
     assert rows["accuracy, %"].tolist() == ["+5", "+7"]
 
 
-def test_paired_table_has_the_papers_difference_of_means():
+def test_table_of_paired_differences_has_the_difference_of_the_papers_means():
     table = paired_table(NUMBERS, "simulated")
     assert table["difference"].tolist() == [
         "multi-sensor − single-sensor", "multi-sensor + triplet − multi-sensor", "adapted − multi-sensor + triplet",
@@ -72,13 +72,13 @@ def test_paired_table_has_the_papers_difference_of_means():
         "+6.0 [5.0, 7.0]",
         "+0.1 [-2.9, 3.1]",
     ]
-    # Differences of means in the paper's table 2: 81.03 - 84.43 and 87.00 - 81.03; the paper has no control.
+    # The differences of means in the paper's table 2 are 81.03 - 84.43 and 87.00 - 81.03. The paper has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
     assert "95 % interval over n boards" in to_markdown(table)
 
 
-def test_one_training_skin_is_not_called_multi_sensor():
+def test_network_of_one_training_skin_is_not_called_multi_sensor():
     numbers = NUMBERS | {"lobo": {"by_board": ALONE}, "paired": PAIRED[1:]}
     text = to_markdown(paired_table(numbers, "recorded"))
     assert "multi-sensor" not in text
@@ -86,7 +86,7 @@ def test_one_training_skin_is_not_called_multi_sensor():
     assert set(paired_table(numbers, "recorded")["accuracy, % (paper: difference of means)"]) == {"–"}
 
 
-def test_table_2_rows_follow_the_paper():
+def test_rows_of_table_2_are_in_the_order_of_the_paper():
     numbers = all_numbers() | {"adapt": {"pokes_n": 390, "control": row(82.0)}}
     table = make_tables(numbers)["table2"]
     assert table["model"].tolist() == [
@@ -103,13 +103,13 @@ def test_table_2_rows_follow_the_paper():
     assert table["accuracy, % (ours)"].tolist()[-1] == "82.0 ± 1.0"
 
 
-def test_other_number_of_pokes_is_stated():
+def test_table_states_a_number_of_pokes_other_than_the_papers():
     numbers = all_numbers() | {"adapt": {"pokes_n": 65, "control": row(82.0)}}
     (name,) = [name for name in make_tables(numbers)["table2"]["model"] if "adapted" in name]
     assert name.endswith("adapted using 65 indentations (paper: 390)")
 
 
-def test_sweeps_are_sorted_by_count():
+def test_rows_of_sweeps_are_sorted_by_count():
     table = sweep_pokes_table([{"pokes_n": n, **row(80.0 + n / 100)} for n in (390, 0, 65)], "simulated")
     assert table["pokes"].tolist() == ["0", "65", "390"]
     assert table["accuracy, % (ours)"].tolist() == ["80.0 ± 1.0", "80.7 ± 1.0", "83.9 ± 1.0"]
@@ -121,7 +121,7 @@ def test_sweeps_are_sorted_by_count():
 
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=9))
-def test_baselines_are_sorted_by_accuracy(accuracies):
+def test_reference_methods_are_sorted_by_accuracy(accuracies):
     rows = [{"method": f"m{i}", "inputs": "raw", "rows_n": 9, **row(value)} for i, value in enumerate(accuracies)]
     methods = baselines_table(rows, "recorded")["method"].tolist()
     assert sorted(methods) == sorted(f"m{i}" for i in range(len(rows)))
@@ -129,7 +129,7 @@ def test_baselines_are_sorted_by_accuracy(accuracies):
     assert all(a >= b for a, b in pairwise(shown))
 
 
-def test_labels_table_has_both_scores():
+def test_table_of_labels_has_scores_as_labelled_and_registered():
     one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
     (line,) = labels_table([one], "recorded").to_dict("records")
     assert line == {
@@ -142,7 +142,7 @@ def test_labels_table_has_both_scores():
     assert (line["coverage of 90 % intervals, %"], line["half-width of 90 % intervals, mm (median)"]) == ("91", "–")
 
 
-def test_unknown_leak_is_highlighted_in_the_audit():
+def test_leak_that_is_not_known_is_highlighted_in_the_audit():
     check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
     rows = [check, check | {"holds": False, "known": True, "found": 6}, check | {"holds": False}]
     table = audit_table(rows, "simulated")
@@ -150,7 +150,7 @@ def test_unknown_leak_is_highlighted_in_the_audit():
     assert table["found"].tolist() == ["0", "6", "0"]
 
 
-def test_chosen_candidate_is_marked():
+def test_chosen_settings_are_marked_among_the_candidates():
     candidates = [
         {"recipe_name": name, "settings": "", **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))
     ]
@@ -196,7 +196,7 @@ def part() -> dict:
     return {"as_labelled": scores, "registered": scores}
 
 
-def test_each_experiment_has_its_table_with_source():
+def test_table_of_each_experiment_names_its_source():
     expected = {
         "claims",
         "paired",
@@ -216,7 +216,7 @@ def test_each_experiment_has_its_table_with_source():
     assert not expected & set(make_tables(nothing))
 
 
-def test_readme_has_the_claims_below_table_2():
+def test_readme_has_the_claims_of_the_paper_below_table_2():
     described = {
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }
@@ -226,7 +226,7 @@ def test_readme_has_the_claims_below_table_2():
     assert f"{table2}\n\n{claims}" in results
 
 
-def test_readme_costs_come_from_provenance():
+def test_costs_in_the_readme_are_those_of_the_recorded_run():
     described = {"grid": {"source": "simulated", "over_skins": {}}}
     numbers = all_numbers() | {"described": described, "trainings": {}}
     numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}

@@ -1,4 +1,7 @@
-"""Tests of the numbers and contrasts of experiments on many skins, against values calculated by hand."""
+"""Tests of the numbers of experiments on many skins, against values calculated by hand.
+
+Contrasts, which are also tested, are differences between points of a sweep.
+"""
 
 import json
 
@@ -15,7 +18,7 @@ from pipeline.statistics import tidy
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, in percentage points
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # The gain by adaptation on each skin, in percentage points.
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
@@ -65,15 +68,15 @@ def paired(of: str, over: str) -> dict:
     return one
 
 
-def test_table_2_pools_skins_by_board():
+def test_scores_of_table_2_are_averaged_over_skins_and_then_over_boards():
     table2 = numbers()["table2"]
     assert table2.keys() == {"multi", "triplet", "adapted"}
     assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
-    # accuracies of the skins of b0: 80 and 82; of b1: 84 and 86
+    # The accuracies on the skins of b0 are 80 and 82. On the skins of b1, they are 84 and 86.
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 
-def test_control_has_its_number_of_pokes():
+def test_numbers_of_the_control_include_its_number_of_pokes():
     assert numbers()["adapt"]["pokes_n"] == 390
     assert numbers()["adapt"]["control"]["accuracy_pct"] == over(79.5, 81.5)
 
@@ -83,9 +86,9 @@ def over(*boards: float) -> dict:
     return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "values": pytest.approx(list(boards))}
 
 
-def test_paired_differences_by_board():
+def test_paired_differences_are_averaged_over_the_skins_of_each_board():
     assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
-    # gains of 2 and 4 percentage points on the skins of b0, of 6 and 8 on the skins of b1
+    # The gains are 2 and 4 percentage points on the skins of b0, and 6 and 8 on the skins of b1.
     assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
     by_board = paired("adapted", "triplet")["by_board"]
     assert {board: metrics["accuracy_pct"] for board, metrics in by_board.items()} == {"b0": 3.0, "b1": 7.0}
@@ -95,14 +98,14 @@ def test_paired_differences_by_board():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_multi_minus_single_uses_skins_of_both():
+def test_difference_of_multi_and_single_uses_the_skins_that_both_were_tested_on():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
     assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
-def test_protocol_counts_what_networks_were_trained_and_tested_on():
+def test_protocol_counts_the_data_for_training_and_for_tests():
     counts = numbers(board_cards("lobo", 80.0))["protocol"]
     assert counts.keys() == {"lobo"}
     cards = board_cards("lobo", 80.0)
@@ -121,18 +124,18 @@ def test_missing_experiment_has_no_numbers():
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
     alone = numbers(adapted_cards("paper", 78.0, 1.0))
     assert alone.keys() == {"table2", "adapt", "protocol", "variants"}
-    assert alone["adapt"] == {"pokes_n": 390}  # there is no control
+    assert alone["adapt"] == {"pokes_n": 390}  # There is no control, so its numbers are missing.
     assert "null" not in json.dumps(numbers())
 
 
-def test_other_recipes_are_only_in_variants():
+def test_networks_with_other_recipes_are_counted_only_as_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
     assert numbers()["variants"]["adapt"]["other"]["accuracy_pct"] == over(6.0, 10.0)
 
 
-def test_sweep_over_pokes_is_sorted():
+def test_sweep_over_the_number_of_pokes_is_sorted():
     points = [
         *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((390, "s2", 90.0), (390, "s3", 94.0))),
         *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((65, "s2", 80.0), (65, "s3", 86.0))),
@@ -143,7 +146,7 @@ def test_sweep_over_pokes_is_sorted():
     assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
 
 
-def test_sweep_over_sensors_has_a_point_per_method_and_count():
+def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
     points = [
         point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
@@ -160,11 +163,12 @@ def test_sweep_over_sensors_has_a_point_per_method_and_count():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # one board, with two draws of skins
+    # There is one board, with two draws of skins, and n counts boards.
+    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
-def test_learning_times_are_medians():
+def test_training_times_are_medians_over_networks():
     rows = [
         {"method": "ridge", "inputs": "raw", "name": "ridge"},
         {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
@@ -186,18 +190,19 @@ def test_learning_times_are_medians():
         "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # median times; the last method was not timed
+    # These are median times. The last method was not timed.
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
 
-def test_adaptation_times_by_number_of_pokes():
+def test_times_of_adaptation_are_given_for_each_number_of_pokes():
     numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
     seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
     assert [row.get("seconds") for row in learning_times(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> list[dict]:
-    """Return points of two boards; `by_count` has the accuracies of both boards at each count."""
+    """Return the points of a sweep on two boards. `by_count` has the accuracies of both boards at each count."""
     return [
         point(dict.fromkeys(skins, float(pct)), board, **{key: count}, **keys)
         for count, both in by_count.items()
@@ -209,7 +214,7 @@ def gains(contrast: dict) -> dict[str, float]:
     return {board: metrics["accuracy_pct"] for board, metrics in contrast["by_board"].items()}
 
 
-def test_poke_contrasts_of_gain_and_plateau():
+def test_contrasts_of_pokes_are_the_gain_and_its_rest_at_large_numbers():
     found = contrasts_of_pokes(
         tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
     )
@@ -221,7 +226,7 @@ def test_poke_contrasts_of_gain_and_plateau():
     assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
-def test_contrasts_beyond_the_range_of_a_sweep_are_absent():
+def test_contrasts_beyond_the_counts_of_a_sweep_are_missing():
     found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
@@ -233,7 +238,7 @@ def test_contrasts_beyond_the_range_of_a_sweep_are_absent():
     }  # fmt: skip
 
 
-def test_sensor_contrasts_of_methods_and_gains():
+def test_contrasts_of_sensors_compare_methods_and_gains():
     scores = {
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},

@@ -1,4 +1,7 @@
-"""Tests of numbers.json (equal for equal runs), provenance.json, and the scores that `dvc metrics` shows."""
+"""Tests of the files with the results of a scene.
+
+These are numbers.json (equal for equal runs), provenance.json, and the scores that `dvc metrics` shows.
+"""
 
 import copy
 import json
@@ -18,7 +21,7 @@ STUDY = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "work_
 
 
 def run(seconds: float) -> dict:
-    """Return the numbers of a run with every kind of run time; one method is not timed."""
+    """Return the numbers of a run with run times of every kind. One method was not timed."""
     trainings = {
         "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
         "train_classical": [{"name": "ridge.b0", "train_s": seconds, "one_reading_s": seconds / 1e3}],
@@ -33,14 +36,14 @@ def run(seconds: float) -> dict:
     return numbers
 
 
-def test_runs_differ_only_in_provenance():
+def test_equal_runs_differ_only_in_their_provenance():
     (numbers, provenance), (other_numbers, other) = split(run(1.0)), split(run(2.0))
     assert numbers == other_numbers
     assert provenance != other
     assert all(row.keys() & set(TIMES) for row in provenance["runtime"]["adaptation"])
 
 
-def test_numbers_have_no_commit_machine_or_times():
+def test_numbers_contain_no_commit_machine_or_times():
     numbers = split(run(1.0))[0]
     assert set(numbers["provenance"]) == {"scene", "source", "seed"}
     assert "stages" not in numbers["runtime"]
@@ -48,7 +51,7 @@ def test_numbers_have_no_commit_machine_or_times():
     assert numbers["runtime"]["quadratures"][0] == STUDY
 
 
-def test_split_and_join_are_inverse():
+def test_joining_split_results_gives_them_back():
     numbers = run(1.0)
     before = copy.deepcopy(numbers)
     assert join(*split(numbers)) == before
@@ -56,13 +59,13 @@ def test_split_and_join_are_inverse():
 
 
 @pytest.mark.parametrize("folder", sorted(file.parent for file in ROOT.glob("reports/*/numbers.json")), ids=str)
-def test_committed_numbers_and_provenance_are_separate(folder):
+def test_committed_numbers_contain_no_provenance(folder):
     numbers, provenance = (read_json(folder / name) for name in ("numbers.json", "provenance.json"))
     assert split(join(numbers, provenance)) == (numbers, provenance)
     assert {"git", "trained", "device", "seconds", "runtime"} <= set(provenance)
 
 
-def test_scores_include_the_means_of_table_2_and_control():
+def test_scores_include_the_means_of_table_2_and_of_the_control():
     numbers = {"provenance": {"source": "simulated"}, "table2": {"multi": scores()}, "adapt": {"control": scores()}}
     numbers["table2"]["multi"]["accuracy_pct"] = stat(82.2)
     assert headline_scores(numbers) == {
@@ -73,10 +76,11 @@ def test_scores_include_the_means_of_table_2_and_control():
     }
 
 
-def test_scores_include_the_last_window_of_drift():
+def test_scores_include_the_last_window_of_experiment_drift():
     windows = [{"contacts_n": n, "accuracy_pct": 100.0 - n, "mse_xy_mm2": 1.0} for n in (10, 20)]
     numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows, "findings": [{"finding": "x"}]}}
-    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # scores without forces
+    # These scores are without forces.
+    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}
 
 
 def test_scores_of_recorded_scenes_include_registered_scores_and_best_methods():
@@ -95,7 +99,7 @@ def test_scores_of_recorded_scenes_include_registered_scores_and_best_methods():
     }
 
 
-def test_runtime_and_provenance_change_no_score():
+def test_run_times_and_provenance_change_no_score():
     numbers = all_experiments()
     before = headline_scores(numbers)
     numbers["provenance"] |= {"git": "other", "trained": "other", "device": "other", "seconds": 9.0}
@@ -104,19 +108,19 @@ def test_runtime_and_provenance_change_no_score():
     assert not any(word in json.dumps(before) for word in ("seconds", '_s"', "git", "device"))
 
 
-def test_empty_scene_has_no_scores():
+def test_scene_without_results_has_no_scores():
     assert headline_scores({"provenance": {"source": "simulated"}}) == {}
 
 
 @pytest.mark.parametrize("without", ANALYSES)
 def test_missing_experiment_has_no_scores(without):
     numbers = all_experiments()
-    numbers.pop(without, None)  # experiment compare is only in recorded scenes
+    numbers.pop(without, None)  # Experiment compare is only in recorded scenes.
     assert not any(name.startswith(without) for name in headline_scores(numbers))
 
 
 @pytest.mark.parametrize("file", sorted(ROOT.glob("reports/*/numbers.json")), ids=lambda file: file.parent.name)
-def test_scores_of_committed_reports(file):
+def test_scores_of_committed_reports_have_units_in_their_names(file):
     numbers = read_json(file)
     known = {value for _, value in leaves(numbers) if isinstance(value, float)}
     shown = dict(leaves(headline_scores(numbers)))
@@ -124,4 +128,4 @@ def test_scores_of_committed_reports(file):
     for name, value in shown.items():
         if not name.endswith(".method"):
             assert value in known
-            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # only R² has no unit
+            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # Only R² has no unit.

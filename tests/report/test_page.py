@@ -47,7 +47,10 @@ VOID = {"meta", "img", "br"}
 
 
 class Reader(HTMLParser):
-    """Parse an HTML page into elements with attributes and ancestors; fail if tags are not nested correctly."""
+    """A parser that turns an HTML page into elements with attributes and ancestors.
+
+    It fails if tags are not nested correctly.
+    """
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -74,7 +77,7 @@ class Reader(HTMLParser):
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_experiments() if numbers is None else numbers
-    # The synthetic numbers lack values that the tables of these experiments need.
+    # The synthetic numbers lack values that the tables of these experiments need, so these experiments are omitted.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
@@ -91,7 +94,7 @@ def read() -> Reader:
     return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
 
 
-def test_page_needs_no_network_or_script(read):
+def test_page_loads_nothing_and_contains_no_script(read):
     assert [one for one in ("script", "link", "svg") if read.all(one)] == []
     names = ("src", "href", "data")
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
@@ -102,19 +105,19 @@ def test_page_needs_no_network_or_script(read):
     assert "@import" not in render()
 
 
-def test_links_lead_to_unique_ids(read):
+def test_links_lead_to_ids_that_exist_once(read):
     ids = Counter(attributes["id"] for _, attributes, _ in read.elements if "id" in attributes)
     assert max(ids.values()) == 1
     links = {attributes["href"] for attributes, _ in read.all("a")}
     assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
     assert [link for link in links if link.startswith("../../") and not (ROOT / link[6:]).exists()] == [
-        "../../pipeline/scenes/x.yaml"  # no such file, because the scene is synthetic
+        "../../pipeline/scenes/x.yaml"  # This file does not exist, because the scene is synthetic.
     ]
     labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
     assert labels <= set(ids)
 
 
-def test_tables_name_their_columns(read):
+def test_tables_have_names_of_columns(read):
     tables = read.all("table")
     assert len(tables) > 8
     assert all(above[-1].startswith("div.box") for _, above in tables)
@@ -122,8 +125,11 @@ def test_tables_name_their_columns(read):
     assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
 
 
-def test_stacked_rows_keep_their_labels_and_roles(read):
-    """On narrow screens, rows are stacked. Each cell then has a label, and roles keep the structure of the table."""
+def test_rows_stacked_on_narrow_screens_keep_their_labels_and_roles(read):
+    """On narrow screens, the cells of a row are below each other.
+
+    Each cell then has a label, and roles keep the table's structure.
+    """
     widths = {above[-1].rpartition(" ")[2] for _, above in read.all("table")}
     stacked = set(re.findall(r"\n[.](w\d+) tbody tr {", render()))
     assert widths <= stacked == {f"w{rem}" for rem in STEPS_REM}
@@ -134,7 +140,7 @@ def test_stacked_rows_keep_their_labels_and_roles(read):
     assert all(attributes["role"] == role for tag, role in roles.items() for attributes, _ in read.all(tag))
 
 
-def test_wider_tables_are_stacked_at_larger_widths():
+def test_tables_with_more_columns_are_stacked_at_larger_widths_of_the_screen():
     row = {f"column {i}": "12.3 [10.1, 14.5]" for i in range(9)}
     widths = [lay_out("t", "T", pd.DataFrame([dict([*row.items()][:n])])).width_rem for n in range(1, 10)]
     assert widths == sorted(widths)
@@ -153,7 +159,7 @@ def test_each_table_and_figure_of_the_paper_is_linked_from_the_top():
     ids = {attributes["id"]: tag for tag, attributes, _ in read.elements if "id" in attributes}
     assert all(ids[place.id] == ("details" if place.shown[0] in tables else "figure") for place in places)
     assert all(link.startswith("#") for link in re.findall('href="([^"]+)"', bar))
-    # The page of a scene without one of these tables and figures says so, and has no link to it.
+    # If a scene lacks one of these tables or figures, its page says so, and has no link to it.
     assert 'href="#figure-4a"' not in render()
     assert "not in this scene" in render()
 
@@ -168,7 +174,7 @@ def test_first_section_answers_questions_on_place_and_force(read):
     ]
 
 
-def test_headings_are_in_order(read):
+def test_levels_of_headings_are_in_order(read):
     levels = [int(tag[1]) for tag, _, _ in read.elements if re.fullmatch(r"h[1-6]", tag)]
     assert levels[0] == 1
     assert levels.count(1) == 1
@@ -191,13 +197,13 @@ def test_results_link_to_the_table_or_figure_that_shows_them():
     ]
 
 
-def test_our_protocol_is_shown_beside_that_of_the_paper():
+def test_page_shows_our_protocol_beside_that_of_the_paper():
     text = render()
     single = text[text.index('<section id="single"') :].partition("</section>")[0]
     assert single.index("45,000 for training") < single.index("7,020 readings") < single.index("<details")
 
 
-def test_figures_have_text_alternatives(read):
+def test_figures_have_texts_for_screen_readers(read):
     objects, images = read.all("object"), read.all("img")
     assert len(objects) == len(images) == 3
     assert all(attributes["aria-label"].strip() and above[-1] == "div.card" for attributes, above in objects)
@@ -206,22 +212,22 @@ def test_figures_have_text_alternatives(read):
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_order_of_figures_results_and_tables():
+def test_figures_results_and_tables_of_a_section_are_in_this_order():
     for part in render().split("<section id=")[1:]:
         places = [part.index(mark) for mark in ("<figure", "Comparison with the paper", "<details") if mark in part]
         assert places == sorted(places)
 
 
-def test_smallest_width_of_a_figure_is_legible():
+def test_width_below_which_a_figure_is_not_legible_is_computed():
     letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
     drawing = measure("figures/a.svg", letters, "a")
     assert (drawing.width_px, drawing.height_px) == (400, 200)
-    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # the smallest text is 6 pt high in a figure 300 pt wide
-    assert drawing.scrolls  # scrolls on a phone
+    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # The smallest text is 6 pt high, in a figure that is 300 pt wide.
+    assert drawing.scrolls  # On a phone, the figure can be scrolled.
     assert not measure("figures/a.svg", letters.replace("6px", "9px"), "a").scrolls
 
 
-def test_figure_without_size_is_an_error():
+def test_figure_that_states_no_size_is_refused():
     with pytest.raises(SchemaError, match=r"figures/a\.svg: the SVG has no size"):
         measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>', "a")
 
@@ -236,17 +242,17 @@ def test_figure_without_size_is_an_error():
         ("rms error 0.6 N, 78 % of 3 Names", "rms error 0.6_N, 78_% of 3 Names"),
     ],
 )
-def test_numbers_are_not_broken_across_lines(text, kept):
+def test_numbers_are_not_broken_at_the_end_of_a_line(text, kept):
     assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
-def test_summary_is_in_the_first_section():
+def test_summary_of_results_is_in_the_first_section():
     text = render(all_experiments())
     first = text.split("<section")[1]
     assert text.count(EFFORTS) == first.count(EFFORTS) == 1
 
 
-def test_section_about_lists_counts():
+def test_section_about_the_scene_lists_counts():
     numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
@@ -263,7 +269,7 @@ def test_results_with_verdicts_come_first():
     assert judged == sorted(judged, reverse=True)
 
 
-def test_incomparable_results_are_omitted():
+def test_results_that_cannot_be_compared_are_omitted():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
     (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "smaller than the paper's: 8,000 contacts"}])).rows
@@ -273,20 +279,20 @@ def test_incomparable_results_are_omitted():
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_badge_shows_the_source(source):
+def test_badge_says_whether_data_are_simulated_or_recorded(source):
     text = render(all_experiments(source))
     assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
 
 
-def test_page_starts_with_the_scene(read):
+def test_page_begins_with_the_scene(read):
     place = next(i for i, word in enumerate(read.words) if "Main captures: 2, with 1,000 readings." in word)
     assert place < read.words.index(read_sections()[0].title)
 
 
-def test_tables_without_a_section_are_shown_as_text(read):
+def test_tables_that_belong_to_no_section_are_shown_with_their_texts_escaped(read):
     assert "Surprise" in read.words
-    assert "<b>" in read.words  # shown as text, not interpreted as a tag
+    assert "<b>" in read.words  # The tag is shown as text, and not interpreted.
     assert "a & b" in read.words
     assert "Unheard of (simulated)" in read.words
 
@@ -296,13 +302,13 @@ def test_table_without_rows_is_not_shown():
     assert "surprise" not in render(surprise=pd.DataFrame({"a": []}))
 
 
-def test_what_experiments_found_is_before_checks_and_captures():
+def test_results_of_experiments_come_before_checks_and_captures():
     keys = [section.key for section in read_sections()]
     experiments = [name for name, file in experiment_files().items() if file.section is not None]
     assert all(keys.index(name) < keys.index("checks") for name in experiments)
 
 
-def test_missing_experiment_has_no_section():
+def test_missing_experiment_has_no_section_on_the_page():
     keys = [section.key for section in arrange(["table2", "captures"], [])]
     assert keys == ["headline", "captures"]
     assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
@@ -310,7 +316,7 @@ def test_missing_experiment_has_no_section():
     ]  # fmt: skip
 
 
-def test_run_page_has_provenance_and_run_times():
+def test_page_about_the_run_has_provenance_and_run_times():
     numbers = all_experiments()
     text = Reader(render_run(numbers)).words
     provenance = numbers["provenance"] | {"versions": "numpy 1, torch 2"}
@@ -320,7 +326,7 @@ def test_run_page_has_provenance_and_run_times():
     assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["training.svg"]
 
 
-def test_page_does_not_depend_on_its_run(read):
+def test_page_of_results_does_not_depend_on_the_run(read):
     assert [frame["src"] for frame, _ in read.all("iframe")] == ["runtime/index.html"]
     other = all_experiments()
     other["provenance"] |= {"git": "other", "trained": "other", "device": "other", "versions": {}, "seconds": 9.0}
@@ -329,7 +335,7 @@ def test_page_does_not_depend_on_its_run(read):
     assert render_run(other) != render_run(all_experiments())
 
 
-def test_page_is_reproducible():
+def test_equal_results_give_an_equal_page():
     assert render() == render()
 
 
@@ -338,11 +344,11 @@ def test_numbers_are_right_aligned():
     assert lay_out("t", "T", table).looks == ["text", "number", "text", "text", "number"]
 
 
-def test_table_notes_are_shown(read):
+def test_notes_of_tables_are_shown(read):
     assert any("within 1 mm" in text for text in read.words)
 
 
-def test_each_table_and_figure_has_one_section():
+def test_each_table_and_figure_is_in_one_section():
     sections = read_sections()
     named = Counter(name for section in sections for name in section.captions)
     assert max(named.values()) == 1
@@ -356,14 +362,14 @@ def luminance(colour: str) -> float:
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def test_contrast_meets_wcag():
+def test_contrast_of_colours_meets_wcag():
     text = render()
     light, dark, printed = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
     for theme in (light, light | dark, light | printed, light | dark | printed):
         inks = ("ink", "soft", "link", "yes", "partly", "no")
         pairs = [(ink, ground) for ink in inks for ground in ("paper",)] + [("ink", "band"), ("soft", "band")]
         for ink, ground in pairs:
-            assert contrast(theme[ink], theme[ground]) >= 4.5  # WCAG 2.2 AA
+            assert contrast(theme[ink], theme[ground]) >= 4.5  # This is the minimum of WCAG 2.2, level AA.
         for source in ("simulated", "recorded"):
             assert contrast("#ffffff", theme[source]) >= 4.5
 
@@ -386,18 +392,18 @@ def scene_numbers(scene: str, source: str) -> dict:
     return found | {"provenance": found["provenance"] | {"scene": scene}}
 
 
-def test_recorded_scenes_come_first():
+def test_recorded_scenes_come_first_in_the_index():
     text = index([scene_numbers("here", "simulated"), scene_numbers("there", "recorded")], {"here": HEADLINE_SVG})
     recorded, simulated = text.split('<section id="simulated">')
     assert 'href="there/index.html"' in recorded
     assert 'href="here/index.html"' in simulated
     assert "there/" not in simulated
     assert "here/" not in recorded.replace("there/", "")
-    assert "there/figures" not in text  # scene `there` has no figures
+    assert "there/figures" not in text  # Scene `there` has no figures.
 
 
-def test_scenes_without_held_out_boards_come_last():
-    # Scene `a` comes before `here` in the alphabet, but has no held-out boards.
+def test_scenes_without_held_out_boards_come_last_in_the_index():
+    # In the alphabet, scene `a` comes before scene `here`. But it has no held-out boards, so it comes last.
     alone = {name: value for name, value in scene_numbers("a", "simulated").items() if name != "table2"}
     both = index([alone, scene_numbers("here", "simulated")], {})
     assert both.index("Scene here") < both.index("Scene a")
@@ -429,7 +435,7 @@ def test_index_links_to_tables_and_figures_of_the_paper():
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
-def test_first_sentence_of_every_scene_describes_the_scene(file):
+def test_first_sentence_about_each_scene_describes_it(file):
     about = about_scene(file.read_text(encoding="utf-8"))
     assert about[0].isupper()
     assert not about.startswith("Scene")
@@ -437,7 +443,7 @@ def test_first_sentence_of_every_scene_describes_the_scene(file):
     assert 20 < len(about) < 250
 
 
-def test_index_needs_no_network_or_script():
+def test_index_loads_nothing_and_contains_no_script():
     text = index([scene_numbers("here", "simulated")], {"here": HEADLINE_SVG})
     addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
     assert addresses
@@ -448,7 +454,8 @@ def test_index_needs_no_network_or_script():
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
-# Frames of two widths show the page; the script writes the widths of the pages and of elements that are too wide.
+# Two frames of different widths show the page. The script writes the width of each page, and the elements that are too
+# wide.
 IN_FRAMES = """<!DOCTYPE html><body><script>
 const page = {page}, found = [];
 for (const px of [400, 1400]) {{
@@ -468,7 +475,7 @@ for (const px of [400, 1400]) {{
 
 @pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}")
 @pytest.mark.parametrize("one", ["scene", "all scenes"])
-def test_nothing_is_wider_than_the_page(one, tmp_path):
+def test_nothing_is_wider_than_the_page_on_phones_and_desktops(one, tmp_path):
     wide = pd.DataFrame(
         {f"column {i} of a wide table": ["78.7 [72.1, 84.2]", "a sentence of several words"] for i in range(14)}
     )
@@ -486,4 +493,4 @@ def test_nothing_is_wider_than_the_page(one, tmp_path):
     command = [BROWSER, *flags, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", file.as_uri()]
     shown = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
     found = json.loads(html.unescape(re.search("<title>(.*?)</title>", shown)[1]))
-    assert sorted(found) == [[400, 0, 0], [1400, 0, 0]]  # no page and no table scrolls sideways
+    assert sorted(found) == [[400, 0, 0], [1400, 0, 0]]  # No page and no table can be scrolled sideways.

@@ -1,4 +1,4 @@
-"""Tests of the sentences below figures."""
+"""Tests of the sentences below figures, which state their results."""
 
 import json
 from copy import deepcopy
@@ -26,7 +26,7 @@ def numbers_of(scene: str) -> dict:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_each_committed_figure_has_one_sentence_or_two(scene):
+def test_each_committed_figure_has_one_or_two_sentences(scene):
     written = sentences(numbers_of(scene))
     drawn = [*(ROOT / "reports" / scene).glob("figures/*.svg")]
     assert [file.name for file in drawn if file.name not in written] == []
@@ -37,7 +37,7 @@ def test_each_committed_figure_has_one_sentence_or_two(scene):
 
 
 @pytest.mark.parametrize("figure", MADE_FROM_RESULTS)
-def test_stated_results_are_those_of_the_run(figure):
+def test_sentences_state_the_results_of_the_run(figure):
     numbers = numbers_of("paper")
     changed = deepcopy(numbers)
     changed["table2"]["multi"]["accuracy_pct"]["mean"] = 12.0
@@ -53,9 +53,10 @@ def test_stated_results_are_those_of_the_run(figure):
     assert ("too high" in before and "0.120\u00a0N too low" in after) or figure != "drift_force.svg"
 
 
-def test_shear_is_that_of_whole_lines():
+def test_sentence_about_shear_is_about_held_out_lines():
     numbers = numbers_of("paper")
-    numbers["shear"]["explained_fz"]["mean"] = 0.5  # random readings held out
+    # This is the result with random readings held out, which the sentence must not state.
+    numbers["shear"]["explained_fz"]["mean"] = 0.5
     numbers["shear"]["by_line"]["explained_fz"]["mean"] = 0.25
     assert "25.00\u00a0% of that of normal forces" in sentences(numbers)["shear.svg"]
 
@@ -66,7 +67,7 @@ def test_accuracy_after_drift_has_one_decimal():
     assert "94.5\u00a0% with one before each contact" in sentences(numbers)["drift.svg"]
 
 
-def test_bars_of_pokes_are_not_called_intervals_of_the_difference():
+def test_sentence_about_pokes_does_not_call_bars_intervals_of_the_difference():
     numbers = numbers_of("quick")
     sentence = sentences(numbers)["sweep_pokes.svg"]
     assert sentence.endswith("not of the difference: that is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")
@@ -74,7 +75,7 @@ def test_bars_of_pokes_are_not_called_intervals_of_the_difference():
     assert sentences(numbers)["sweep_pokes.svg"].endswith("not of the difference.")
 
 
-def test_unseen_boards_replace_table_2():
+def test_sentence_is_about_unseen_boards_instead_of_table_2_if_they_were_tested():
     numbers = numbers_of("lab")
     for row in numbers["random_presses"]["rows"]:
         row["mse_f_N2"] = {"mean": 4.0, "n": 2, "values": [4.0, 16.0]}
@@ -83,5 +84,5 @@ def test_unseen_boards_replace_table_2():
     assert "3.0\u00a0N with 40" in written[FORCE]
 
 
-def test_results_without_optional_parts():
+def test_sentences_can_be_written_for_results_without_optional_parts():
     assert set(sentences({})) <= set(sentences(all_experiments()))

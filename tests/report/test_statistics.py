@@ -1,4 +1,4 @@
-"""Tests of the statistics over boards: against SciPy and naive loops, and symmetries."""
+"""Tests of the statistics over boards, against SciPy and loops. Further tests are about symmetries."""
 
 import io
 
@@ -49,8 +49,8 @@ from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
 from tests.report.synthetic import SKINS, adapted_cards, card
 
-FEW = settings(max_examples=25, deadline=None)  # few examples, because building tables takes milliseconds
-DOUBLE = 1e-9  # relative rounding error of sums of numbers of about 10
+FEW = settings(max_examples=25, deadline=None)  # Fewer examples than usual, because building tables takes milliseconds.
+DOUBLE = 1e-9  # The relative rounding error of sums of numbers of about 10.
 VALUES = st.lists(st.floats(-50, 50), min_size=4, max_size=9).filter(lambda values: np.std(values) > 1e-3)
 PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=4, max_size=9).filter(
     lambda pairs: np.std([a - b for a, b in pairs]) > 1e-3
@@ -69,7 +69,10 @@ def skin_scores(**changes: object) -> pd.DataFrame:
 
 
 def score_table(values: dict[str, list[list[float]]]) -> pd.DataFrame:
-    """Return a score table with a row per network; `values` has, for each board, lists of networks per skin."""
+    """Return a score table with one row per network.
+
+    For each board, `values` has one list per skin, with the scores of the networks.
+    """
     rows = [
         {"board": board, "skin": f"{board}_s{i}", "accuracy_pct": value}
         for board, skins in values.items() for i, networks in enumerate(skins) for value in networks
@@ -81,8 +84,8 @@ def board_scores(values: list[float]) -> pd.DataFrame:
     return score_table({f"b{i}": [[value]] for i, value in enumerate(values)})
 
 
-def test_seeds_of_a_fold_are_averaged_first():
-    # squared errors: 0 and 4 for the two seeds of fold b0, 16 for fold b1
+def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
+    # The squared errors of fold b0 are 0 and 4 for its two seeds. That of fold b1 is 16.
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
@@ -92,7 +95,7 @@ def test_seeds_of_a_fold_are_averaged_first():
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
 
 
-def test_sd_over_seeds_is_computed_within_each_board():
+def test_standard_deviation_over_seeds_is_computed_within_each_board():
     rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
     found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
@@ -100,21 +103,24 @@ def test_sd_over_seeds_is_computed_within_each_board():
     assert add_seed_sd(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
-def test_adapted_networks_are_pooled_by_fold_and_seed():
+def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
     rows = whole(tidy(adapted_cards()))
     assert list(zip(rows.fold, rows.seed, strict=True)) == [(fold, i) for i in range(3) for fold in ("b0", "b1")]
     assert set(rows.rows_n) == {20}
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
         for _, row in whole(tidy(adapted_cards()), places).iterrows():
             cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
-            for name in METRICS[:3]:  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
+            for name in METRICS[
+                :3
+            ]:  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
                 total = 0.0
                 for one in cards:
                     total += one["scores"][part][name]
-                assert row[name] == pytest.approx(total / 2, rel=1e-12)  # rounding in float64
+                # The tolerance is rounding in double precision.
+                assert row[name] == pytest.approx(total / 2, rel=1e-12)
 
 
-def test_unequal_skins_pool_to_the_score_of_all_rows():
+def test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows():
     predicted = TRUE + RNG.normal(0, 1, TRUE.shape)
     board = np.repeat("b0", 30)
     parts = [slice(0, 10), slice(10, 30)]
@@ -124,33 +130,35 @@ def test_unequal_skins_pool_to_the_score_of_all_rows():
     assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
 
-def test_tidy_table_is_restored_from_csv():
+def test_score_table_written_as_csv_is_read_again():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
     table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # rows: as labelled, registered, and per skin
+    # The numbers of rows of the three parts of the table. In each part, rows are as labelled, registered, or per skin.
+    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
     again = pd.read_csv(io.StringIO(to_csv(table)), keep_default_na=False, na_values={name: "" for name in METRICS})
     assert again["labels_n"].iloc[-1] == "5"
-    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)  # the CSV has six digits
+    # Tolerance: the CSV has six digits.
+    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)
 
 
 @given(VALUES)
-def test_interval_equals_scipy(values):
+def test_interval_equals_students_interval_of_scipy(values):
     low, high = t.interval(0.95, len(values) - 1, np.mean(values), np.std(values, ddof=1) / np.sqrt(len(values)))
     assert interval(values) == pytest.approx([low, high], abs=DOUBLE)
 
 
-def test_single_value_has_no_spread():
+def test_single_value_has_no_standard_deviation():
     assert statistic([5.0]) == statistic([5.0], boards=True) == {"mean": 5.0, "n": 1}
     assert statistic([80.0, 90.0]) == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
 
 
 @FEW
 @given(PAIRS)
-def test_paired_equals_scipys_paired_t_test(pairs):
+def test_paired_difference_equals_scipys_paired_t_test(pairs):
     stat = paired(*(board_scores([pair[side] for pair in pairs]) for side in (0, 1)))["accuracy_pct"]
     test = ttest_rel(*np.array(pairs).T)
     low, high = test.confidence_interval(0.95)
@@ -159,17 +167,17 @@ def test_paired_equals_scipys_paired_t_test(pairs):
         assert (verdict(stat) == UNDECIDED) == (test.pvalue > 0.05)
 
 
-def test_differences_are_averaged_over_networks_then_skins():
-    # means of the skins of b0: 2 and 10; skins have different numbers of networks
+def test_differences_are_averaged_over_networks_then_skins_then_boards():
+    # The means on the skins of b0 are 2 and 10. The skins have different numbers of networks.
     first = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})
-    second = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # means of the skins of b0: 1 and 2
+    second = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # The means on the skins of b0 are 1 and 2.
     found = paired(first, second)
     assert found["by_board"] == {"b0": {"accuracy_pct": (1 + 8) / 2}, "b1": {"accuracy_pct": -4.0}}
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (0.25, 2)
 
 
 def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str, float]:
-    """Reference: return the mean difference of each board, by loops over skins and seeds."""
+    """Return the reference: the mean difference of each board, by loops over skins and seeds."""
     found: dict[str, list[float]] = {}
     for board, skin in SKINS:
         sides = [
@@ -180,7 +188,7 @@ def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str,
     return {board: sum(differences) / len(differences) for board, differences in found.items()}
 
 
-def test_paired_equals_naive_loops():
+def test_paired_difference_equals_loops_over_skins_and_seeds():
     found = paired(skin_scores(), skin_scores(off_mm=2.0))
     for name in METRICS:
         looped = looped_boards(adapted_cards(), adapted_cards(off_mm=2.0), name)
@@ -191,10 +199,10 @@ def test_paired_equals_naive_loops():
             "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
-    assert found["mse_xy_mm2"]["mean"] < 0  # the first method has the smaller error
+    assert found["mse_xy_mm2"]["mean"] < 0  # The first method has the smaller error.
 
 
-def test_paired_with_itself_is_zero():
+def test_difference_of_a_method_from_itself_is_zero():
     assert paired(skin_scores(), skin_scores())["accuracy_pct"] == {
         "mean": 0.0,
         "sd": 0.0,
@@ -204,7 +212,7 @@ def test_paired_with_itself_is_zero():
     assert paired(skin_scores(), by_skin(tidy(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
 
 
-def test_more_skins_of_equal_scores_change_nothing():
+def test_more_skins_with_equal_scores_do_not_change_the_difference():
     once, thrice = ({f"b{i}": [[float(i)]] * n for i in range(3)} for n in (1, 3))
     nothing = {board: [[0.0]] * 3 for board in thrice}
     assert paired(score_table(thrice), score_table(nothing)) == paired(score_table(once), board_scores([0.0] * 3))
@@ -212,7 +220,7 @@ def test_more_skins_of_equal_scores_change_nothing():
 
 @FEW
 @given(VALUES, st.integers(0, 99))
-def test_order_of_rows_does_not_matter(values, seed):
+def test_order_of_rows_does_not_change_the_difference(values, seed):
     first = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
     over = score_table({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
     assert paired(first.sample(frac=1, random_state=seed), over[::-1]) == paired(first, over)
@@ -232,7 +240,7 @@ def test_swapping_the_methods_negates_the_difference(values):
 
 @FEW
 @given(VALUES, st.floats(-50, 50))
-def test_threshold_is_equivalent_to_a_shift(values, above):
+def test_comparison_with_a_threshold_equals_comparison_of_shifted_values_with_zero(values, above):
     stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
@@ -256,37 +264,39 @@ def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
         ([-9.0, 9.0], UNDECIDED),
     ],
 )
-def test_verdict_within_limits(ends, expected):
+def test_verdict_within_limits_depends_on_the_whole_interval(ends, expected):
     assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == expected
 
 
-def test_single_board_has_no_verdict():
+def test_difference_on_a_single_board_has_no_verdict():
     stat = paired(score_table({"b0": [[3.0], [4.0]]}), score_table({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
     assert stat == {"mean": 2.5, "n": 1}
     assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negate(stat)) == FEW_BOARDS
 
 
 def test_repeats_on_one_skin_do_not_count_as_boards():
-    assert (
-        verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
-    )  # n counts repeats on one skin, so there is no interval over boards
+    # Here, n counts repeats on one skin, so there is no interval over boards.
+    assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
 
 
-def test_combined_verdicts():
+def test_claim_of_several_parts_is_supported_only_if_all_parts_are():
     assert combine_verdicts([SUPPORTED, SUPPORTED]) == SUPPORTED
     assert combine_verdicts([SUPPORTED, UNDECIDED, CONTRADICTED]) == CONTRADICTED
     assert combine_verdicts([SUPPORTED, UNDECIDED]) == UNDECIDED
     assert combine_verdicts([SUPPORTED, FEW_BOARDS]) == FEW_BOARDS
 
 
-def test_paired_needs_equal_skins():
+def test_methods_tested_on_different_skins_cannot_be_compared():
     few, many = score_table({"b0": [[1.0]]}), score_table({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
     with pytest.raises(SchemaError, match="the same held-out skins for both methods; only one method has .*'b1_s0'"):
         paired(few, many)
 
 
 def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
-    """Return a score table of networks trained on one skin (a fold); rows are folds, columns are test boards."""
+    """Return a score table of networks that were trained on a single skin (a fold).
+
+    `values` has the accuracy for each fold and test board.
+    """
     rows = [
         {"fold": fold, "board": board, "skin": f"{board}_s0", "accuracy_pct": value}
         for fold, boards in values.items() for board, value in boards.items()
@@ -294,7 +304,7 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_paired_with_single_counts_training_skins():
+def test_interval_of_the_difference_from_single_skin_networks_includes_the_spread_of_training_skins():
     boards = [f"b{i}" for i in range(4)]
     equal_gains = transfer_scores(
         {fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")}
@@ -305,9 +315,9 @@ def test_paired_with_single_counts_training_skins():
     many = board_scores([80.0, 81.0, 82.0, 83.0])
     certain, uncertain = (paired_with_single(many, one)["accuracy_pct"] for one in (equal_gains, different_gains))
     assert certain["mean"] == pytest.approx(60.0)
-    assert certain["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
-    # The mean gain is 50 on every board, and 60, 50, 40 for the training skins: variance 100 / 3 with two degrees of
-    # freedom.
+    assert certain["ci95"] == pytest.approx([60.0, 60.0])  # All gains are equal, so the interval has no width.
+    # The mean gain is 50 on every board. For the three training skins it is 60, 50 and 40, so the variance of the mean
+    # is 100 / 3 with two degrees of freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
     assert uncertain["ci95"] == pytest.approx([low, high])
     assert uncertain["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
@@ -320,14 +330,14 @@ def test_paired_with_single_counts_training_skins():
 
 @FEW
 @given(VALUES, VALUES)
-def test_crossed_variance_is_at_least_that_of_either_factor(rows, columns):
+def test_variance_over_training_skins_and_boards_is_the_sum_of_both_variances(rows, columns):
     table = pd.DataFrame(np.add.outer(rows, columns))
     se, freedom = two_way_error(table)
     row_variance, column_variance = (np.var(part, ddof=1) / len(part) for part in (rows, columns))
     assert se**2 == pytest.approx(row_variance + column_variance)
     assert min(len(rows), len(columns)) - 1 <= freedom * (1 + 1e-9)
     assert freedom <= (len(rows) + len(columns) - 2) * (1 + 1e-9)
-    assert two_way_error(table[[0, 1]]) is None  # undefined for two boards
+    assert two_way_error(table[[0, 1]]) is None  # The variance is undefined for two boards.
 
 
 @FEW
@@ -338,28 +348,28 @@ def test_intervals_stay_in_the_range_of_the_metric(values):
         ends = interval(values, metric)
         assert low <= ends[0] <= mean * (1 + 1e-12)
         assert mean * (1 - 1e-12) <= ends[1] <= high
-    ends = interval([1 - value for value in values], "r2_f")  # values far below the upper limit of 1
+    ends = interval([1 - value for value in values], "r2_f")  # These values are far below the upper limit of 1.
     assert ends[0] <= 1 - mean + 1e-9
     assert 1 - mean - 1e-9 <= ends[1] <= 1
 
 
 @FEW
 @given(st.lists(st.floats(49.9, 50.1), min_size=4, max_size=9))
-def test_bounded_interval_approaches_students_interval_far_from_the_bounds(values):
+def test_bounded_interval_equals_students_interval_far_from_the_bounds(values):
     plain, bounded = np.array(interval(values)), np.array(interval(values, "accuracy_pct"))
     np.testing.assert_allclose(bounded, plain, atol=0.02 * np.ptp(plain) + 1e-9)
 
 
 @FEW
 @given(st.dictionaries(st.text(min_size=1, max_size=3), st.floats(0, 1), min_size=1, max_size=8))
-def test_holm_equals_the_step_down_definition(p_values):
+def test_corrected_p_values_equal_the_definition_of_holm(p_values):
     adjusted, names = holm(p_values), sorted(p_values, key=lambda name: p_values[name])
     for rank, name in enumerate(names):
         worst = max((len(names) - i) * p_values[names[i]] for i in range(rank + 1))
         assert adjusted[name] == min(1.0, worst)
 
 
-def test_missing_scores_are_ignored():
+def test_scores_that_are_missing_are_ignored():
     known = pd.DataFrame([
         {"board": "b0", "skin": "s0", "mse_f_N2": 1.0, "mse_xy_mm2": 2.0},
         {"board": "b0", "skin": "s1", "mse_xy_mm2": 4.0},
@@ -368,7 +378,7 @@ def test_missing_scores_are_ignored():
     assert set(paired(skin_scores(force=False), skin_scores(force=False))) == {"accuracy_pct", "mse_xy_mm2", "by_board"}
 
 
-def test_over_boards_equals_over_folds():
+def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
     rows = tidy(adapted_cards())
     for name, stat in over_boards(rows).items():
         plain = over_folds(rows)[name]
@@ -378,11 +388,13 @@ def test_over_boards_equals_over_folds():
             np.mean([one["scores"]["all"][name] for one in adapted_cards() if one["fold"] == board])
             for board in ("b0", "b1")
         ]
-        if name != "r2_f":  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
+        if (
+            name != "r2_f"
+        ):  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
             assert stat["values"] == pytest.approx(means)
 
 
-def test_draws_of_one_board_are_pooled():
+def test_draws_of_one_board_are_averaged():
     cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
     assert over_boards(tidy(cards)) == over_boards(tidy(adapted_cards()))
     alone = over_boards(tidy([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
@@ -391,7 +403,7 @@ def test_draws_of_one_board_are_pooled():
     assert alone["sd_seeds"] > 0
 
 
-def test_over_pairs_counts_pairs():
+def test_transfer_scores_count_pairs_of_training_and_test_skins():
     rng = rng_for(0, "transfer")
     tested = [f"b{i}" for i in range(1, 5)]
     boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
@@ -412,7 +424,7 @@ def test_over_pairs_counts_pairs():
     assert stat["ci95"][0] > 0
 
 
-def test_transfer_and_lobo_have_equal_test_rows():
+def test_experiments_transfer_and_lobo_have_equal_test_rows():
     split = Split(transfer_skins_n=3, pool_passes_n=2)
     table = six_by_three_in_passes(5)
     many = {skin: fold for fold in draw_folds(table, ["lobo"], split, 0) for skin in np.unique(table.skin[fold.test])}
@@ -428,7 +440,7 @@ TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collaps
 
 
 @given(TRAININGS)
-def test_tally_of_training_runs_counts_every_attempt(done):
+def test_every_attempt_of_a_training_is_counted(done):
     attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),

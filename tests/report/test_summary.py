@@ -1,4 +1,4 @@
-"""Tests of the summary of a scene for a terminal."""
+"""Tests of the summary of a scene that is printed in a terminal."""
 
 import subprocess
 
@@ -19,14 +19,14 @@ def numbers_of(scene: str) -> dict:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_summary_fits_a_terminal_and_names_the_kind_of_data(scene):
+def test_summary_fits_into_a_terminal_and_names_the_kind_of_data(scene):
     lines = summarise(numbers_of(scene))
     assert len(lines) <= 12
     assert max(map(len, lines), default=0) <= 100
     assert not lines or lines[0].lower().startswith(numbers_of(scene)["provenance"]["source"])
 
 
-def test_simulated_scores_are_beside_those_of_the_paper():
+def test_scores_of_simulated_scenes_are_shown_beside_those_of_the_paper():
     lines = summarise(numbers_of("quick"))
     row = next(line for line in lines if "multi-sensor  " in line)
     for metric, (mean, _) in TABLE_2["multi"].items():
@@ -34,11 +34,11 @@ def test_simulated_scores_are_beside_those_of_the_paper():
     assert f"{numbers_of('quick')['table2']['multi']['accuracy_pct']['mean']:.0f} (" in row
 
 
-def test_recorded_scores_are_shown_without_those_of_the_paper():
+def test_scores_of_recorded_scenes_are_shown_without_those_of_the_paper():
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}, "mse_f_N2": {"mean": 1.0, "n": 2}}
     lines = summarise({"provenance": {"source": "recorded"}, "table2": {"multi": row}})
     assert "(" not in "".join(lines)
-    assert any("50" in line and "–" in line for line in lines)  # an unknown score is a dash
+    assert any("50" in line and "–" in line for line in lines)  # A score that is unknown is shown as a dash.
 
 
 def test_final_model_of_recorded_boards_is_named():
@@ -62,7 +62,7 @@ def test_methods_with_labels_are_shown_with_the_fewest_and_the_most():
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """Create a git checkout with a committed report of scene quick, change to it, and return its folder."""
+    """Create a git checkout with a committed report of scene quick. Change to its folder and return it."""
     provenance = {"git": "abc", "trained": "abc", "versions": {"torch": "1"}, "seconds": 1.0}
     io.write_json(tmp_path / "reports/quick/numbers.json", numbers_of("quick"))
     io.write_json(tmp_path / "reports/quick/provenance.json", provenance)
@@ -86,13 +86,13 @@ def run(scene: str) -> str:
     return " ".join(done.output.split())
 
 
-def test_equal_report_is_called_reproduced_only_if_it_was_computed_again(checkout):
+def test_report_is_called_reproduced_only_if_it_was_computed_again(checkout):
     assert "it was not computed again" in run("quick")
     change(checkout, "provenance.json", seconds=2.0)
     assert "Scene quick is reproduced: all " in run("quick")
 
 
-def test_differences_are_counted_with_probable_reasons(checkout):
+def test_differences_from_the_commit_are_counted_with_probable_reasons(checkout):
     scores = numbers_of("quick")["table2"]
     scores["multi"]["accuracy_pct"]["mean"] *= 0.5
     change(checkout, "numbers.json", table2=scores)
@@ -102,7 +102,7 @@ def test_differences_are_counted_with_probable_reasons(checkout):
     assert "package torch 2 (committed: 1)" in output
 
 
-def test_uncommitted_and_missing_reports_are_named(checkout):
+def test_reports_that_are_not_committed_or_missing_are_named(checkout):
     (checkout / "reports/quick").rename(checkout / "reports/mine")
     assert "Scene mine: its report is not committed" in run("mine")
     assert "Scene other: no results yet. Run: dvc repro report@other" in run("other")

@@ -1,4 +1,4 @@
-"""Tests of the report's tables: our numbers, numbers of the paper, source."""
+"""Tests of the tables in the report, which contain our numbers, those of the paper, and the source of the data."""
 
 import json
 import re
@@ -67,7 +67,7 @@ def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(cards), headline="paper")}
 
 
-def test_pooled_scores_are_over_boards_and_single_ones_over_pairs():
+def test_scores_are_averaged_over_boards_and_scores_of_single_skins_over_pairs():
     table2 = numbers()["table2"]
     spread = pytest.approx(50**0.5)
     assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": spread, "values": [80.0, 90.0]}
@@ -75,7 +75,7 @@ def test_pooled_scores_are_over_boards_and_single_ones_over_pairs():
     assert table2["single"]["accuracy_pct"] == pairs
 
 
-def test_rows_before_touch_follow_the_row_of_their_split():
+def test_rows_about_readings_before_touch_follow_the_row_of_their_split():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
     predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
@@ -95,7 +95,7 @@ def test_missing_experiment_has_no_table():
     assert "null" not in json.dumps(only_single)
 
 
-def test_splits_of_one_skin_start_with_the_papers():
+def test_first_split_in_the_table_is_that_of_the_paper():
     accuracy_by_split = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
     shown = numbers(
         [card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in accuracy_by_split.items()]
@@ -110,24 +110,24 @@ def test_splits_of_one_skin_start_with_the_papers():
     assert "as in the paper" in table["model"][0]
 
 
-def test_variants_have_a_separate_table():
+def test_variants_are_in_a_separate_table():
     assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 
 
-def test_capture_counts_are_summed():
+def test_counts_of_captures_are_summed():
     assert add_up(COUNTS) == {
         "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
         "lost_bytes_n": 3,
     }  # fmt: skip
 
 
-def test_capture_counts_by_protocol():
+def test_counts_of_captures_are_given_for_each_protocol():
     wear = {"accounts": COUNTS, "left_out": {}}
     losses = {
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
-        "variation": wear,  # uses the captures of `drift`, which are counted once
+        "variation": wear,  # This experiment uses the captures of `drift`, which are counted once.
         "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
-        "contacts": {"accounts": [], "left_out": {}},  # uses the main captures
+        "contacts": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
     }
     found = lost_by_protocol(losses)
     assert set(found) == {"wear", "drag"}
@@ -136,35 +136,35 @@ def test_capture_counts_by_protocol():
     shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index(["protocol", "what"])["count"]
     assert shown["main", "bytes_n"] == shown["wear", "bytes_n"] == "249"
     assert shown["drag", "left out of training: low_force_rows_n"] == "7"
-    assert ("drag", "lost_bytes_n") not in shown  # zero counts are not shown
+    assert ("drag", "lost_bytes_n") not in shown  # Counts of zero are not shown.
     assert shown["wear", "lost_bytes_n"] == "3"
 
 
-def test_every_row_has_its_source():
+def test_every_row_names_its_source():
     for source in ("simulated", "recorded"):
         tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # the paper's table, with a column for ours
+        ours = tables.pop("table1")[OURS]  # This is the paper's table, with one column for our skin.
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
         for table in tables.values():
             assert set(table["source"]) == {source}
 
 
-def test_table_2_has_the_papers_numbers():
+def test_table_2_contains_the_papers_numbers():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
-        assert f"{value[0]:g} ± {value[1]:g}" in text  # with as many digits as in the paper
+        assert f"{value[0]:g} ± {value[1]:g}" in text  # Numbers have as many digits as in the paper.
     assert "85.0 ± 7.1" in text
 
 
-def test_one_training_skin_is_not_called_pooled():
+def test_network_of_one_training_skin_is_not_called_pooled():
     alone = numbers([{**one, "train_skins": ["s9"]} for one in CARDS])
     (row,) = [name for name in make_tables(alone)["table2"]["model"] if "board" in name]
     assert row == "Leave-one-board-out, one training skin (paper: single-sensor)"
     assert "84.43" not in to_markdown(make_tables(alone)["table2"])
 
 
-def test_score_tables_explain_the_metric():
+def test_tables_of_scores_explain_their_metric():
     tables = make_tables(numbers())
     assert "within 1 mm" in to_markdown(tables["table2"])
     assert "within 1 mm" not in to_markdown(tables["captures"])
@@ -177,7 +177,7 @@ def test_unknown_number_is_a_dash():
     assert table["MSE_F, N² (ours)"].tolist() == ["–"]
 
 
-def test_format_of_spread_over_seeds():
+def test_standard_deviation_over_seeds_is_shown_with_its_meaning():
     assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.70 ± 0.04 (seeds)"
     assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1.0 ± 0.04 (seeds)"
     boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
@@ -192,28 +192,31 @@ def test_format_of_spread_over_seeds():
     half=st.floats(1e-4, 100),
     asymmetry=st.floats(0.3, 0.7),
 )
-def test_uncertainty_decides_the_digits(mean, half, asymmetry):
+def test_number_of_digits_follows_from_the_uncertainty(mean, half, asymmetry):
     value = {"mean": mean, "n": 6, "ci95": [mean - 2 * half * asymmetry, mean + 2 * half * (1 - asymmetry)]}
     shown, low, high = (float(text) for text in re.sub(r"[\[\],]", "", show(value)).split())
     unit = 10.0 ** -len(show(value).partition(" ")[0].partition(".")[2])
     ends = zip((shown, low, high), (mean, *value["ci95"]), strict=True)
-    assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)  # all have the same number of decimals
-    digits = np.floor(np.log10(half / unit)) + 1  # digits of half of the interval
-    assert digits <= 3  # two digits, or three if an end would otherwise be rounded to 0
-    assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10  # fewer only if the mean already has four digits
+    # All numbers have the same number of decimals.
+    assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)
+    digits = np.floor(np.log10(half / unit)) + 1  # The number of digits of half the interval.
+    assert digits <= 3  # There are two digits, or three if an end of the interval would otherwise be rounded to 0.
+    # There are fewer digits only if the mean already has four.
+    assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10
 
 
 def test_end_of_an_interval_is_not_rounded_to_zero():
     assert show({"mean": 2.09, "n": 6, "ci95": [0.0134, 4.17]}) == "2.09 [0.01, 4.17]"
-    assert show({"mean": 0.0335, "n": 6, "ci95": [-2e-5, 0.067]}) == "0.034 [0.000, 0.067]"  # no digit would help
+    # In this case, no number of digits would help.
+    assert show({"mean": 0.0335, "n": 6, "ci95": [-2e-5, 0.067]}) == "0.034 [0.000, 0.067]"
 
 
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
-def test_rounding_keeps_six_digits(value, kept):
+def test_stored_numbers_are_rounded_to_six_digits(value, kept):
     assert rounded({"a": [value, 3]}) == {"a": [kept, 3]}
 
 
-def test_fill_replaces_only_marked_blocks():
+def test_only_marked_blocks_of_a_page_are_replaced():
     pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
     assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
     assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
@@ -223,11 +226,11 @@ def test_fill_replaces_only_marked_blocks():
         fill(pages | {"other.md": pages["one.md"]}, {"a": "new"})
 
 
-def test_all_metrics_have_a_column():
+def test_each_metric_has_a_column():
     assert {metric for row in TABLE_2.values() for metric in row} == set(PAPER_METRICS)
 
 
-def test_summary_has_our_scores_the_papers_and_the_control():
+def test_summary_contains_our_scores_the_papers_and_those_of_the_control():
     numbers = all_experiments()
     table = summary_table(numbers).set_index(HELD_OUT)
     assert len(table) == len(numbers["table2"]) + 1
@@ -257,7 +260,7 @@ def test_summary_starts_with_the_universal_model():
     assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
 
 
-def test_summary_of_recordings_has_labels():
+def test_summary_of_recordings_has_scores_with_labels():
     numbers = read_json(ROOT / "reports/lab/numbers.json")
     table, usual = summary_table(numbers), numbers["labels"][0]["method"]
     lines = table.set_index(HELD_OUT).to_dict("index")
@@ -268,7 +271,7 @@ def test_summary_of_recordings_has_labels():
             assert shown == show(row["as_labelled"]["accuracy_pct"])
 
 
-def test_no_summary_without_held_out_boards():
+def test_scene_without_held_out_boards_has_no_summary():
     assert (
         summary_table(
             {name: experiment_numbers for name, experiment_numbers in all_experiments().items() if name != "table2"}
@@ -297,7 +300,7 @@ def test_only_reskin_meets_every_requirement():
 
 
 @given(st.dictionaries(st.sampled_from(PROPERTIES), st.text(max_size=9)))
-def test_table_1_has_the_papers_cells(measured):
+def test_table_1_contains_the_cells_of_the_paper(measured):
     table = table1(TABLE_1, measured)
     for (name, cells), (_, row) in zip(TABLE_1.rows.items(), table.iterrows(), strict=False):
         assert [row["property"], *(row[column] for column in TABLE_1.columns)] == [name, *cells]
@@ -306,7 +309,7 @@ def test_table_1_has_the_papers_cells(measured):
     assert table.iloc[-1]["property"] == LOCALISATION
 
 
-def test_simulated_settings_are_not_called_measured():
+def test_settings_of_a_simulation_are_not_called_measured():
     for source, rate, area in (
         ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
         ("recorded", "400 Hz, recorded", "mm, recorded"),
@@ -321,18 +324,18 @@ def test_simulated_settings_are_not_called_measured():
         assert cells["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
 
 
-def test_table_1_lists_every_source():
+def test_list_below_table_1_contains_every_source():
     meaning = table1(TABLE_1, {}).attrs["meaning"]
     assert all(source in meaning for source in TABLE_1.columns.values())
 
 
-def test_unknown_property_is_an_error():
+def test_unknown_property_in_table_1_is_refused():
     with pytest.raises(ParamsError, match="Weight"):
         table1(TABLE_1, {"Weight": "5 g"})
 
 
 @pytest.mark.parametrize(("rows", "fault"), [("{Type: [Magnetic]}", "2 cells, not 1"), ("{Type: [1, 2]}", "string")])
-def test_invalid_table_1_is_an_error(tmp_path, rows, fault):
+def test_invalid_rows_of_table_1_are_refused(tmp_path, rows, fault):
     file = tmp_path / "tables.yaml"
     file.write_text(f"columns: {{a: x, b: y}}\nrows: {rows}\n")
     with pytest.raises(ParamsError, match=fault):
@@ -350,7 +353,7 @@ SIMULATED = described("simulated", noise_xy_uT=3.3, force_max_N=40.0, step_z_uT=
 RECORDED = described("recorded", noise_xy_uT=3.1, force_max_N=4.0)
 
 
-def test_skins_table_has_mean_range_and_count():
+def test_table_of_skins_has_mean_range_and_number():
     table = skins_table({"quick (simulated)": SIMULATED})
     assert table["quick (simulated)"].tolist() == [
         "3.3 [1.65 … 6.6] (3)",
@@ -360,7 +363,7 @@ def test_skins_table_has_mean_range_and_count():
     assert "simulated / nearest recorded" not in table
 
 
-def test_simulated_skins_are_compared_with_recorded():
+def test_table_compares_simulated_skins_with_recorded_ones():
     table = skins_table({"quick (simulated)": SIMULATED, "lab (recorded)": RECORDED})
     ratios = dict(zip(table["quantity"], table["simulated / nearest recorded"], strict=True))
     assert ratios["noise of one reading, x and y, µT"] == "1.1"
@@ -378,26 +381,26 @@ CASE = {
 }  # fmt: skip
 
 
-def test_verification_table_has_error_and_tolerance():
+def test_table_of_verification_has_errors_and_tolerances():
     table = verification_table([CHECK, CHECK | {"unit": "1", "error": 1.5e-15}], "simulated")
     assert table["error"].tolist() == ["3.3e-05 uT", "1.5e-15"]
     assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
     assert table["reason for the tolerance"].tolist() == ["four decimals"] * 2
 
 
-def test_stability_table_has_dashes_without_numbers():
+def test_table_of_stability_has_dashes_for_missing_numbers():
     table = stability_table([CASE, CASE | {"error": None, "limit": None}], "simulated")
     assert table["error"].tolist() == ["1", "–"]
     assert table["allowed"].tolist() == ["1", "–"]
 
 
 @pytest.mark.parametrize(("layout", "row"), [(verification_table, CHECK), (stability_table, CASE)])
-def test_failed_rows_are_highlighted(layout, row):
+def test_rows_of_failed_checks_are_highlighted(layout, row):
     table = layout([row, row | {"holds": False}], "simulated")
     assert table["holds"].tolist() == ["yes", "NO"]
     assert table["source"].tolist() == ["simulated"] * 2
 
 
 @pytest.mark.parametrize("layout", [verification_table, stability_table])
-def test_no_rows_make_an_empty_table(layout):
+def test_table_without_rows_is_empty(layout):
     assert layout([], "simulated").empty

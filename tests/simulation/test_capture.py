@@ -1,4 +1,7 @@
-"""Tests of simulated captures against the protocol and the simulated field; names, seeds, physics terms."""
+"""Tests of simulated captures, against the protocol and the simulated field.
+
+Further tests are about names, seeds and the terms of the physics.
+"""
 
 import numpy as np
 import pytest
@@ -51,7 +54,7 @@ def same(one, other):
 
 
 def frames_by_indentation(capture, frames_n=FRAMES_N):
-    """Return the fields of a capture as [indentation, frame, chip, axis]."""
+    """Return the fields of a capture, as an array [indentation, frame, chip, axis]."""
     return capture.b_uT.astype(np.float64).reshape(-1, frames_n, 5, 3)
 
 
@@ -59,7 +62,7 @@ def labels_in_contact(capture, name):
     return getattr(capture.probe, name)[capture.probe.contact]
 
 
-def test_frames_and_dwells_of_each_indentation(capture):
+def test_each_indentation_has_the_frames_and_dwells_of_the_protocol(capture):
     indentations_n = 2 * 2 * 65
     assert capture.b_uT.shape == (indentations_n * FRAMES_N, 15)
     assert capture.temperature_degC.shape == (indentations_n * FRAMES_N, 5)
@@ -67,7 +70,7 @@ def test_frames_and_dwells_of_each_indentation(capture):
     assert set(capture.overruns.values()) == {0}
 
 
-def test_noiseless_capture_equals_the_field():
+def test_capture_without_noise_equals_the_simulated_field():
     scene = noiseless_scene()
     b_uT = frames_by_indentation(capture_of(scene))
     board = draw_board(scene.boards["rigid"].design, scene.spreads, seed=1, name="b0")
@@ -77,17 +80,18 @@ def test_noiseless_capture_equals_the_field():
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     found_uT = (b_uT[:, READ] - b_uT[:, 1:2])[:130]
-    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # one LSB of z, because two readings are rounded
+    # The tolerance is one step of z, because two readings are rounded.
+    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75
 
 
-def test_robot_spread_changes_fields_but_not_labels():
+def test_position_errors_of_the_robot_change_fields_and_not_labels():
     exact, loose = capture_of(noiseless_scene()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
     moved_uT = (frames_by_indentation(exact) - frames_by_indentation(loose))[:, READ].std()
-    assert moved_uT > 2 * 5.0  # twice the noise of a reading
+    assert moved_uT > 2 * 5.0  # This is twice the noise of a reading.
 
 
-def test_labels_are_commanded_and_forces_measured(capture):
+def test_labels_have_the_commanded_place_and_the_measured_force(capture):
     log = capture.probe
     np.testing.assert_array_equal(
         np.column_stack([labels_in_contact(capture, "x_mm"), labels_in_contact(capture, "y_mm")]),
@@ -97,20 +101,21 @@ def test_labels_are_commanded_and_forces_measured(capture):
     scene = synthesis()
     skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0")
     noise_N = labels_in_contact(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
-    assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four standard errors for 260 draws
+    assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # The tolerance is four standard errors for 260 draws.
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
 def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
-    # Only frames without motion are compared, because while the tip moves, chips that convert earlier read less.
+    # Only frames without motion are compared, because while the tip moves down, chips that convert earlier read a
+    # smaller field change.
     without_motion = [1, 2, 3, 4, 8, 9, 10]
     b_uT = frames_by_indentation(capture)[:, without_motion]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
-    # standard error for 7000 draws: 0.8 %
+    # The standard error for 7000 draws is 0.8 %.
     np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)
 
 
-def test_protocol_may_have_another_frame_rate():
+def test_protocol_may_state_another_frame_rate():
     slow, usual = (
         capture_of(with_protocol("other", GRID | {"passes_n": 1} | rate), "other") for rate in ({"rate_hz": 133.0}, {})
     )
@@ -147,11 +152,12 @@ def test_scattered_pokes_are_at_their_labels():
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
-    # one LSB of z, because two readings are rounded; the rounding of labels to float32 (4 nm) is negligible
+    # The tolerance is one step of z, because two readings are rounded. The rounding of labels to single precision (4
+    # nm) is negligible.
     assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
 
 
-def test_frames_of_forty_chips_survive_the_wire():
+def test_frames_of_forty_chips_are_encoded_and_decoded_unchanged():
     one = capture_of(sleeve(), "sleeve", board="v0", skin="v0_s0")
     header, files = to_files(one, sleeve())
     assert (header.chips_n, len(files["stream.bin"])) == (40, 6 * FRAMES_N * (16 * 40 + 2))
@@ -170,7 +176,7 @@ def test_hand_pokes_have_fields_but_no_labels():
     change_uT = np.linalg.norm(
         (frames_by_indentation(one)[:, READ] - frames_by_indentation(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1
     )
-    # noise alone, a difference of two readings in 15 channels averaged over 3, would give 13 uT
+    # Noise alone would give 13 uT: it is a difference of two readings in 15 channels, averaged over 3.
     assert change_uT.min() > 30
 
 
@@ -179,10 +185,11 @@ def aged_capture(**changes):
     return with_protocol("grid", grid, terms=changes)
 
 
-def test_aging_softens_and_drifts(capture):
+def test_ageing_softens_the_skin_and_moves_its_no_load_field(capture):
     old = capture_of(aged_capture(ageing=AGEING))
     ratio = labels_in_contact(old, "Fz_N")[-65:] / labels_in_contact(capture, "Fz_N")[-65:]
-    # At contact 227, the middle of the last 65: 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946.
+    # Contact 227 is in the middle of the last 65 contacts. There, the remaining force is 1 - 0.1 (1 - exp(-227/300)) -
+    # 0.01 log10(1.227) = 0.946.
     assert np.median(ratio) == pytest.approx(0.946, abs=0.005)
     drift_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         -1
@@ -191,11 +198,12 @@ def test_aging_softens_and_drifts(capture):
     early_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         0
     ]
-    # noise alone: three standard deviations of a difference of two means of two readings with 5 uT
+    # The limit is three standard deviations of noise alone: of a difference of two means of two readings with 5 uT
+    # each.
     assert np.abs(early_uT).max() < 12
 
 
-def test_relaxation_lowers_the_force_only(capture):
+def test_relaxation_lowers_only_the_force(capture):
     slack = capture_of(aged_capture(relaxation=RELAXATION))
     ratio = np.median(labels_in_contact(slack, "Fz_N")[65:130] / labels_in_contact(capture, "Fz_N")[65:130])
     # After 1 s, the two fastest terms (0.05 each) have relaxed, and at most a tenth of the third.
@@ -203,28 +211,29 @@ def test_relaxation_lowers_the_force_only(capture):
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
 
-def test_temperature_is_read_and_weakens_the_field(capture):
+def test_warming_is_read_by_chips_and_weakens_the_field(capture):
     warm = capture_of(aged_capture(temperature=TEMPERATURE))
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
-    offset = 5 * 3 * 200 * 0.8  # sum over 15 channels of the chips' constant offset of 200 uT (mean of |normal| = 0.8)
+    # The constant offset of the chips, of 200 uT, summed over 15 channels. The mean of |normal| is 0.8.
+    offset = 5 * 3 * 200 * 0.8
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 
 
-def test_capture_is_reproducible(capture):
+def test_equal_settings_give_equal_captures(capture):
     assert same(capture, capture_of())
     assert not same(capture, capture_of(seed=2))
 
 
-def test_more_boards_skins_and_protocols_change_nothing(capture):
+def test_adding_boards_skins_or_protocols_does_not_change_other_captures(capture):
     boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
     more = with_protocol("hand", HAND, boards=boards)
     assert set(list_captures(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
     assert same(capture, capture_of(more))
 
 
-def test_order_of_captures_does_not_matter():
+def test_captures_do_not_depend_on_the_order_in_which_they_are_simulated():
     assert list_captures(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
         ("b0", "b0_s0"),
         ("b0", "b0_s1"),
@@ -234,9 +243,8 @@ def test_order_of_captures_does_not_matter():
 
 def test_skins_of_a_board_have_the_same_chips_and_different_fields(capture):
     other = capture_of(skin="b0_s1")
-    assert not np.allclose(
-        frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20
-    )  # six standard deviations of the noise
+    # The limit is six standard deviations of the noise.
+    assert not np.allclose(frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20)
 
 
 def test_skin_without_magnetisation_has_no_signal():

@@ -1,4 +1,4 @@
-"""Tests of frames read from fields: blocks, repeated conversions, temperature, sensitivity of chips."""
+"""Tests of frames that chips read from simulated fields: blocks, repeated conversions, temperature, sensitivity."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0
 
 
 @pytest.mark.parametrize("rate_hz", [400.0, 1000.0])
-def test_frames_do_not_depend_on_blocks(rate_hz, monkeypatch):
+def test_frames_do_not_depend_on_the_size_of_blocks(rate_hz, monkeypatch):
     whole = read(rate_hz=rate_hz, temperature=WARMING)
     monkeypatch.setattr(rig, "BLOCK_INDENTATIONS_N", 7)
     parts = read(rate_hz=rate_hz, temperature=WARMING)
@@ -43,31 +43,33 @@ def test_frames_do_not_depend_on_blocks(rate_hz, monkeypatch):
     np.testing.assert_array_equal(whole.temperature_degC, parts.temperature_degC)
 
 
-def test_frames_repeat_conversions_with_their_noise():
+def test_repeated_conversions_repeat_their_noise():
     slow, fast = (read(rate_hz=rate_hz).b_uT.reshape(-1, CHIPS_N, 3) for rate_hz in (400.0, 1000.0))
     repeats = [(one[1:] == one[:-1]).all(axis=2).mean() for one in (slow, fast)]
     assert repeats[0] == 0
-    assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # a conversion takes 1.84 ms, a frame 1 ms
+    assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # A conversion takes 1.84 ms, and a frame 1 ms.
 
 
-def test_chip_reads_the_field_of_its_conversion_time():
+def test_chip_reads_the_field_at_the_time_of_its_conversion():
     one = response()
     ramp = one.change_T[:, 0].copy()
     frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))
     found_uT = read(QUIET).b_uT.reshape(N, frames_n, CHIPS_N, 3)
-    share = (found_uT[:, 5] / 1e6 - one.rest_T) / ramp  # first frame of the descent, at a third of the field change
-    large = np.abs(ramp) > 1e-4  # one LSB of 0.15 uT is less than 0.002 of this change
+    # The first frame while the tip moves down, in which the field change is a third of the whole.
+    share = (found_uT[:, 5] / 1e6 - one.rest_T) / ramp
+    large = np.abs(ramp) > 1e-4  # One step of 0.15 uT is less than 0.002 of this change.
     assert (share[large] < 1 / 3 + 0.002).all()
     assert (share[large] > -0.01).all()
-    # the age of conversions differs between chips and between indentations
+    # The age of conversions differs between chips and between indentations.
     assert share[large].max() - share[large].min() > 0.2
 
 
-def test_temperature_of_skin_and_chip():
+def test_warming_changes_the_field_of_the_skin_and_the_sensitivity_of_the_chip():
     warm, room = (read(QUIET, temperature=drift, sensitivity_per_K=(0.004, -0.002)).b_uT for drift in (WARMING, None))
-    last = slice(-8, -3)  # frames in which the field is constant
+    last = slice(-8, -3)  # In these frames, the field is constant.
     late_s = len(room) / 400.0
     warmer_K = 10 * (1 - np.exp(-late_s)) + 2 * np.sin(2 * np.pi * late_s / 3)
     ratio = (warm[last] / room[last]).mean(axis=0).reshape(CHIPS_N, 3).mean(axis=1)
     truth = (1 + REMANENCE_PER_K * warmer_K) * (1 + warmer_K * np.array([0.004, -0.002]))
-    np.testing.assert_allclose(ratio, truth, atol=1.5e-3)  # rounding of 0.15 in 1000 uT, and warming during 10 frames
+    # The tolerance is the rounding of 0.15 in 1000 uT, and the warming during 10 frames.
+    np.testing.assert_allclose(ratio, truth, atol=1.5e-3)

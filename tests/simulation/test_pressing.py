@@ -1,4 +1,4 @@
-"""Tests of protocols with weights and dynamic presses: forces, half sines, footfalls, random presses."""
+"""Tests of protocols with weights and dynamic presses: forces, half sines in time, footfalls, random presses."""
 
 import numpy as np
 import pytest
@@ -46,31 +46,31 @@ def draw_presses(presses_n, name="presses"):
 @given(st.floats(1e-3, 2.0))
 def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
-    # tolerance: 1e-12 m times at most 20 N/mm is 2e-8 N
+    # Tolerance: 1e-12 m times at most 20 N/mm is 2e-8 N.
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
-def test_more_weight_sinks_deeper():
+def test_heavier_weight_sinks_deeper():
     depth_m = depths_under_load(SKIN, load_steps_N(1.0, 0.02)[None])[0]
     assert depth_m[0] == -SKIN.depth_zero_m
     assert (np.diff(depth_m) > 0).all()
 
 
-def test_too_heavy_weight_is_refused():
+def test_weight_that_is_too_heavy_for_the_skin_is_refused():
     with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, the force at the greatest depth"):
         depths_under_load(SKIN, np.array([[1e4]]))
 
 
-def test_glass_is_filled_in_even_steps():
+def test_glass_is_filled_in_equal_steps():
     np.testing.assert_allclose(load_steps_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
 
 
-def test_filling_has_weights_and_no_depth():
+def test_protocol_of_a_filling_states_weights_instead_of_depths():
     capture = capture_of("glass", GLASS)
     log = capture.probe
     assert np.isnan(log.depth_mm[log.contact]).all()
     read_N = log.Fz_N[log.contact].reshape(3, 5)
-    # six standard deviations
+    # The tolerance is six standard deviations.
     np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)
     assert set(log.x_mm[log.contact]) == {8.0}
 
@@ -81,30 +81,31 @@ def test_field_change_grows_with_the_weight():
     lifted_n, dwell_n = 1 + 4 + 2, 1 + 3
     stops_uT = b_uT[:, lifted_n : lifted_n + 5 * dwell_n].reshape(3, 5, dwell_n, 15)[:, :, -1]
     change_uT = np.linalg.norm(stops_uT - b_uT[:, 1:2], axis=2)
-    assert (change_uT[:, 0] <= 0.7 * 4).all()  # tolerance: each of 15 channels is rounded by half an LSB
+    assert (change_uT[:, 0] <= 0.7 * 4).all()  # Tolerance: each of 15 channels is rounded by half a step.
     assert (np.diff(change_uT, axis=1) > 10).all()
 
 
-def test_half_sine_is_symmetric():
+def test_half_sine_press_is_symmetric_in_time():
     depth_mm = half_sine(101, 0.8)
     assert depth_mm.argmax() == 50
     assert depth_mm[50] == pytest.approx(0.8)
     np.testing.assert_allclose(depth_mm, depth_mm[::-1], atol=1e-12)
-    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)  # error of the midpoint rule: (pi / 2 n)^2 / 6
+    # The tolerance is the error of the midpoint rule, (pi / 2 n)^2 / 6.
+    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)
 
 
-def test_durations_are_log_uniform():
+def test_logarithms_of_durations_are_uniform():
     stops = draw_presses(2000)
     frames_n = (stops.depth_mm > 0).sum(axis=1)
     position = np.log(frames_n / 20) / np.log(20)
-    # four standard errors of a median, 0.5 / sqrt(n) each
+    # The tolerance is four standard errors of a median, 0.5 / sqrt(n) each.
     np.testing.assert_allclose(np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05)
     after = np.arange(stops.depth_mm.shape[1]) >= frames_n[:, None]
     assert (stops.depth_mm[after] == LIFTED_MM).all()
     assert stops.depth_mm.max() <= 1.2
 
 
-def test_walk_has_footfalls_and_swings():
+def test_walk_consists_of_footfalls_and_swings():
     plan = Walk(**WALK | {"steps_n": 40, "terms": ()}).plan(rng_for(0, "walk"), SKIN_MM)
     down = plan.depth_mm[0] > 0
     edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))
@@ -125,28 +126,29 @@ def test_frames_in_contact_form_dwells():
     np.testing.assert_allclose(depths_mm, plan.depth_mm[plan.depth_mm > 0], rtol=1e-6)
 
 
-def test_chips_read_a_rising_press_late():
+def test_readings_of_a_rising_press_lag_behind_the_field():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     fast, slow = (
         capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
-        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # both presses have 20 frames, 2.5 ms and 250 ms apart
+        # Both presses have 20 frames. They are 2.5 ms apart in the fast press, and 250 ms in the slow one.
+        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
-    assert (late_uT > 1.0).all()  # 1 uT is more than three LSB of z
+    assert (late_uT > 1.0).all()  # A difference of 1 uT is more than three steps of z.
     # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart. Each reading must therefore be between two
     # readings of the slow press.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
-    assert (moving_uT[1:] >= low_uT - 1).all()  # tolerance in uT: more than one LSB of x, y and z
+    assert (moving_uT[1:] >= low_uT - 1).all()  # The tolerance in uT is more than one step of x, y and z.
     assert (moving_uT[1:] <= high_uT + 1).all()
 
 
-def test_truth_of_a_walk_uses_the_clock_of_the_log():
+def test_true_forces_of_a_walk_have_times_on_the_clock_of_the_log():
     capture = capture_of("log", WALK)
     assert capture.card_rate_hz == 250.0
     log = capture.probe
     assert log.t_start_s[0] == pytest.approx(0.5 / 250)
-    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # the first contact starts after 0.4 s at rest
+    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # The first contact starts after 0.4 s at rest.
     touched = log.depth_mm[log.contact].astype(float)
     skin = draw_skin(
         synthesis().skin,
@@ -155,11 +157,13 @@ def test_truth_of_a_walk_uses_the_clock_of_the_log():
         name="b0_s0",
         rule=synthesis().main_boards.quadrature.in_si(),
     )
-    np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)  # depths are float32
-    assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # two gaps, so three footfalls
+    # The relative tolerance is for depths in single precision.
+    np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)
+    # Two gaps between contacts mean three footfalls.
+    assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2
 
 
-def test_force_controlled_presses_refuse_relaxation_and_wear():
+def test_presses_with_given_forces_cannot_be_simulated_with_relaxation_or_wear():
     with pytest.raises(ParamsError, match="terms"):
         with_protocol("press", PRESS | {"terms": ["relaxation"]})
     with pytest.raises(ParamsError, match="duration_s must list the smaller value first"):
@@ -168,14 +172,14 @@ def test_force_controlled_presses_refuse_relaxation_and_wear():
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
 
-def test_walk_is_written_as_sd_card_log(tmp_path):
+def test_walk_is_written_as_the_log_of_an_sd_card(tmp_path):
     capture = capture_of("log", WALK)
     header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
     assert sorted(header.files) == ["log.csv", "probe.csv"]
     assert (header.layout, header.wire, header.source) == ("sd-card", None, "simulated")
     t_s, b_uT, temperature_degC, account = read_log(tmp_path / capture.name / "log.csv")
     np.testing.assert_allclose(t_s, (1 + np.arange(len(capture.b_uT))) / 250)
-    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # the log has two decimals
+    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # Tolerance: the log has two decimals.
     np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
@@ -191,5 +195,5 @@ def test_presses_and_fillings_are_valid_captures(tmp_path):
         logged_N = capture.probe.Fz_N[capture.probe.contact]
         readings_n = 1 if name == "press" else 3
         np.testing.assert_array_equal(np.concatenate([one.Fz_N for one in blocks]), np.repeat(logged_N, readings_n))
-        assert not [key for key in opened.account if key.startswith("fault_")]  # a healthy board raises no alarm
+        assert not [key for key in opened.account if key.startswith("fault_")]  # A healthy board raises no alarm.
         assert opened.account["indentations_n"] == protocol.get("presses_n", protocol.get("passes_n"))

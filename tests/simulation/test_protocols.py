@@ -31,9 +31,9 @@ def test_grid_pass_has_390_indentations():
     np.testing.assert_array_equal(plan.pass_i, np.repeat([0, 1], 390))
 
 
-def test_drag_lines_are_2_mm_apart():
+def test_lines_of_a_drag_are_2_mm_apart():
     plan = plan_of(DRAG)
-    assert plan.x_mm.shape == (2 * 18, 17)  # lines along 9 rows and 9 columns, at two depths
+    assert plan.x_mm.shape == (2 * 18, 17)  # Lines along 9 rows and 9 columns, at two depths.
     rows, columns = slice(0, 9), slice(9, 18)
     np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
     np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])
@@ -41,7 +41,7 @@ def test_drag_lines_are_2_mm_apart():
     np.testing.assert_allclose(np.abs(np.diff(plan.y_mm[columns], axis=1)), 1.0)
 
 
-def test_drag_lines_alternate_in_direction():
+def test_neighbouring_drag_lines_have_opposite_directions():
     steps_mm = np.diff(plan_of(DRAG).x_mm, axis=1)[:9, 0]
     np.testing.assert_array_equal(np.sign(steps_mm), np.where(np.arange(9) % 2 == 0, 1, -1))
 
@@ -60,18 +60,19 @@ def test_every_second_pass_drags_backwards():
 
 def test_hand_protocol_has_325_pokes_without_labels():
     plan = plan_of(HAND)
-    assert len(plan) == 325  # paper section 5.2
+    assert len(plan) == 325  # This number is in section 5.2 of the paper.
     assert not plan.labelled
     x_mm, y_mm = plan.x_mm.reshape(13, 25), plan.y_mm.reshape(13, 25)
     assert (np.diff(x_mm.mean(axis=0)) > 0).all()
     assert (np.diff(y_mm.mean(axis=1)) > 0).all()
-    # 325 draws, clipped at the edges
+    # Tolerance for 325 draws, which are clipped at the edges.
     assert (y_mm - np.linspace(0, 16, 13)[:, None]).std() == pytest.approx(0.3, rel=0.15)
     assert plan.depth_mm.min() > 0.4
     assert plan.depth_mm.max() < 1.2
-    # 650 draws, limited to two standard deviations
+    # Tolerance for 650 draws, which are limited to two standard deviations.
     assert plan.tilt.std() == pytest.approx(np.tan(np.radians(5.0)), rel=0.15)
-    assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)  # tolerance: four standard errors 0.23 / sqrt(325)
+    # The tolerance is four standard errors, 0.23 / sqrt(325) each.
+    assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)
 
 
 def test_only_hand_pokes_are_random():
@@ -111,7 +112,7 @@ def test_scattered_places_keep_a_margin_to_the_edges(skin_mm, margin_mm):
     assert not plan.tilt.any()
 
 
-def test_different_names_have_different_draws():
+def test_protocols_of_different_names_have_different_draws():
     assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
     assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
 

@@ -1,4 +1,4 @@
-"""Tests of the simulated rig: timeline, clocks, chunks, dwells; noise and range of the force sensor."""
+"""Tests of the simulated rig: timeline, clocks, chunks of bytes, dwells; noise and range of its force sensor."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def plan(protocol=None):
 DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
 
 
-def test_timeline_of_an_indentation():
+def test_timeline_of_an_indentation_has_its_phases_in_order():
     frames = timeline(rig(), 1)
     np.testing.assert_allclose(frames.share, [0] * 5 + [1 / 3, 2 / 3] + [1] * 4 + [2 / 3, 1 / 3])
     assert frames.noload_i == 1
@@ -43,7 +43,7 @@ def test_timeline_of_an_indentation():
     assert not frames.stop_i.any()
 
 
-def test_timeline_of_a_dragged_line():
+def test_timeline_of_a_dragged_line_has_a_dwell_at_each_stop():
     frames = timeline(rig(), 3)
     assert frames.stop_i.tolist() == [0] * 7 + [0] * 4 + [1] * 4 + [2] * 4 + [2] * 2
     assert frames.contact_i.tolist() == [8, 12, 16]
@@ -95,7 +95,7 @@ def test_robot_misses_places_by_the_given_spread():
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
     loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
     missed_mm = actual_positions(grid, loose, rng_for(0, "robot")) - exact_mm
-    # tolerance 25 %: four standard errors, 6 % each for 130 draws
+    # The tolerance of 25 % is four standard errors, which are 6 % each for 130 draws.
     np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)
     planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
     along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm
@@ -110,26 +110,27 @@ def read_clipped(force_N, noise_N=0.0):
 
 
 @given(inside_N)
-def test_noiseless_force_within_range(force_N):
+def test_force_sensor_without_noise_reads_the_true_force_within_its_range(force_N):
     read_N, clipped_n = read_clipped(force_N)
     np.testing.assert_array_equal(read_N[0], np.float32(force_N))
     assert clipped_n == 0
 
 
-def test_force_beyond_range_is_clipped_and_counted():
+def test_forces_beyond_the_range_of_the_sensor_are_clipped_and_counted():
     read_N, clipped_n = read_clipped([[25.1, 0, 0], [0, -1e4, 1e4], [0, 0, -36], [0, 0, 34.9]])
     np.testing.assert_array_equal(read_N, np.float32([[25, 0, 0], [0, -25, 35], [0, 0, -35], [0, 0, 34.9]]))
     assert clipped_n == 4
 
 
-def test_noise_has_the_given_deviation():
+def test_noise_of_the_force_sensor_has_the_given_standard_deviation():
     read_N, clipped_n = read_clipped(np.zeros((40_000, 3)), noise_N=1 / 160)
-    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four standard errors 1 / sqrt(2 n)
+    # The tolerance is four standard errors, 1 / sqrt(2 n) each.
+    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)
     assert clipped_n == 0
     read_N, clipped_n = read_clipped(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
     assert (read_N <= np.float32(FORCE_RANGE_N)).all()
-    assert 1400 < clipped_n < 1600  # half of 3000, within 3.7 standard deviations
+    assert 1400 < clipped_n < 1600  # The expected number is half of 3000. The limits are 3.7 standard deviations.
 
 
-def test_readings_follow_the_generator():
+def test_equal_generators_give_equal_forces():
     assert read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes() == read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes()

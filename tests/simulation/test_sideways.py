@@ -24,7 +24,7 @@ STRAIGHT = np.zeros((1, 2))
 
 
 def line(*x_mm, y_mm=1.0):
-    """Return the tip positions (x, y, depth) of one dragged line."""
+    """Return the positions of the tip (x, y, depth) along one dragged line."""
     return np.array([[[1e-3 * x, 1e-3 * y_mm, DEPTH_M] for x in x_mm]])
 
 
@@ -36,16 +36,16 @@ def press_T(tip_m):
     return changes_of_field(BOARD, SKIN, tip_m.reshape(-1, 3))[1].reshape(*tip_m.shape[:2], 5, 3)
 
 
-def test_short_drag_sticks_and_long_drag_slides():
+def test_tip_sticks_in_a_short_drag_and_slides_in_a_long_one():
     found = drag(line(0.0, 0.1, 4.0)).force_N[0]
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
     stiffness = SKIN.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     limit_N = 0.8 * forces(SKIN, np.array([DEPTH_M]))[0]
     np.testing.assert_allclose(found, [[0, 0], [stiffness * 0.1e-3, 0], [limit_N, 0]], rtol=1e-6)
-    assert found[1, 0] < limit_N  # the first stop sticks
+    assert found[1, 0] < limit_N  # The tip still sticks at the first stop.
 
 
-def test_without_friction_the_drag_is_a_press():
+def test_drag_without_friction_equals_a_press():
     tip_m = line(-2.0, 0.0, 3.0)
     found = drag(tip_m, coefficient=0.0)
     assert not found.force_N.any()
@@ -62,7 +62,7 @@ def test_direction_of_the_drag_changes_the_field():
     assert np.linalg.norm(forward.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
 
 
-def test_mirror_symmetry_of_a_drag():
+def test_mirrored_drag_has_the_mirrored_field():
     # The reflection x -> -x swaps chips 1 and 3, and leaves the checkerboard unchanged as a field of axial vectors. By
     # and Bz therefore change sign.
     one = drag(line(-1.0, 2.0))
@@ -77,27 +77,27 @@ def test_force_of_a_leaning_tip_is_limited_by_friction():
         np.testing.assert_allclose(found, [0.0, share * normal_N], rtol=1e-12)
 
 
-def test_tip_above_the_skin_has_no_effect():
+def test_tip_above_the_skin_causes_no_force_and_no_field_change():
     tip_m = line(0.0, 2.0) * (1, 1, -1)
     found = drag(tip_m)
     assert not found.force_N.any()
     assert not found.change_T.any()
 
 
-def test_lines_of_a_drag_are_independent():
+def test_lines_of_a_drag_do_not_influence_each_other():
     lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
     both, second = drag(lines_m, tilt=np.zeros((2, 2))), drag(lines_m[1:])
     np.testing.assert_allclose(both.force_N[1], second.force_N[0])
 
 
 @pytest.mark.parametrize("coefficient", [0.3, 0.8])
-def test_force_is_limited_by_coulomb(coefficient):
+def test_tangential_force_is_limited_by_friction(coefficient):
     tip_m = line(-5.0, -4.9, -4.5, 0.0, 0.05, -3.0)
     found = np.hypot(*drag(tip_m, coefficient).force_N[0].T)
     assert (found <= coefficient * forces(SKIN, tip_m[0, :, 2]) * (1 + 1e-12)).all()
 
 
-def test_drag_equals_press_and_many_small_shears():
+def test_drag_equals_a_press_and_many_small_shears():
     # Reference: press the material at its rest position behind the tip, then shear it in 50 steps of the force.
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
     found = drag(tip_m, coefficient=0.4)
@@ -112,7 +112,8 @@ def test_drag_equals_press_and_many_small_shears():
         )
         nodes_m, moments = nodes_m + step.displacement_m, Rotation.from_rotvec(step.half_curl).apply(moments)
     truth_T = change_of_field(before, (nodes_m, moments), BOARD.chips_m)
-    # 20 %: the code takes one or two midpoint steps and moves the traction; a wrong sign would give 50 % or more.
+    # The tolerance is 20 %, because the code takes one or two midpoint steps and moves the traction. A wrong sign would
+    # give 50 % or more.
     assert np.linalg.norm(found.change_T[0, 1] - truth_T) < 0.2 * np.linalg.norm(truth_T)
 
 
@@ -129,9 +130,10 @@ HELD = EVEN.skin.model_copy(
 )
 
 
-def test_held_skin_is_in_series_with_its_springs():
+def test_springs_of_a_held_skin_act_in_series_with_its_shear():
     one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
-    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle, so the skin does not rotate
+    # The line passes through the middle, so the skin does not rotate.
+    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3
     force_N = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=0.8)).force_N[0, 1]
     sizes = {"thickness_m": one.thickness_m, "tip_radius_m": one.tip_radius_m, "base": one.base}
     thinned = (1 - DEPTH_M / one.thickness_m) ** -1.5
@@ -142,11 +144,11 @@ def test_held_skin_is_in_series_with_its_springs():
     as_one_T = change_of_field((one.nodes_m, one.moments_A_m2), (slid, one.moments_A_m2), BOARD.chips_m)
     pressed_T = changes_of_field(BOARD, one, tip_m[0, 1:])[1][0]
     dragged_T = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=0.8)).change_T[0, 1]
-    far = [2, 4]  # chips beside the line
+    far = [2, 4]  # These chips are beside the line.
     np.testing.assert_allclose((dragged_T - pressed_T)[far], as_one_T[far], atol=0.5 * np.abs(as_one_T[far]).max())
 
 
-def test_stiff_springs_equal_a_fixed_base():
+def test_skin_held_by_stiff_springs_equals_a_skin_on_a_fixed_base():
     tip_m, hold = line(0.0, 0.02), HELD.hold.model_copy(update={"springs_N_mm": 1e6})
     stiff = draw_skin(HELD.model_copy(update={"hold": hold}), EVEN.spreads, seed=0, name="b0_s0")
     free = replace(stiff, hold=None, modulus_Pa=stiff.modulus_Pa * (1 - DEPTH_M / stiff.thickness_m) ** -1.5)

@@ -26,12 +26,13 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # number of stops of a path; twice as many for the finer path
-# Limit on a ratio: largest change of dB between two stops on the finer path, divided by that on the coarse path. The
-# ratio is 0.5 if dB is smooth, and 1 if dB jumps.
+STOPS_N = 48  # The number of stops of a path. The finer path has twice as many.
+# Limit on a ratio: the largest change of dB between two stops on the finer path, divided by the largest change on the
+# coarse path. The ratio is 0.5 if dB is smooth, and 1 if dB jumps.
 HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # so short that the tip sticks
+# These drags are so short that the tip sticks.
+short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))
 FEW = settings(max_examples=8, deadline=None)
 
 
@@ -41,7 +42,7 @@ def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
 
 
 def depths_of_forces_m(skin: Skin, force_N) -> np.ndarray:
-    """Return the commanded depths in m for these forces; for zero force, the tip is 20 um above the skin."""
+    """Return the commanded depths in m for these forces. For zero force, the tip is 20 um above the skin."""
     skin_settings = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     depth_m = slide.depth_at(np.asarray(force_N, float), **skin_settings) - skin.depth_zero_m
     return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
@@ -53,14 +54,14 @@ def sizes_uT(change_T) -> np.ndarray:
 
 @FEW
 @given(places, st.integers(0, 10**6))
-def test_millinewton_is_below_the_noise(place_m, name_i):
+def test_field_change_by_a_force_of_one_millinewton_is_below_the_noise(place_m, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
     force_N = np.array([0.0, 1e-6, 1e-5, 1e-4, LIGHT_N])
     poke_m = np.column_stack([np.tile(place_m, (5, 1)), depths_of_forces_m(skin, force_N)])
     np.testing.assert_allclose(forces(skin, poke_m[:, 2]), force_N, rtol=1e-2)
     found_uT = sizes_uT(changes_of_field(board, skin, poke_m)[1])
     assert found_uT[0] == 0
-    # For small forces, the slide is proportional to the force F; the deformation of the layer falls as F^(4/3).
+    # For small forces F, the slide of the skin is proportional to F, and the deformation of the layer to F^(4/3).
     assert (found_uT[1:] <= 1.3 * found_uT[-1] * force_N[1:] / LIGHT_N).all()
     assert found_uT[-1] <= LIGHT_MAX_uT
 
@@ -80,7 +81,7 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
 
 
 @FEW
-@example((0.0, 0.0), 0.0, 1.0, 2.2e-311, 0.0, 0)  # subnormal coefficient of friction
+@example((0.0, 0.0), 0.0, 1.0, 2.2e-311, 0.0, 0)  # Here, the coefficient of friction is a subnormal number.
 @given(
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
@@ -88,10 +89,10 @@ def test_friction_limits_press_and_drag_together(start_m, angle_rad, force_N, fr
     board, skin = draw_board_and_skin(f"b{name_i}")
     assert skin.hold is not None
     drag_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
-    end_m = np.clip(np.subtract(start_m, drag_m), -8e-3, 8e-3)  # on the skin
+    end_m = np.clip(np.subtract(start_m, drag_m), -8e-3, 8e-3)  # The end of the drag must be on the skin.
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
     found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), friction=Friction(coefficient=friction))
-    # tolerance: rounding, also of subnormal numbers if the coefficient of friction is tiny
+    # Tolerance: rounding, also of subnormal numbers if the coefficient of friction is tiny.
     limit_N = friction * forces(skin, tip_m[0, :, 2]) * (1 + 1e-9) + 1e-15
     assert (np.hypot(*found.force_N[0].T) <= limit_N).all()
     assert (skin.hold.springs_N_per_m * np.hypot(*found.slide_m[0].T) <= limit_N).all()
@@ -109,9 +110,10 @@ def test_tip_without_friction_does_not_move_the_skin():
 
 
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
-def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
+def test_field_changes_smoothly_while_the_tip_sinks_in_and_sticks(depth_m):
     board, skin = draw_board_and_skin("b0")
-    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # crosses a tabulated depth of the shear tables
+    # The depths include one at which the shear tables change.
+    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
     found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.8))
@@ -130,7 +132,7 @@ def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forc
     assert fine <= HALVED * coarse
 
 
-def test_field_jump_of_unlimited_slide_is_detected(monkeypatch):
+def test_jump_of_the_field_by_a_slide_without_limit_is_detected(monkeypatch):
     board, skin = draw_board_and_skin("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
@@ -141,7 +143,7 @@ def test_field_jump_of_unlimited_slide_is_detected(monkeypatch):
 
 
 @pytest.mark.parametrize("terms", [(), ("memory",)])
-def test_lift_off_leaves_only_the_memory(terms):
+def test_after_lift_off_only_the_field_memory_remains(terms):
     board, skin = draw_board_and_skin("b0")
     depth_m = depths_of_forces_m(skin, np.array([0.5, 2.0, 0.5, 0.0]))
     tip_m = np.column_stack([np.full(4, 5e-3), np.full(4, -3e-3), depth_m])[None].repeat(3, axis=0)
@@ -149,14 +151,14 @@ def test_lift_off_leaves_only_the_memory(terms):
     found = simulate_response(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
     left_uT, pressed_uT = sizes_uT(found.change_T[:, -1]), sizes_uT(found.change_T[:, 1])
     assert not found.force_N[:, -1].any()
-    if terms:  # in recordings, 5 to 8 % of the last field change remain in the next no-load reading
+    if terms:  # In recordings, 5 to 8 % of the last field change remain in the next no-load reading.
         assert (left_uT < 0.2 * pressed_uT).all()
         assert left_uT[0] > 0
     else:
         assert not left_uT.any()
 
 
-def test_friction_matters_for_light_touches_only():
+def test_friction_limits_only_the_slide_by_light_touches():
     board, skin = draw_board_and_skin("b0")
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))

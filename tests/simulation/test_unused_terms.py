@@ -23,15 +23,15 @@ FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
 
 
 def functions_run(scene):
-    """Simulate a capture; return the names of the library functions that are called."""
+    """Simulate a capture. Return the names of the functions of the library that are called."""
     called = set()
 
     def note(frame, event, _):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
-    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # first run: computes the deformation tables
-    shear.tabulate_depth.cache_clear()  # otherwise, a cached result would hide a call
+    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # The first run computes the deformation tables.
+    shear.tabulate_depth.cache_clear()  # Otherwise, a cached result would hide a call.
     sys.setprofile(note)
     try:
         simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)
@@ -44,14 +44,14 @@ def scene_with(*terms):
     return with_protocol("few", FEW | {"terms": list(terms)}, terms={term: TERMS[term][0] for term in terms})
 
 
-def test_protocol_without_terms_computes_none():
+def test_protocol_without_optional_terms_computes_none_of_them():
     run = functions_run(scene_with())
-    assert {"simulate_capture", "read_field"} <= run  # checks that the profiler works
+    assert {"simulate_capture", "read_field"} <= run  # This checks that the profiler works.
     assert not run & TERM_FUNCTIONS
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_each_term_computes_only_what_it_needs(term):
+def test_each_term_calls_only_the_functions_that_it_needs(term):
     run = functions_run(scene_with(term)) & TERM_FUNCTIONS
     assert run
     assert run <= TERMS[term][1]

@@ -1,4 +1,7 @@
-"""Tests of predicting places from readings before contact, for scans in fixed order and in random order."""
+"""Tests of predicting places from readings before contact.
+
+If such predictions succeed, the order of a scan or the memory of earlier presses reveals the place.
+"""
 
 from pathlib import Path
 
@@ -17,11 +20,14 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
-CHANCE_MAX_PCT = 15.0  # chance level is 1 in 64; predictions between neighbouring places score a little more
+CHANCE_MAX_PCT = 15.0  # The chance level is 1 in 64. Predictions between neighbouring places score a little more.
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
-    """Score predictions for a grid scan in four passes; a fraction `memory` of each field change remains afterwards."""
+    """Return scores of predictions for a scan of a grid in four passes.
+
+    A fraction `memory` of each field change remains in the following no-load reading.
+    """
     rng = rng_for(0, "scan")
     order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
     place_i = np.concatenate(order)
@@ -42,28 +48,31 @@ def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
 
 
-def test_snake_scan_with_memory_reveals_places(tmp_path):
+def test_memory_of_the_previous_press_reveals_places_in_snake_order(tmp_path):
     found = score_scan(tmp_path, snake=True, memory=0.1)
     assert found["scan"] == 100.0
     assert found["noload"] > 95.0
 
 
-def test_snake_scan_without_memory_reveals_places_by_their_order(tmp_path):
+def test_order_of_a_snake_scan_reveals_places_even_without_memory(tmp_path):
     found = score_scan(tmp_path, snake=True, memory=0.0)
     assert found["scan"] == 100.0
     assert found["noload"] < CHANCE_MAX_PCT
 
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
-    """Score predictions from readings while the tip hovers; only a magnetic tip affects these readings."""
-    # Two readings per place: above the place, then in contact.
+    """Return scores of predictions from readings while the tip hovers.
+
+    Only a magnetic tip changes these readings.
+    """
+    # There are two readings per place: above the place, then in contact.
     place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)
     touches = np.tile([False, True], PASSES_N * PLACES_N)
     place_mm = np.column_stack([2 * (place_i // 8), 2 * (place_i % 8)]).astype(np.float32)
     rng = rng_for(0, "hover")
     db_uT = np.column_stack([place_mm, place_mm[:, :1] * place_mm[:, 1:]]) * np.float32(10)
     db_uT = (db_uT * (touches | magnetic)[:, None] + rng.standard_normal(db_uT.shape)).astype(np.float32)
-    corner = np.arange(len(place_i)) % (2 * PLACES_N) == 0  # the first reading of each pass is beside the skin
+    corner = np.arange(len(place_i)) % (2 * PLACES_N) == 0  # The first reading of each pass is beside the skin.
     one = readings(
         f=len(place_i), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
         y_mm=np.where(touches, place_mm[:, 1], np.nan).astype(np.float32),
@@ -72,7 +81,7 @@ def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float
     )  # fmt: skip
     hover = gather_hover([one])
     assert len(hover) == (~touches & ~corner).sum()
-    # the label of a hover reading is the next touched place
+    # The label of a reading above the skin is the place that is touched next.
     np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.1))
@@ -82,28 +91,28 @@ def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float
     return {row["told_by"]: row for row in table.to_pylist()}
 
 
-def test_hovering_tip_is_located_only_if_magnetic(tmp_path):
+def test_hovering_tip_is_located_only_if_it_is_magnetic(tmp_path):
     found = score_hovering(tmp_path, magnetic=True)
     assert found["hover"]["accuracy_pct"] > 95
     assert found["hover"]["hover_uT"] > 0.9 * found["hover"]["touch_uT"]
-    # the network predicts the same corner for all readings
+    # The network predicts the same corner for all readings.
     assert found["hover_network"]["accuracy_pct"] < CHANCE_MAX_PCT
     found = score_hovering(tmp_path, magnetic=False)
     assert found["hover"]["accuracy_pct"] < CHANCE_MAX_PCT
     assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
 
 
-def test_random_order_reveals_no_place(tmp_path):
+def test_scan_in_random_order_reveals_no_place(tmp_path):
     assert max(score_scan(tmp_path, snake=False, memory=0.1).values()) < CHANCE_MAX_PCT
 
 
-def test_indentations_count_from_0_in_each_pass():
+def test_numbers_of_indentations_count_from_0_in_each_pass():
     press = np.array([7, 7, 8, 20, 21, 21], np.int32)
     one = readings(indentation=press, pass_i=np.array([0, 0, 0, 1, 1, 1], np.int32))
     assert number_in_pass(one).tolist() == [0, 0, 1, 0, 1, 1]
 
 
-def test_excluded_rows_keep_their_numbers():
+def test_rows_keep_their_numbers_if_others_are_excluded():
     lost = np.array([0, np.nan, 2, 3, np.nan, 5], np.float32)
     one = readings(x_mm=lost, noload_uT=np.arange(18, dtype=np.float32).reshape(6, 3))
     scan = gather_scan([one], ALL)

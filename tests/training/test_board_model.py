@@ -1,4 +1,7 @@
-"""Tests of a universal model that is made for another board: its file, its accuracy on simulated skins, refusals."""
+"""Tests of a universal model that is made for another board than the paper's.
+
+Tested are its file, its accuracy on simulated skins, and what is refused.
+"""
 
 import re
 import shutil
@@ -30,7 +33,8 @@ from reskin.universal.model import FILE, Universal, load_universal
 from tests.live.boards import make_script, play_to_skin
 
 SPREADS, CHIP = parse(Spreads, nominal("spreads"), "spreads"), parse(ChipDesign, nominal("chip"), "chip")
-# Four chips at the corners of a square, another pitch, other turns, a thicker skin and an area without cut corners.
+# The board has four chips at the corners of a square, with another pitch and other turns. The skin is thicker, and the
+# pressed area has corners.
 LAYOUT = """
 name: square
 chips:
@@ -56,7 +60,7 @@ spreads: {seat_x_mm: 0.3, seat_y_mm: 0.3}
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """Make a model for `LAYOUT` with few skins and few steps of training."""
+    """Make a model for `LAYOUT`, with few skins and few training steps."""
     folder = tmp_path_factory.mktemp("board")
     (folder / "square.yaml").write_text(LAYOUT)
     usual = shipping.read_inputs
@@ -79,7 +83,8 @@ def made(tmp_path_factory) -> Path:
 def test_simulated_presses_of_the_board_are_placed_within_1_mm(made, labels_n, least):
     model = reskin.load_universal(file=made)
     inputs = shipping.read_inputs(layout=model.layout)
-    skins = draw_prior_skins(inputs.prior, 6, 3, "of the test", law_error(0.0))  # not among the skins of the training
+    # These skins are not among those of the training.
+    skins = draw_prior_skins(inputs.prior, 6, 3, "of the test", law_error(0.0))
     within = []
     for i in range(len(skins)):
         b_uT, place_mm = calibrate(model, skins, i, (45, labels_n), even=False, seed=3)
@@ -90,7 +95,8 @@ def test_simulated_presses_of_the_board_are_placed_within_1_mm(made, labels_n, l
 
 
 def test_presses_simulated_by_independent_code_are_placed_within_1_mm(made):
-    # This simulator has separate code for positions and turns of chips. A wrong turn of one chip makes places wrong.
+    # This simulator computes positions and turns of chips by other code than the model. A wrong turn of one chip makes
+    # places wrong.
     model = load_universal(file=made)
     layout, rng, within, with_wrong_turn = model.layout, rng_for(0, "square"), [], []
     turned = (layout.chips[0].model_copy(update={"turn_deg": 270}), *layout.chips[1:])
@@ -99,7 +105,8 @@ def test_presses_simulated_by_independent_code_are_placed_within_1_mm(made):
         chips_xy_mm=tuple(map(tuple, layout.chips_mm.tolist())), chips_turn_deg=layout.turns_deg, gap_mm=layout.gap_mm
     )
     usual = layout.setup().design
-    strength_T = layout.skin.magnetisation * usual.saturation_T  # with a stronger magnetisation, some chips saturate
+    # If the magnetisation were stronger, some chips would saturate.
+    strength_T = layout.skin.magnetisation * usual.saturation_T
     skin_design = usual.model_copy(update={"modulus_kPa": 190.0, "saturation_T": strength_T})
     for name in ("b0", "b1", "b2"):
         board = draw_board(design, SPREADS, seed=5, name=name)
@@ -135,14 +142,14 @@ def test_chips_are_in_the_order_and_axes_of_the_layout(made):
     strongest = np.abs(tables.mean_uT[..., 5, :]).reshape(-1, 4, 3).max(axis=(0, 2))
     assert strongest.max() < 2 * strongest.min()
     board_uT = np.arange(12.0)[None]
-    by_hand_uT = [1, -0, 2, 3, 4, 5, -7, 6, 8, -9, -10, 11]  # turns of 90, 0, 270 and 180 degrees
+    by_hand_uT = [1, -0, 2, 3, 4, 5, -7, 6, 8, -9, -10, 11]  # The chips are turned by 90, 0, 270 and 180 degrees.
     np.testing.assert_allclose(layout.to_chips(board_uT)[0], by_hand_uT, atol=1e-12)
     np.testing.assert_allclose(layout.to_board(layout.to_chips(board_uT)), board_uT, atol=1e-12)
     assert np.abs(tables.axis_mm).max() == pytest.approx(5.4)
     assert np.abs(model.skin.hypotheses.place_mm).max(axis=0) == pytest.approx([5.4, 4.4], abs=0.8)
 
 
-def test_saved_calibration_is_for_the_board_alone(made, tmp_path):
+def test_saved_calibration_is_refused_for_other_boards(made, tmp_path):
     model, file = load_universal(file=made), tmp_path / "s1.safetensors"
     rest_uT = model.layout.to_chips(model.tables.rest_uT[None])
     press_uT = rest_uT + model.layout.to_chips(model.tables.mean_uT[6:8, 5, 5])
@@ -155,7 +162,7 @@ def test_saved_calibration_is_for_the_board_alone(made, tmp_path):
         model.label([[8.0, 8.0]], [2.0], press_uT[:1])
 
 
-def test_live_page_and_predict_accept_the_model(made, tmp_path):
+def test_live_page_and_command_predict_accept_the_model(made, tmp_path):
     model = predicting.read_models([made])
     assert model.layout.name == "square"
     calibration = tmp_path / "s1.safetensors"
@@ -176,7 +183,7 @@ def test_live_page_and_predict_accept_the_model(made, tmp_path):
     assert np.abs(guided_mm).max() > 2.5
 
 
-def test_board_with_these_chips_is_read_with_the_model(made):
+def test_board_is_read_live_with_the_model_for_its_layout(made):
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), predicting.read_models([made]))
     assert skin.layout.known
     assert np.isfinite(np.concatenate([batch.target[batch.contact] for batch in readings])).all()
@@ -185,7 +192,7 @@ def test_board_with_these_chips_is_read_with_the_model(made):
     assert "no place or force: the universal model is for 4 chips. Use a model for this board." in other.alarms()
 
 
-def test_card_states_layout_and_limits(made):
+def test_model_card_states_the_layout_and_the_limits_of_use(made):
     card = io.read_json(made.with_suffix(".json"))
     assert card["source"] == "simulated"
     assert card["layout"] == read_layout(made.with_suffix(".yaml")).model_dump(mode="json")
@@ -194,7 +201,7 @@ def test_card_states_layout_and_limits(made):
     assert "layout" in card["not_for"]
 
 
-def test_card_of_another_model_is_refused(made, tmp_path):
+def test_model_card_of_another_model_is_refused(made, tmp_path):
     file = tmp_path / "mixed.safetensors"
     shutil.copy(made, file)
     io.write_json(file.with_suffix(".json"), io.read_json(FILE.with_suffix(".json")))
@@ -202,7 +209,7 @@ def test_card_of_another_model_is_refused(made, tmp_path):
         load_universal(file=file)
 
 
-def test_output_is_not_overwritten(made):
+def test_existing_output_is_not_overwritten(made):
     with pytest.raises(ParamsError, match="square.safetensors exists. Choose another name"):
         shipping.make(made.with_suffix(".yaml"), made)
     with pytest.raises(ParamsError, match="must end in .safetensors. Try: "):

@@ -1,4 +1,4 @@
-"""Tests of the choice of training settings from cards of candidate networks."""
+"""Tests of choosing training settings from the model cards of candidate networks."""
 
 from typing import Any
 
@@ -15,7 +15,11 @@ Card = dict[str, Any]
 
 
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
-    """Return a card with one skin per board. The larger the place error, the better are accuracy and force error."""
+    """Return a model card with one skin per board.
+
+    All scores follow from the place error, so that settings with a smaller place error have the worse accuracy and
+    force error.
+    """
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
         "all": score,
@@ -58,14 +62,14 @@ def test_smallest_place_error_is_chosen_with_the_base_of_adaptation():
     chosen = choose(CARDS)
     assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
     assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
-    # recipe `light` is better without adaptation, `heavy` after adaptation
+    # Recipe `light` is better without adaptation, and recipe `heavy` is better after adaptation.
     assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0
     assert chosen["adapt"]["settings"]["unlabelled_weight"] == 0.1
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(CARDS))
-def test_choice_does_not_depend_on_the_order_of_cards(cards):
+def test_choice_does_not_depend_on_the_order_of_model_cards(cards):
     assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
 
 
@@ -81,8 +85,9 @@ def test_all_candidates_are_listed_with_scores():
     }
 
 
-def test_mean_over_boards_decides():
-    # Seeds of a board are averaged first: (0.4 + 0.9) / 2 is less than 0.695, but (0.4 + 0.9 + 0.9) / 3 is not.
+def test_settings_are_compared_by_the_mean_over_boards():
+    # The seeds of a board are averaged first. Therefore the mean is (0.4 + 0.9) / 2, which is less than 0.695. The mean
+    # over all networks, (0.4 + 0.9 + 0.9) / 3, would not be less.
     boards = [
         card("lobo", "fast", 0.29, "b0", recipe=RECIPE | {"rate_max": 6e-3}),
         card("lobo", "fast", 1.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}),
@@ -96,7 +101,7 @@ def test_mean_over_boards_decides():
     assert chosen["recipe_name"] == "even"
 
 
-def test_adapted_skins_are_pooled_by_board():
+def test_scores_of_adapted_skins_are_averaged_over_boards():
     # Board b0 has two skins (0.2, 0.4), b1 has one (0.9). The mean is (0.3 + 0.9) / 2, not the mean over three skins.
     skins = [
         adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
@@ -105,7 +110,7 @@ def test_adapted_skins_are_pooled_by_board():
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
     scores = chosen["candidates"][0]["mse_xy_mm2"]
     assert scores["mean"] == pytest.approx(0.6)
-    assert "sd_seeds" not in scores  # a spread over skins is not a spread over seeds
+    assert "sd_seeds" not in scores  # The spread over skins is not a spread over seeds.
 
 
 SHAPED = {"inputs": "shape"}
@@ -121,7 +126,7 @@ SHAPED = {"inputs": "shape"}
     ],
     ids=["shape", "triplet shape", "adapted shape", "another experiment"],
 )
-def test_other_inputs_and_experiments_are_not_candidates(better):
+def test_networks_with_other_inputs_or_experiments_are_not_candidates(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
@@ -144,7 +149,7 @@ def test_steps_and_base_are_not_settings():
     ],
     ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
 )
-def test_missing_candidates_are_an_error(cards, stage):
+def test_choice_without_candidates_is_refused(cards, stage):
     with pytest.raises(ParamsError, match=f"no candidates of {stage}. Run experiments lobo"):
         choose(cards)
 
@@ -159,12 +164,12 @@ def test_record_lists_boards_skins_and_settings():
 
 
 def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
-    """Return a copy of a card with another number of steps and another error."""
+    """Return a copy of a model card with another number of steps and another error."""
     return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
 
 
-def test_candidates_need_equal_steps():
+def test_candidates_must_have_the_same_number_of_steps():
     slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]
@@ -172,7 +177,7 @@ def test_candidates_need_equal_steps():
     with pytest.raises(ParamsError, match="steps of train_multi's fast differ between candidates"):
         choose([*unfair, *others])
     chosen = choose([*unfair, with_steps(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
-    # mean errors: 0.275 for `fast`, 0.3 for `slow`
+    # The mean error is 0.275 for `fast`, and 0.3 for `slow`.
     assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3
 
 
@@ -186,7 +191,7 @@ def test_control_is_listed_but_not_chosen():
 
 
 @pytest.mark.parametrize("failure", [{"collapsed": True}, {"collapsed_before_n": 1}])
-def test_settings_of_a_collapsed_training_are_not_chosen(failure):
+def test_settings_with_which_a_training_collapsed_are_not_chosen(failure):
     # With the same settings, the training on the other board did not collapse.
     again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **failure)
     assert names(choose([*CARDS, again]))["train_multi"] == "fastest"

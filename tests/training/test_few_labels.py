@@ -44,7 +44,10 @@ METHODS = [
 
 
 def example_rows() -> Rows:
-    """Return rows: two skins on board b0, one on each other board; 3 x 3 places, two passes, two readings per press."""
+    """Return rows of two skins on board b0, and of one skin on each other board.
+
+    Each skin has 3 x 3 places, two passes, and two readings per press.
+    """
     own_n = PLACES_N * PASSES_N * READINGS_N
     rng, f = rng_for(0, "few labels"), len(SKINS) * own_n
     place_i = np.tile(np.arange(PLACES_N).repeat(READINGS_N), len(SKINS) * PASSES_N)
@@ -71,7 +74,7 @@ def training_data(rows: Rows) -> TrainingData:
 
 
 def initial_result(job: TrainingJob) -> TrainingResult:
-    """Return a result with the initial weights and the fitted scaler of a job."""
+    """Return a result that has the initial weights and the fitted scaler of a job."""
     prepared, scaler = prepare(job, training_data(ROWS))
     return TrainingResult(
         f"key of {job.name}",
@@ -88,7 +91,10 @@ def initial_result(job: TrainingJob) -> TrainingResult:
 
 
 def networks_of(tested_study: few.Study) -> list[few.TrainedEntry]:
-    """Return all entries of the study with jobs and untrained results, in the order of the steps of the stage."""
+    """Return all entries of the study with their jobs, and results that are not trained.
+
+    They are in the order of the steps of the stage.
+    """
     done: list[few.TrainedEntry] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
         done = [*done, *((entry, job, initial_result(job)) for entry, job in step(tested_study, done))]
@@ -144,7 +150,7 @@ def test_labels_are_whole_indentations_of_the_pool():
         assert {*labelled_rows} <= {*entry.fold.pool}
         labelled = np.unique(ROWS.indentation[labelled_rows])
         assert len(labelled) == entry.labels_n
-        # all readings of labelled indentations, and no others
+        # All readings of the labelled indentations are used, and no others.
         assert {*labelled_rows} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}
         assert not {*labelled} & {*ROWS.indentation[one.test]}
 
@@ -155,7 +161,7 @@ def test_entries_for_zero_labels_contain_no_labels():
             assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
 
 
-def test_labels_are_the_same_for_all_methods_but_not_for_all_folds():
+def test_labels_of_a_fold_are_the_same_for_all_methods():
     given_labels: dict[tuple[str, int], set[tuple[int, ...]]] = {}
     for entry, one in with_labels(STUDY, NETWORKS):
         given_labels.setdefault((entry.fold.name, entry.labels_n), set()).add(tuple(labels_of(one)))
@@ -184,7 +190,7 @@ def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
             assert rows[fold.name, less] < rows[fold.name, more]
 
 
-def test_labels_depend_on_the_seed_but_not_on_order():
+def test_labels_depend_on_the_seed_but_not_on_the_order_of_rows():
     first, repeated, other, reordered = (
         [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(tested_study) if entry.labels_n == 5]
         for tested_study in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
@@ -194,7 +200,7 @@ def test_labels_depend_on_the_seed_but_not_on_order():
 
 
 def with_unknown_targets(what: np.ndarray, rows: Rows = ROWS) -> Rows:
-    """Return the rows with NaN as place and force of the rows `what`."""
+    """Return the rows, with NaN as place and force of the rows `what`."""
     target = rows.target.copy()
     target[what] = np.nan
     return replace(rows, target=target)
@@ -210,7 +216,8 @@ def test_scaler_ignores_labels_of_the_new_board():
         for name, values in pooled[entry.method.removesuffix(", adapted"), entry.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # labels are used for training
+        # The labels themselves are used for training.
+        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()
         assert len(prepared.few_labels.inputs) == READINGS_N * entry.labels_n
 
 
@@ -224,7 +231,7 @@ def test_fine_tuning_starts_from_the_network_of_its_fold():
 def test_only_listed_networks_are_adapted():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
-        # all pool rows are on a line: each of 8 places on a 3 x 3 grid has a neighbour
+        # All rows of the pool are on a line, because each of the 8 places on the 3 x 3 grid has a neighbour.
         assert {*job.tuning.lines.row} == {*fold.pool}
     assert few.adaptation_jobs(study(adapted=[]), untrained_networks(study(adapted=[]))) == []
 

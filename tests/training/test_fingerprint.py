@@ -1,4 +1,4 @@
-"""Tests of the fingerprint of the simulated skin: it changes with every setting that changes a capture."""
+"""Tests of the fingerprint of the simulated skin, which changes with every setting that changes a capture."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -15,7 +15,7 @@ PARAMS = read_yaml(NOMINAL)
 CURRENT = fingerprint(PARAMS)
 
 
-def test_order_of_settings_does_not_matter():
+def test_order_of_settings_does_not_change_the_fingerprint():
     reordered = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
     assert fingerprint(reordered) == CURRENT
     assert len(CURRENT) == 16
@@ -34,7 +34,7 @@ def test_every_setting_changes_the_fingerprint(section, name, value):
     assert fingerprint(changed) != CURRENT
 
 
-def test_fingerprint_depends_on_physics_but_not_rounding(monkeypatch):
+def test_fingerprint_changes_with_the_physics_but_not_by_rounding(monkeypatch):
     rigid = slide.press_displacement_m
     monkeypatch.setattr(slide, "press_displacement_m", lambda *args, **kwargs: rigid(*args, **kwargs) * (1 + 1e-12))
     assert fingerprint(PARAMS) == CURRENT
@@ -42,6 +42,6 @@ def test_fingerprint_depends_on_physics_but_not_rounding(monkeypatch):
     assert fingerprint(PARAMS) != CURRENT
 
 
-def test_tuned_settings_match_the_current_skin():
+def test_fingerprint_stored_with_the_chosen_settings_is_that_of_the_current_skin():
     record = read_yaml(ROOT / "reports/tuning/choice.json")
     assert record["physics"] == CURRENT, "run scene tuning again and commit reports/tuning/choice.json"

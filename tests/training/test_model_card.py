@@ -34,7 +34,7 @@ def card(job: TrainingJob, **changes: object) -> dict:
     return model_card(job, trained, rows(), scene="lab")
 
 
-def test_card_describes_training_and_test_data():
+def test_model_card_describes_the_data_for_training_and_tests():
     result = card(pooled())
     assert (result["scene"], result["key"], result["question"]) == ("lab", "k", "triplet")
     assert (result["train_boards"], result["train_skins"]) == (["b0"], ["b0_s0", "b0_s1"])
@@ -57,18 +57,18 @@ def test_card_describes_the_network():
 
 
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_card_is_json(job):
+def test_model_card_can_be_written_as_json(job):
     written = card(job)
     assert json.loads(json.dumps(written, allow_nan=False)) == written
 
 
 @pytest.mark.parametrize(("explained", "collapsed"), [(None, False), (0.9, False), (0.049, True), (-3.0, True)])
-def test_card_states_collapse_and_attempts(explained, collapsed):
+def test_model_card_states_whether_and_how_often_the_training_collapsed(explained, collapsed):
     result = card(pooled(), explained_min=explained, collapsed_before_n=1)
     assert (result["explained_min"], result["collapsed"], result["collapsed_before_n"]) == (explained, collapsed, 1)
 
 
-def test_card_states_an_early_stop():
+def test_model_card_states_that_the_training_was_stopped_early():
     assert card(pooled())["stopped_step"] is None
     assert card(pooled(), stopped_step=150)["stopped_step"] == 150
 
@@ -78,9 +78,9 @@ def test_card_states_an_early_stop():
     [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", LABELLED)],
     ids=["unlabelled", "labelled"],
 )
-def test_card_of_a_tuned_network_describes_the_tuning(job, kind, used):
+def test_model_card_of_an_adapted_network_describes_the_adaptation(job, kind, used):
     tuning = card(job)["tuning"]
     assert (tuning["from"], tuning["kind"], tuning["skins"]) == ("start", kind, ["b1_s1"])
     assert tuning["settings"] == job.tuning.settings.model_dump()
-    assert tuning["pokes_n"] == len({row // 2 for row in used})  # an indentation has two readings
+    assert tuning["pokes_n"] == len({row // 2 for row in used})  # An indentation has two readings.
     assert not set(used) & set(TEST)

@@ -27,7 +27,10 @@ def model() -> Universal:
 
 
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
-    """Return simulated skins near the nominal one: presses on the lattice; law errors are proportional to the field."""
+    """Return simulated skins near the nominal one, whose presses are at lattice points.
+
+    Errors of the law are proportional to the field.
+    """
     tables, rng = model.tables, rng_for(0, "shipping")
     place_i = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
     force_i = rng.integers(1, len(tables.force_N), (skins_n, PRESSES_N))
@@ -41,7 +44,7 @@ def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
 
 
 @pytest.mark.parametrize("labels_n", [0, 3, 10])
-def test_shipped_model_estimates_like_the_tested_variant(model, labels_n):
+def test_shipped_model_has_the_estimates_of_the_variant_that_experiments_test(model, labels_n):
     skins = skins_of(model, 1)
     b_uT, _ = calibrate(model, skins, 0, (65, labels_n), even=True, seed=0)
     prior = PriorModel(new_map(model.tables), model.networks)
@@ -52,13 +55,13 @@ def test_shipped_model_estimates_like_the_tested_variant(model, labels_n):
     found = model.estimate(b_uT)
     assert model.misfit == pytest.approx(calibration.misfit, rel=1e-3)
     assert model.power == pytest.approx(powers[0].combined, rel=1e-3)
-    # tolerance in mm: fields are in single precision
+    # The tolerance in mm is rounding, because fields are in single precision.
     np.testing.assert_allclose(found.place_mm - 8, expected.place_mm, atol=1e-3)
     np.testing.assert_allclose(found.sd_mm, expected.sd_mm, rtol=1e-3)
 
 
 @pytest.mark.parametrize("presses_n", [12, 65])
-def test_larger_misfit_lowers_the_power(model, presses_n):
+def test_larger_misfit_lowers_the_likelihood_power(model, presses_n):
     misfits, powers = [], []
     for error in (0.1, 1.0):
         calibrate(model, skins_of(model, 1, error), 0, (presses_n, 0), even=False, seed=0)
@@ -70,7 +73,7 @@ def test_larger_misfit_lowers_the_power(model, presses_n):
     assert powers == pytest.approx([min(1, model.powers.power_for(presses_n, 0, even=False) / of) for of in misfits])
 
 
-def test_powers_are_calibrated_for_all_presses_and_labels(model, monkeypatch):
+def test_likelihood_powers_are_calibrated_for_all_numbers_of_presses_and_labels(model, monkeypatch):
     monkeypatch.setattr(shipping, "CALIBRATION_SKINS_N", 1)
     monkeypatch.setattr(shipping, "draw_prior_skins", lambda *_: skins_of(model, 1))
     found = calibrate_powers(model, SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), (0, 10), seed=0)

@@ -43,7 +43,7 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 FRAME = Frame(np.tile(QUARTER, (5, 1, 1)), (8.0, 7.0), mirrored=True)
 
 
-def test_place_and_label_are_inverse():
+def test_converting_places_to_labels_and_back_changes_nothing():
     label_mm = np.array([[8.0, 7.0], [9.0, 10.0]])
     np.testing.assert_allclose(FRAME.place(label_mm), [[0, 0], [1, -3]])
     np.testing.assert_allclose(FRAME.label(FRAME.place(label_mm)), label_mm)
@@ -52,7 +52,8 @@ def test_place_and_label_are_inverse():
 
 
 def test_recorded_readings_are_grouped_by_press():
-    counts = [2, 150, 1, 3]  # readings of four presses; the third press has no force, the last is on another board
+    # The readings of four presses. The third press has no force, and the last one is on another board.
+    counts = [2, 150, 1, 3]
     press = np.repeat(np.arange(4), counts)
     board = np.where(press == 3, "other", "own")
     target = np.stack([8 + press, 7 + press, np.where(press == 2, 0.0, 1 + press)], axis=1).astype(np.float32)
@@ -66,7 +67,7 @@ def test_recorded_readings_are_grouped_by_press():
     np.testing.assert_allclose(found.db_uT[..., 2], np.tile([[1], [2]], READINGS_N))
 
 
-def test_saved_networks_predict_the_same(tmp_path):
+def test_saved_networks_give_the_same_predictions(tmp_path):
     networks = [draw_weights(15, rng_for(0, "written", i)) for i in range(2)]
     model = PriorModel(new_map(make_tables()), networks)
     nominal, held_out = (
@@ -107,7 +108,7 @@ def calibrate_to_skin_with(nominal: Variant, error) -> tuple[PoolCalibration, La
     return calibrate_to_simulated(nominal.model, draw_prior_skins(nominal.prior, 1, 0, "asked", error), 0, 0)
 
 
-def test_best_powers_cover_90_percent():
+def test_calibrated_likelihood_powers_give_intervals_that_cover_90_percent():
     found = [np.array([[0.5, 0.7], [0.9, 0.8], [1.0, 1.0]]), np.array([[0.7, 0.9], [0.9, 0.9], [1.0, 1.0]])]
     assert best_powers((1.0, 0.5, 0.1), found) == (0.5, 0.5)
 
@@ -135,12 +136,12 @@ def exact_and_wrong_labels(nominal) -> tuple[PoolCalibration, PoolCalibration]:
     return exact, replace(exact, pool=replace(exact.pool, place_mm=exact.pool.place_mm + off_mm))
 
 
-def test_errors_of_held_out_labels_widen_intervals(exact_and_wrong_labels):
+def test_errors_of_held_out_labels_lower_the_likelihood_power(exact_and_wrong_labels):
     powers = [Powers(0.3, 0.3), Powers(0.1, 0.1)]
     fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in exact_and_wrong_labels)
     _, misled = exact_and_wrong_labels
     assert (misled_powers < fitting_powers / 2).all()
-    assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
+    assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # Without labels, the powers stay the same.
     # Forty wrong labels must lower the powers more than three wrong labels.
     assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
@@ -153,21 +154,22 @@ def test_single_label_is_held_out(exact_and_wrong_labels):
     assert found == pytest.approx([0.3 / variance_inflation(one) for one in errors])
 
 
-def test_powers_are_calibrated_for_all_numbers_of_labels(nominal, monkeypatch):
+def test_likelihood_powers_are_calibrated_for_all_numbers_of_labels(nominal, monkeypatch):
     monkeypatch.setattr(universal, "CALIBRATION_SKINS_N", 2)
     found = calibrate_on_simulated(nominal, (0, 40), seed=0)
     assert set(found) == {0, 40}
     assert set(np.ravel(list(found.values()))) <= set(NOMINAL_POWERS)
 
 
-def test_force_line_corrects_forces_of_a_stiffer_skin():
+def test_calibration_line_corrects_the_forces_of_a_stiffer_skin():
     tables = make_tables()
     model = PriorModel(new_map(tables), [draw_weights(15, rng_for(0, "powers"))])
     skins = make_population(1, rng_for(3, "stiffer"))
     pool, tested = split_presses(skins, 0, seed=1)
-    pool, tested = (replace(part, force_N=2 * part.force_N) for part in (pool, tested))  # all forces are twice as large
+    # On a skin that is twice as stiff, all forces are twice as large.
+    pool, tested = (replace(part, force_N=2 * part.force_N) for part in (pool, tested))
     calibration = calibrate(model, skins.rest_uT[0].astype(float), pool)
-    assert universal.fit_force_line(calibration, 4).mean[0] == 0  # too few labels
+    assert universal.fit_force_line(calibration, 4).mean[0] == 0  # Four labels are too few for the line.
     labelled = calibration.with_labels(0)
     corrected = replace(labelled, line=universal.fit_force_line(calibration, 40))
     errors = [

@@ -1,4 +1,7 @@
-"""A synthetic skin for tests, whose fields are a simple formula (no simulation); the design of the real skin."""
+"""A synthetic skin for tests.
+
+Its fields are a simple formula, so no simulation is needed; its design is that of the real skin.
+"""
 
 from pathlib import Path
 
@@ -16,26 +19,33 @@ CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
-FORCES_N = np.geomspace(0.55, 9.5, 6)  # force grid of the tables; few forces suffice for the formula
+# Forces at which the tables give fields. Few forces suffice, because the formula is smooth in the force.
+FORCES_N = np.geomspace(0.55, 9.5, 6)
 NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
 REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 
 
 def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -> np.ndarray:
-    """Return fields in 15 channels, largest near each chip. x and y point away from the chip; `upright` scales z."""
+    """Return fields in 15 channels, which are largest near each chip.
+
+    The x and y components point away from the chip. The z component is multiplied by `upright`.
+    """
     offset = (place_mm[:, None] - CHIPS_MM) / WIDE_MM
     size = 400 * force_N[:, None] ** 0.7 * np.exp(-(offset**2).sum(axis=2) / 2)
     return np.stack([size * offset[..., 0], size * offset[..., 1], size * upright], axis=2).reshape(len(place_mm), -1)
 
 
 def poked_uT(place_mm: np.ndarray, force_N: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Return fields of a skin whose parameters are `number` prior standard deviations from the prior mean."""
+    """Return the fields of presses on a skin whose three parameters differ from the prior mean.
+
+    `number` is this difference for each parameter, in standard deviations of the prior.
+    """
     label_x_mm, label_y_mm, gap_mm = number * SPREADS
     return fields_uT(place_mm + [label_x_mm, label_y_mm], force_N, 1 + gap_mm)
 
 
 def make_tables() -> Tables:
-    """Return tables of the synthetic skin; slopes are computed by small differences."""
+    """Return the tables of the synthetic skin. Slopes are finite differences of 0.001 standard deviations."""
     axis_mm = lattice_mm()
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.repeat(place_mm, len(FORCES_N), axis=0), np.tile(FORCES_N, len(place_mm))
@@ -49,7 +59,10 @@ def make_tables() -> Tables:
 
 
 def make_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
-    """Draw synthetic skins with random parameters. With `weight_N`, the last press is at (0, 0) with this force."""
+    """Draw synthetic skins with random parameters.
+
+    If `weight_N` is given, each skin gets one more press: at the place (0, 0), with this force.
+    """
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))
     number = rng.standard_normal((skins_n, 3))

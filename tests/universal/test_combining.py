@@ -1,4 +1,4 @@
-"""Tests of combining map and networks as normal distributions, and of correcting the networks' places."""
+"""Tests of combining the estimates of the map and of the networks as normal distributions, and of correcting places."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,11 @@ def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: fl
     return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network, prior_line())
 
 
-def test_places_of_evenly_spread_presses_are_centred():
+def test_mean_place_of_evenly_spread_presses_is_zero_and_labels_reduce_this_shift():
+    """The first result is the shift that moves the mean place to the middle of the skin.
+
+    Labels make this shift smaller.
+    """
     even_mm, place_mm = RNG.normal(0.7, 3, (65, 2)), np.zeros((10, 2))
     centre_mm, _ = network_offsets_mm(-even_mm.mean(axis=0), place_mm[:0], place_mm[:0])
     np.testing.assert_allclose((even_mm + centre_mm).mean(axis=0), 0, atol=1e-12)
@@ -36,6 +40,7 @@ def test_places_of_evenly_spread_presses_are_centred():
 
 @pytest.mark.parametrize("labels_n", [1, 7])
 def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
+    """The shift equals the conditional mean of a normal variable, given true minus estimated places."""
     estimated_mm, true_mm = RNG.normal(0, 3, (labels_n, 2)), RNG.normal(0, 3, (labels_n, 2))
     cov = OFFSET_SD_MM**2 * np.ones((labels_n, labels_n)) + LABEL_SD_MM**2 * np.eye(labels_n)
     expected_mm = OFFSET_SD_MM**2 * np.ones(labels_n) @ np.linalg.solve(cov, true_mm - estimated_mm)
@@ -45,6 +50,7 @@ def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
 
 
 def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
+    """Without a field change, all places are equally likely for the map, so the place comes from the network."""
     place_mm = np.array([[3.0, 2.0], [-4.0, 1.0]])
     db_uT = fields_uT(place_mm, np.array([2.0, 3.0]))
     right = evaluation(skin, db_uT, place_mm).combined(1.0)
@@ -56,7 +62,7 @@ def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
     assert np.isfinite(blind.place_mm).all()
 
 
-def test_lower_power_widens_intervals_without_changing_estimates(skin):
+def test_lower_likelihood_power_widens_intervals_without_changing_estimates(skin):
     place_mm = np.array([[3.0, 2.0]])
     evaluated = evaluation(skin, fields_uT(place_mm, np.array([2.0])), place_mm)
     full, lower = evaluated.combined(1.0), evaluated.combined(0.25)
@@ -64,7 +70,7 @@ def test_lower_power_widens_intervals_without_changing_estimates(skin):
     assert (lower.sd_mm > full.sd_mm).all()
 
 
-def test_places_are_moved_onto_the_area_of_the_grid():
+def test_shifted_places_are_moved_back_onto_the_area_of_the_grid():
     octagon_mm = RNG.uniform(-8, 8, (2000, 2))
     octagon_mm = octagon_mm[inside(octagon_mm)]
     errors = []
@@ -75,11 +81,13 @@ def test_places_are_moved_onto_the_area_of_the_grid():
             moved_mm = shift_onto_area(Estimate(place_mm, np.full((65, 2), 0.5), nan, nan, nan), sd_mm=1.0)
             errors.append(moved_mm + shift_mm)
     rms_mm = np.sqrt(np.mean(np.square(errors)))
-    mean_mm = 4.4 / np.sqrt(65)  # standard deviation of the mean of 65 places in the octagon
+    # For comparison: the standard error of the mean of 65 random places in the octagon, by which a shift to the mean
+    # would be wrong.
+    mean_mm = 4.4 / np.sqrt(65)
     assert rms_mm < 0.8 * mean_mm
 
 
-def test_map_moves_all_places_by_the_shift(skin):
+def test_shift_of_the_map_moves_all_estimated_places(skin):
     place_mm, by_mm = np.array([[3.0, 2.0], [-4.0, 1.0], [0.0, -3.0]]), np.array([0.3, -0.2])
     db_uT = fields_uT(place_mm, np.full(3, 2.0))
     before = skin.evaluator.estimate(db_uT)

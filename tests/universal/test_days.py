@@ -1,4 +1,7 @@
-"""Tests of calibrations over several days: the algebra, the decision whether the slide has changed, and saved files."""
+"""Tests of calibrations over several days: the algebra, the decision whether the slide has changed, and saved files.
+
+The slide is how far the skin slides on its base under presses. It can change from one day to the next.
+"""
 
 from dataclasses import replace
 
@@ -32,11 +35,12 @@ from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import grid
 from tests.universal.skins import REST_SLOPE_uT, make_tables, poked_uT
 
+# The tests of the algebra use three parameters. The third one stands for the slide, which may change between days.
 NAMES = (
     "label_x_mm",
     "label_y_mm",
     "away_um_mm",
-)  # tests of the algebra have three parameters, of which the third is the slide
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,14 +54,17 @@ def skin() -> Universal:
 
 
 def labelled_presses(presses_n=9):
-    """Return places, forces, field changes and days of labelled presses on three days."""
+    """Return places, forces and field changes of labelled presses.
+
+    The last array says how many days ago each press was made (0, 1 or 2).
+    """
     rng = rng_for(0, "days")
     place_mm, force_N = rng.permutation(grid())[:presses_n], np.exp(rng.uniform(np.log(0.7), np.log(8), presses_n))
     db_uT = poked_uT(place_mm, force_N, np.array([0.5, -0.5, 1.0])) + rng.normal(0, 20, (presses_n, 15))
     return place_mm, force_N, db_uT, np.arange(presses_n) % 3
 
 
-def test_conditioning_on_three_days_equals_a_dense_gaussian(skin_map, monkeypatch):
+def test_conditioning_on_three_days_equals_conditioning_of_a_joint_gaussian(skin_map, monkeypatch):
     monkeypatch.setattr(map, "SLIDE_CORRELATION", 0.4)
     place_mm, force_N, db_uT, days_ago = labelled_presses()
     rest_uT = rng_for(1, "rest").normal(0, 300, 15)
@@ -65,8 +72,8 @@ def test_conditioning_on_three_days_equals_a_dense_gaussian(skin_map, monkeypatc
         begin_day(begin_day(condition_on_noload(skin_map, rest_uT))), place_mm, force_N, db_uT, days_ago
     )
 
-    # Reference in covariance form: two constant parameters, then the slide today, one day ago and two days ago. The
-    # no-load field was read two days ago.
+    # Reference: Gaussian conditioning with the full covariance. There are five unknowns: two parameters that are
+    # constant, and the slide of today, of yesterday and of two days ago. The no-load field was read two days ago.
     prior = np.eye(5)
     prior[2:, 2:] = [[1, 0.4, 0.16], [0.4, 1, 0.4], [0.16, 0.4, 1]]
     mean_uT, slope_uT, _ = interpolate(skin_map, place_mm, force_N)
@@ -91,19 +98,21 @@ def test_conditioning_on_three_days_equals_a_dense_gaussian(skin_map, monkeypatc
     np.testing.assert_array_equal(found.current[0], found.mean[:3])
 
 
-def test_days_without_change_equal_one_day(skin_map, monkeypatch):
+def test_days_between_which_nothing_changes_equal_a_single_day(skin_map, monkeypatch):
     place_mm, force_N, db_uT, days_ago = labelled_presses()
     at_once = condition_on_labels(skin_map, place_mm, force_N, db_uT)
-    monkeypatch.setattr(map, "SLIDE_CORRELATION", 1 - 1e-8)  # with 1, the covariance cannot be inverted
+    # With a correlation of exactly 1, the covariance of the slides cannot be inverted.
+    monkeypatch.setattr(map, "SLIDE_CORRELATION", 1 - 1e-8)
     monkeypatch.setattr(map, "ERROR_CORRELATION", 1.0)
     by_day = condition_on_labels(begin_day(begin_day(skin_map)), place_mm, force_N, db_uT, days_ago)
     np.testing.assert_allclose(by_day.current[0], at_once.mean, atol=1e-5)
     np.testing.assert_allclose(by_day.current[1], at_once.cov, atol=1e-5)
     one, other = (each.evaluator.estimate(db_uT) for each in (at_once, by_day))
-    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # deviances are in single precision
+    # The tolerance in mm is the effect of rounding, because deviances are in single precision.
+    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)
 
 
-def test_new_day_resets_only_the_slide(skin_map):
+def test_beginning_a_new_day_resets_only_the_slide(skin_map):
     known = condition_on_labels(skin_map, *labelled_presses()[:3])
     after, (mean, cov) = replace(known, labelled=None), begin_day(known).current
     np.testing.assert_array_equal(mean[:2], after.mean[:2])
@@ -113,7 +122,10 @@ def test_new_day_resets_only_the_slide(skin_map):
 
 
 def pokes(skin, shift=None, force_i=3):
-    """Return field changes along the chips' axes at 16 places, with parameters shifted by `shift` (name: spreads)."""
+    """Return the field changes of presses at 16 places, along the axes of the chips.
+
+    `shift` gives, by name of a parameter, its difference from the prior mean in standard deviations.
+    """
     at, tables = np.ix_([4, 9, 14, 19], [4, 9, 14, 19]), skin.tables
     slope_uT = tables.slope_uT[at][:, :, force_i]
     change = sum(by * slope_uT[..., tables.names.index(name)] for name, by in (shift or {}).items())
@@ -126,7 +138,7 @@ PLACES_MM = np.array([[4.0, 4.0], [4.0, 12.0], [12.0, 4.0], [12.0, 12.0], [8.0, 
 
 @pytest.fixture
 def first_day(skin, tmp_path):
-    """Return a no-load reading, and a file with presses and labels of the first day."""
+    """Return a no-load reading, and the file in which the presses and labels of the first day are saved."""
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     pressed_uT = pokes(skin) + rest_uT
     skin.zero(rest_uT).see(pressed_uT)
@@ -143,7 +155,7 @@ def test_presses_of_a_new_day_show_whether_the_slide_has_changed(skin, first_day
     later = load_universal(file, new_day=True).zero(rest_uT, keep=True)
     assert later.slide == Slide(same=False, log_odds=0.0)
     assert later.see(same_uT).slide.same
-    # presses of both days are then used together
+    # If the slide is the same, the presses of both days are used together, as if they had been made on one day.
     together = load_universal(file).zero(rest_uT, keep=True)
     data = replace(together._data, presses_uT=np.concatenate([together._data.presses_uT, together._change(same_uT)]))
     expected = together._begin(data).estimate(changed_uT)
@@ -159,7 +171,7 @@ def test_presses_of_a_new_day_show_whether_the_slide_has_changed(skin, first_day
         for each in (other, together)
     ]
     assert off_mm[0] < off_mm[1]
-    # more presses can change the decision
+    # Presses that are made later on the same day can change the decision.
     assert not later.see(np.concatenate([changed_uT, changed_uT])).slide.same
     assert "earlier days: 1, 15 presses at unknown places, 0 labelled" in repr(later)
 
@@ -173,17 +185,20 @@ def test_order_of_presses_and_labels_of_a_new_day_does_not_matter(skin, first_da
         one.see(read_uT).label(*labels)
         if shift:
             other.label(*labels).see(read_uT[::-1])
-        else:  # if the slide is unchanged, presses are added to those of the first day, so the first call matters
+        # If the slide is unchanged, presses are added to those of the first day. The order of the two calls then
+        # matters, so only the order of the presses is reversed.
+        else:
             other.see(read_uT[::-1]).label(*labels)
         assert one.slide.same == other.slide.same == (not shift)
         assert one.slide.log_odds == pytest.approx(other.slide.log_odds, rel=1e-6)
         for found, value in zip(
             vars(one.estimate(read_uT)).values(), vars(other.estimate(read_uT)).values(), strict=True
         ):
-            np.testing.assert_allclose(found, value, rtol=2e-3)  # sums in single precision
+            # The tolerance is the rounding of sums, which are in single precision.
+            np.testing.assert_allclose(found, value, rtol=2e-3)
 
 
-def test_saved_days_are_loaded_again(skin, first_day, tmp_path):
+def test_calibrations_of_several_days_are_saved_and_loaded(skin, first_day, tmp_path):
     rest_uT, file = first_day
     changed_uT, later_file = pokes(skin, OTHER_SLIDE) + rest_uT, tmp_path / "later.safetensors"
     later = load_universal(file, new_day=True).zero(rest_uT + 5, keep=True).see(changed_uT, even=True)
@@ -197,13 +212,13 @@ def test_saved_days_are_loaded_again(skin, first_day, tmp_path):
         np.testing.assert_allclose(found, value, rtol=1e-5)
     third = load_universal(later_file, new_day=True)
     assert "earlier days: 2" in repr(third)
-    third.save(later_file)  # a day without presses is not kept
+    third.save(later_file)  # A day without presses is not saved.
     assert "earlier days: 2" in repr(load_universal(later_file, new_day=True))
     assert third.zero(rest_uT).presses_n == 0
     assert third.slide is None
 
 
-def test_files_in_the_third_format_are_read_as_one_day(skin, first_day):
+def test_files_in_the_third_format_are_read_as_calibrations_of_one_day(skin, first_day):
     rest_uT, file = first_day
     tensors, header = io.read_tensors(file)
     assert header["format"] == "reskin-skin-4"
@@ -218,14 +233,15 @@ def test_files_in_the_third_format_are_read_as_one_day(skin, first_day):
         np.testing.assert_allclose(found, value, rtol=1e-5)
 
 
-def test_days_are_limited_and_checked(first_day, monkeypatch):
+def test_too_many_or_invalid_days_are_refused(first_day, monkeypatch):
     rest_uT, file = first_day
     with pytest.raises(SchemaError, match="new_day: there is no calibration of an earlier day"):
         load_universal(new_day=True)
     tensors, header = io.read_tensors(file)
     days = {f"earlier_{i}_{name}": values for i in range(4) for name, values in tensors.items()}
     io.write_tensors(file, tensors | days, header)
-    assert "earlier days: 4" in repr(load_universal(file, new_day=True))  # the first of five days is omitted
+    # A new day begins, and the oldest of the five earlier days is dropped, because a calibration has at most five days.
+    assert "earlier days: 4" in repr(load_universal(file, new_day=True))
     more = {f"earlier_4_{name}": values for name, values in tensors.items()}
     io.write_tensors(file, tensors | days | more, header)
     with pytest.raises(SchemaError, match="days must be at most 5 days with 2000 labels; got 6 with 36"):
@@ -241,7 +257,7 @@ def test_days_are_limited_and_checked(first_day, monkeypatch):
     assert later.presses_n == 22
 
 
-def test_full_days_of_a_large_board_fit_a_file(tmp_path):
+def test_file_holds_as_many_days_and_labels_as_are_allowed_for_64_chips(tmp_path):
     channels_n, file = 3 * 64, tmp_path / "full.safetensors"
     full = CalibrationData.at_rest(np.zeros(channels_n))
     pressed_uT = np.ones((FULL_SET_N, channels_n))
@@ -256,14 +272,14 @@ def test_full_days_of_a_large_board_fit_a_file(tmp_path):
 
 
 def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
-    """Correct labels of the first day must not hide wrong axes on the later day."""
+    """On the later day, all labels are mirrored. The correct labels of the first day must not hide this error."""
     rest_uT, file = first_day
     axis_mm = skin.tables.axis_mm[[4, 9, 14, 19]] + 8
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)[[0, 3, 6, 9, 12]]
     for shift in ({}, OTHER_SLIDE):
         pressed_uT = pokes(skin, shift)[[0, 3, 6, 9, 12]] + rest_uT
         later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(pokes(skin, shift) + rest_uT)
-        assert later.label_frame is None  # no label on this day
+        assert later.label_frame is None  # There is no label of the later day yet.
         assert later.label(place_mm, None, pressed_uT).label_frame.log_odds < 0
         assert later.slide.same == (not shift)
         assert later.label(place_mm * [1, -1] + [0, 16], None, pressed_uT).label_frame.log_odds > 5
@@ -273,6 +289,7 @@ def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
 
 @pytest.mark.parametrize("external_uT", [0.0, 30.0])
 def test_turned_skin_has_the_same_estimates_on_a_new_day(skin, tmp_path, external_uT):
+    """All fields of a turned skin have the opposite sign. If the model knows this, its estimates must not change."""
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     changed_uT, found = pokes(skin, OTHER_SLIDE) + rest_uT, []
     for turned in (False, True):
@@ -289,14 +306,16 @@ def test_turned_skin_has_the_same_estimates_on_a_new_day(skin, tmp_path, externa
         np.testing.assert_array_equal(one, other)
 
 
-def test_middle_of_the_skin_is_kept_on_a_new_day(skin, tmp_path):
+def test_middle_of_the_skin_found_on_the_first_day_is_kept_on_a_new_day(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
     found_mm = []
+    # All presses of the first day are on one side of the skin. With `even`, their mean place is nevertheless taken as
+    # the middle of the skin, which shifts the estimates. The new day must keep this shift.
     for even in (
         False,
         True,
-    ):  # Presses on one side only. With `even`, their mean place is taken as the middle of the skin.
+    ):
         skin.zero(rest_uT).see(np.tile(pokes(skin)[[2, 3, 6, 7]] + rest_uT, (3, 1)), even=even).save(file)
         later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(changed_uT)
         assert not later.slide.same
@@ -306,7 +325,7 @@ def test_middle_of_the_skin_is_kept_on_a_new_day(skin, tmp_path):
     np.testing.assert_allclose(later_mm, first_mm, atol=0.5 * np.linalg.norm(first_mm))
 
 
-def test_option_new_day_of_the_commands_begins_a_day(first_day):
+def test_command_line_option_new_day_begins_a_new_day(first_day):
     _, file = first_day
     assert read_models([file], new_day=True).slide == Slide(same=False, log_odds=0.0)
     with pytest.raises(ParamsError, match="--new-day: there is no calibration of an earlier day"):

@@ -1,4 +1,4 @@
-"""Tests of exported estimates against Python: C code that is compiled here, and ONNX files in ONNX Runtime."""
+"""Tests that exported models (C code, which is compiled here, and ONNX files) give the same estimates as Python."""
 
 import re
 import shutil
@@ -21,12 +21,12 @@ from reskin.universal.network import LAYERS_N, WIDTH
 ROOT = Path(__file__).resolve().parents[2]
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic-errors", "-Werror"]
-# The program reads a reading per line, and prints one estimate per line.
+# The example program of docs/robots.md. It reads one reading per line, and prints one estimate per line.
 PROGRAM = re.search(r"```c\n(.*?)```", (ROOT / "docs/robots.md").read_text(encoding="utf-8"), re.DOTALL)[1]
 NAMES = ("place_mm", "sd_mm", "force_N", "sd_log_N", "misfit")
 LABELS_N = {"unlabelled": 0, "few forces, moving, two networks": 3, "labels, turned": 6}
-# Tolerance in mm and in N, for presses and for readings without contact. The model in Python computes in single
-# precision, so its estimates are no more exact than this.
+# Tolerance in mm and in N for readings of presses and for readings without contact. The model in Python computes in
+# single precision, so its estimates are no more exact than this.
 EXACT = 1e-5
 
 
@@ -58,7 +58,7 @@ def coarse(kind: str) -> Universal:
 
 
 def narrow(first: int, width: int = 24) -> dict[str, np.ndarray]:
-    """Return a part of the shipped network: a few units of each layer, beginning with unit `first`."""
+    """Return `width` units of each layer of the shipped network, beginning with unit `first`."""
     weights, kept = dict(whole().networks[0]), np.arange(first, first + width)
     for i in range(LAYERS_N):
         weight, both = weights[f"layer{i}_weight"][kept], np.concatenate([kept, WIDTH + kept])
@@ -81,7 +81,11 @@ def quiet() -> np.ndarray:
 
 
 def presses(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return places, forces and field changes of presses of the central law at places of the lattice."""
+    """Return places, forces and field changes of `n` presses.
+
+    The places are points of the model's lattice. The field changes are those of the mean of the prior, each multiplied
+    by a random factor between 0.8 and 1.2.
+    """
     rng, tables = rng_for(2, "export"), whole().tables
     i, j = rng.integers(6, len(tables.axis_mm) - 6, (2, n))
     q = rng.integers(2, len(tables.force_N), n)
@@ -90,7 +94,7 @@ def presses(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def readings(kind: str) -> dict[str, np.ndarray]:
-    """Return field changes of several kinds, one reading per row."""
+    """Return field changes by kind (presses, light presses, no change, ...), one reading per row."""
     rng = rng_for(3, "export")
     db_uT = presses(200)[2] + 3 * rng.standard_normal((200, 15))
     changes = {"presses": db_uT, "light": 0.02 * db_uT, "none": np.zeros((1, 15)), "strong": 10 * db_uT}
@@ -101,7 +105,7 @@ def readings(kind: str) -> dict[str, np.ndarray]:
 
 @cache
 def run_c(kind: str, *options: str) -> dict[str, np.ndarray]:
-    """Export, compile and run a model for all readings, and for a reading of NaN as the last one."""
+    """Export a model to C, compile it and run it for all readings. The last reading is NaN in all channels."""
     with TemporaryDirectory() as name:
         folder, program = Path(name), Path(name) / "main"
         coarse(kind).export_c(folder / "skin.h", sign(kind) * quiet())
@@ -127,11 +131,11 @@ def run_onnx(file: Path, db_uT: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def check_equal(model: Universal, found: dict[str, np.ndarray], changes: dict[str, np.ndarray]) -> None:
-    """Compare exported estimates with Python's.
+    """Check that exported estimates equal those of the model in Python.
 
-    Python sums chi^2 in single precision, so rounding errors grow with chi^2. These errors matter only if two distant
-    hypotheses have large, nearly equal chi^2, which can happen for readings that are not presses. For such readings, 90
-    % of the estimates must agree to the usual tolerance, and the others to a larger one.
+    Python sums chi^2 in single precision, so its rounding errors grow with chi^2. They change an estimate only if two
+    distant hypotheses have large and nearly equal chi^2, which can happen for readings that are not presses. For such
+    readings, 90 % of the estimates must agree to the usual tolerance, and the others to a larger tolerance.
     """
     expected = model.estimate(np.concatenate(list(changes.values())) + model.noload_uT)
     kind_of = np.repeat(list(changes), [len(rows) for rows in changes.values()])
@@ -157,8 +161,9 @@ def test_c_code_equals_python(kind):
     change_uT = magnitudes_uT(db_uT, suppressor)
     np.testing.assert_allclose(found["change_uT"], change_uT, rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(found["contact"], change_uT > contact_threshold_uT(quiet_uT, suppressor))
-    assert found["contact"][:200].all()  # presses
-    assert not found["contact"][[400, -1]].any()  # no change, NaN
+    assert found["contact"][:200].all()  # The first 200 readings are presses.
+    # Reading 400 has no field change, and the last reading is NaN. Neither is a contact.
+    assert not found["contact"][[400, -1]].any()
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
@@ -175,12 +180,13 @@ def test_onnx_model_equals_python(tmp_path, kind):
     found = run_onnx(tmp_path / "skin.onnx", with_nan(changes))
     check_equal(model, found, changes)
     assert len(run_onnx(tmp_path / "skin.onnx", np.zeros((0, 15)))["place_mm"]) == 0
-    if COMPILER is not None:  # both compute the same function in double precision
+    # The C code and the ONNX model compute the same function in double precision, so they agree up to rounding.
+    if COMPILER is not None:
         for name, values in run_c(kind).items():
             np.testing.assert_allclose(found[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-def test_shipped_model_is_exported_whole(tmp_path):
+def test_onnx_export_of_the_whole_shipped_model_equals_python(tmp_path):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     model, changes = load_universal().zero(quiet()), {"presses": presses(50)[2]}
     model.export_onnx(tmp_path / "skin.onnx")

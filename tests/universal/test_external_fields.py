@@ -1,4 +1,4 @@
-"""Tests of the universal model's option for external fields, on pokes of its nominal skin and of a simulated one."""
+"""Tests of the option `external_uT` of the universal model, which allows for magnetic fields from outside the skin."""
 
 import numpy as np
 import pytest
@@ -14,30 +14,32 @@ from tests.universal.test_shipped import PLACES_MM, pokes
 
 UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
 
-FORCE_I = 4  # index of the pokes' force; norms: 220 to 410 uT (their field changes), 224 uT (uniform fields)
+# Index of the force of all pokes. Their field changes then have norms of 220 to 410 uT; the norm of each uniform field,
+# over all channels, is 224 uT.
+FORCE_I = 4
 
 
 def nominal(external_uT: float) -> tuple[Universal, np.ndarray]:
-    """Return the model, zeroed on its nominal skin, and readings of four pokes on that skin."""
+    """Return the model after its no-load reading on its nominal skin, and the readings of four pokes on this skin."""
     model = load_universal(external_uT=external_uT)
     rest_uT = to_chips(model.tables.rest_uT[None])
     return model.zero(rest_uT), pokes(model, FORCE_I) + rest_uT
 
 
 def moved_mm(model: Universal, b_uT: np.ndarray) -> np.ndarray:
-    """Return how far each of three uniform fields moves the estimates of pokes: [field, poke]."""
+    """Return the distances in mm by which uniform fields move the estimated places, as an array [field, poke]."""
     before_mm = model.estimate(b_uT).place_mm
     after_mm = np.stack([model.estimate(b_uT + uniform_uT).place_mm for uniform_uT in UNIFORM_uT])
     return np.linalg.norm(after_mm - before_mm, axis=2)
 
 
-def test_uniform_field_of_100_uT_does_not_move_estimates_with_the_option():
+def test_with_the_option_a_uniform_field_of_100_uT_does_not_move_estimates():
     with_mm, without_mm = moved_mm(*nominal(100.0)), moved_mm(*nominal(0.0))
     assert with_mm.max() < 0.2
     assert without_mm.max() > 1.0
 
 
-def test_estimates_on_a_moving_simulated_skin_are_closer_with_the_option():
+def test_with_the_option_estimates_in_changing_fields_are_more_accurate():
     places = np.column_stack([np.random.default_rng(0).uniform(3, 13, (40, 2)), np.full(40, 1.0)])
     noload_uT, b_uT, _ = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     uniform_uT = 100 * np.random.default_rng(1).standard_normal((40, 3))
@@ -48,15 +50,16 @@ def test_estimates_on_a_moving_simulated_skin_are_closer_with_the_option():
         return float(np.median(np.linalg.norm(found[:, :2] - places[:, :2], axis=1)))
 
     assert error_mm(100.0, moving_uT) < error_mm(0.0, moving_uT)
-    assert error_mm(0.0, b_uT) < error_mm(100.0, b_uT)  # without external fields, the option costs accuracy
+    # If there are no external fields, the option makes estimates less accurate, because it discards information.
+    assert error_mm(0.0, b_uT) < error_mm(100.0, b_uT)
 
 
-def test_place_uncertainty_grows_with_the_expected_external_field():
+def test_place_uncertainty_grows_with_the_assumed_external_field():
     sd_mm = [model.estimate(b_uT).sd_mm.mean() for model, b_uT in map(nominal, (0.0, 30.0, 140.0))]
     assert sd_mm[0] < sd_mm[1] < sd_mm[2]
 
 
-def test_likelihood_power_falls_with_the_expected_field_but_less_with_labels():
+def test_labels_reduce_the_effect_of_external_fields_on_the_likelihood_power():
     powers = {}
     for external_uT in (0.0, 30.0, 140.0):
         model, b_uT = nominal(external_uT)
@@ -75,11 +78,12 @@ def test_estimated_external_field_is_close_to_the_true_one():
     cleaned_uT = [
         evaluator.without_external(read_uT, evaluator.evaluate(read_uT)) for read_uT in (db_uT, db_uT + uniform_uT)
     ]
-    # Of the 224 uT (norm), less than a tenth remains, because prior and noise share the rest.
+    # Less than a tenth of the 224 uT remains. The estimate cannot be exact, because a part of the field is attributed
+    # to noise.
     assert np.linalg.norm(cleaned_uT[1] - cleaned_uT[0], axis=1).max() < 0.1 * np.linalg.norm(uniform_uT)
 
 
-def test_without_the_option_the_model_is_unchanged():
+def test_model_without_the_option_makes_no_allowance_for_external_fields():
     skin = new_map(make_tables())
     db_uT = np.random.default_rng(0).normal(0, 300, (3, 15))
     assert skin.evaluator.without_external(db_uT, skin.evaluator.evaluate(db_uT)) is db_uT
@@ -89,6 +93,7 @@ def test_without_the_option_the_model_is_unchanged():
 
 
 def test_calibration_file_can_be_used_with_the_option(tmp_path):
+    """The calibration is saved without the option, and loaded with it."""
     model, b_uT = nominal(0.0)
     model.see(b_uT).save(tmp_path / "skin.safetensors")
     loaded = load_universal(tmp_path / "skin.safetensors", external_uT=100.0)
@@ -98,20 +103,21 @@ def test_calibration_file_can_be_used_with_the_option(tmp_path):
 
 
 @pytest.mark.parametrize("wrong", [-1.0, np.nan, np.inf, EXTERNAL_MAX_uT + 1])
-def test_invalid_size_of_external_fields_is_an_error(wrong):
+def test_external_field_of_invalid_size_is_refused(wrong):
     with pytest.raises(SchemaError, match=r"external_uT must be 0 to 1,000 uT"):
         load_universal(external_uT=wrong)
 
 
-def test_suppressor_is_for_fields_along_the_axes_of_the_chips():
+def test_suppressor_removes_uniform_fields_given_along_the_axes_of_the_chips():
     assert load_universal().suppressor(4.0) is None
     shrunk_uT = UNIFORM_uT @ load_universal(external_uT=100.0).suppressor(4.0)
-    # Field and noise are whitened: fields of one standard deviation become as long as noise along three axes.
+    # The suppressor whitens the sum of field and noise. A field of one standard deviation becomes at most about as long
+    # as the noise of one chip along its three axes.
     assert np.linalg.norm(shrunk_uT, axis=1).max() < 2 * 4.0
 
 
 def test_single_precision_suffices_for_the_largest_field():
-    """chi2 for the largest field equals that in double precision, within 0.1 or 1 %."""
+    """chi^2 for the largest external field equals chi^2 in double precision, up to 0.1 or 1 %."""
     model, b_uT = nominal(EXTERNAL_MAX_uT)
     db_uT, skin = to_board(b_uT - model.noload_uT), model.skin
     chi2, h = skin.evaluator.evaluate(db_uT).chi2, slice(None, None, 97)

@@ -1,4 +1,4 @@
-"""Tests of the calibration of forces: a Bayesian line, its intervals, and the selection of the estimator."""
+"""Tests of the calibration of forces: the Bayesian regression line, its intervals, and the choice of the estimator."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def draw_log_forces(labels_n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return log_N, line + SCATTER_SD * rng.standard_normal(labels_n)
 
 
-def test_no_label_leaves_forces_unchanged():
+def test_without_labels_forces_are_not_corrected():
     log_N = np.log([0.1, 2.0, 9.0])
     calibrated, sd_log_N = prior_line().apply(log_N)
     np.testing.assert_allclose(calibrated, log_N)
@@ -44,7 +44,8 @@ def test_no_label_leaves_forces_unchanged():
 
 
 @pytest.mark.parametrize("labels_n", [1, 4])
-def test_line_equals_the_regression_of_a_gaussian_process(labels_n):
+def test_calibration_line_equals_gaussian_process_regression(labels_n):
+    """A line with normal priors on intercept and slope is a Gaussian process with a linear kernel."""
     log_N, true_log_N = draw_log_forces(labels_n, 1)
     line = fit_line([log_N, log_N], true_log_N)
     query_log_N = np.log([0.3, 1.0, 5.0])
@@ -58,7 +59,7 @@ def test_line_equals_the_regression_of_a_gaussian_process(labels_n):
     np.testing.assert_allclose(sd_log_N, np.sqrt(var + line.scatter_var))
 
 
-def test_intervals_of_the_line_are_calibrated():
+def test_90_percent_intervals_of_the_line_contain_90_percent_of_forces():
     inside = []
     for seed in range(200):
         log_N, true_log_N = draw_log_forces(12, seed)
@@ -69,7 +70,7 @@ def test_intervals_of_the_line_are_calibrated():
 
 
 @pytest.mark.parametrize(("noise", "expected"), [((0.1, 1.0), "combined"), ((1.0, 0.1), "map"), ((0.1, 0.1), "map")])
-def test_best_estimator_is_selected(noise, expected):
+def test_estimator_with_the_smaller_residuals_is_selected(noise, expected):
     log_N, true_log_N = draw_log_forces(40, 2)
     rng = rng_for(3, "force line")
     by_estimator = [log_N + sd * rng.standard_normal(40) for sd in noise]
@@ -80,9 +81,10 @@ def test_best_estimator_is_selected(noise, expected):
 
 @pytest.fixture(scope="module")
 def calibrated() -> list[tuple]:
-    """Calibrate the shipped model to simulated skins with large law errors; return (labels, log errors, sd) per skin.
+    """Calibrate the shipped model to simulated skins whose errors of the law are large.
 
-    Each skin is calibrated with 0, 1 and 20 labels.
+    Each skin is calibrated with 0, 1 and 20 labels. Returns, for each skin and number of labels: this number, the
+    errors of the log forces, and their estimated standard deviations.
     """
     prior, model, found = read_inputs().prior, load_universal(), []
     skins = draw_prior_skins(prior, SKINS_N, 5, "force", law_error(1.5))
@@ -103,31 +105,33 @@ def calibrated() -> list[tuple]:
 @pytest.mark.parametrize("labels_n", [0, 1, LABELS_N])
 def test_force_intervals_cover_simulated_skins(calibrated, labels_n):
     inside = [np.abs(error) < NORMAL_90 * sd for n, error, sd in calibrated if n == labels_n]
-    assert 0.8 < np.concatenate(inside).mean() <= 1  # the coverage would be 90 % if errors were as large as assumed
+    # The expected coverage is 90 % if errors are as large as the model assumes, but here they are drawn larger.
+    assert 0.8 < np.concatenate(inside).mean() <= 1
 
 
-def test_labels_improve_forces(calibrated):
+def test_labels_reduce_force_errors(calibrated):
     rms = {n: np.sqrt(np.mean([np.mean(error**2) for m, error, _ in calibrated if m == n])) for n in (0, LABELS_N)}
     assert rms[LABELS_N] < 0.9 * rms[0]
 
 
-def test_scatter_is_learnt_from_residuals():
+def test_scatter_is_estimated_from_residuals():
     log_N = np.log(np.geomspace(0.5, 8, 200))
     for scatter_sd in (0.1, 1.0):
         residual = scatter_sd * rng_for(4, "force line").standard_normal(200)
         line = prior_line().condition(log_N, log_N + residual)
         expected = (SCATTER_LABELS_N * SCATTER_SD**2 + 200 * scatter_sd**2) / (SCATTER_LABELS_N + 200)
-        assert line.scatter_var == pytest.approx(expected, rel=0.15)  # 200 residuals: 10 % of their variance
+        # Tolerance: the variance of 200 residuals has a standard error of 10 %.
+        assert line.scatter_var == pytest.approx(expected, rel=0.15)
 
 
-def test_line_becomes_constant_if_estimates_are_noise():
+def test_calibrated_force_is_constant_if_estimates_are_only_noise():
     rng = rng_for(5, "force line")
     true_log_N = np.log(rng.uniform(1.5, 2.5, 40))
     line = fit_line(list(3 * rng.standard_normal((2, 40))), true_log_N)
     assert abs(line.mean[1]) < 0.1
 
 
-def test_presses_with_unknown_force_do_not_calibrate_forces():
+def test_labels_without_a_force_do_not_calibrate_forces():
     model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     presses_uT = to_chips(model.tables.mean_uT[11:13, 11, 4])
@@ -135,12 +139,14 @@ def test_presses_with_unknown_force_do_not_calibrate_forces():
     np.testing.assert_array_equal(model.line.mean, prior_line().mean)
     model.label([[8.4, 8.4]], [4.0], rest_uT + presses_uT[:1], keep=True)
     assert model.line.mean[0] != 0
-    model.label([[8.4, 8.4]], [0.05], rest_uT + presses_uT[:1])  # calibrated forces are then far below the estimate
-    model.label([[9.2, 8.4]], None, rest_uT + 1e-2 * presses_uT[1:] + 3.0, keep=True)  # a light press is accepted
+    # A label with this small force lowers all calibrated forces, far below the uncalibrated estimate.
+    model.label([[8.4, 8.4]], [0.05], rest_uT + presses_uT[:1])
+    # Even then, a light press is accepted as a label.
+    model.label([[9.2, 8.4]], None, rest_uT + 1e-2 * presses_uT[1:] + 3.0, keep=True)
 
 
 @pytest.mark.parametrize("labels_n", [1, 5, 12])
-def test_held_out_labels_do_not_affect_the_model(labels_n):
+def test_held_out_labels_do_not_affect_the_model_that_predicts_them(labels_n):
     model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     place_i = rng_for(6, "force line").integers(4, 18, (labels_n, 2))
@@ -148,7 +154,7 @@ def test_held_out_labels_do_not_affect_the_model(labels_n):
     place_mm, force_N = model.tables.axis_mm[place_i] + CENTRE_MM, np.full(labels_n, 3.0)
     model.zero(rest_uT).label(place_mm, force_N, presses_uT)
     before = model.line
-    wrong_N = np.where(np.arange(labels_n) == 0, 8.0, 3.0)  # another force of the first label
+    wrong_N = np.where(np.arange(labels_n) == 0, 8.0, 3.0)  # The force of the first label is changed to 8 N.
     model.label(place_mm, wrong_N, presses_uT)
     (fold, *_) = model._held_out()
     same_as_without = load_universal().zero(rest_uT)
@@ -164,6 +170,7 @@ def test_held_out_labels_do_not_affect_the_model(labels_n):
 
 
 def test_known_weight_corrects_near_forces_by_the_map_and_far_forces_by_the_line():
+    """The map (the model of the fields of a skin) is corrected near the label only, the calibration line everywhere."""
     model, weight_N = load_universal(), 4.0
     rest_uT = to_chips(model.tables.rest_uT[None])
     weight_uT, far_uT = (rest_uT + to_chips(model.tables.mean_uT[i : i + 1, i, 5]) for i in (11, 2))
@@ -174,4 +181,5 @@ def test_known_weight_corrects_near_forces_by_the_map_and_far_forces_by_the_line
     cov = INTERCEPT_SD**2 + SLOPE_SD**2 * np.array([off**2, off * (np.log(before_N[1]) - LOG_CENTRE_N)])
     gain = cov / (INTERCEPT_SD**2 + (SLOPE_SD * off) ** 2 + model.line.scatter_var)
     moved = np.log(after_N[1] / before_N[1]) / np.log(weight_N / before_N[0])
-    assert moved == pytest.approx(gain[1], rel=0.05)  # at a press 12 mm away, only the line uses the known weight
+    # The second press is 12 mm away from the label, where the map is not corrected. Only the line changes its force.
+    assert moved == pytest.approx(gain[1], rel=0.05)

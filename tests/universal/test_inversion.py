@@ -1,4 +1,7 @@
-"""Tests of the inversion of the law: it recovers presses and parameters, and other readings have large residuals."""
+"""Tests of the inversion of the law (the formula that gives the field change for a place and a force).
+
+The inversion recovers presses and parameters, and readings that are not presses have large residuals.
+"""
 
 from dataclasses import asdict, replace
 
@@ -20,7 +23,8 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 @pytest.fixture(autouse=True)
 def small_lattice(monkeypatch):
-    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # only places within 2.8 mm, for speed
+    # For speed, the search covers only places within 2.8 mm of the middle.
+    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])
 
 
 def fields_uT() -> np.ndarray:
@@ -29,14 +33,14 @@ def fields_uT() -> np.ndarray:
 
 def test_search_recovers_places_and_forces():
     found = search(chart(TRUE, COARSE_SETUP), fields_uT())
-    np.testing.assert_allclose(
-        found.place_mm, PLACE_MM, atol=0.2
-    )  # tolerance: a quarter of the pitch, because the search takes a single step with the slopes at the lattice point
+    # The tolerance is a quarter of the lattice's pitch. The search takes a single step from the nearest lattice point,
+    # with the slopes at this point, so it is not exact between lattice points.
+    np.testing.assert_allclose(found.place_mm, PLACE_MM, atol=0.2)
     np.testing.assert_allclose(np.log(found.force_N), np.log(FORCE_N), atol=0.2)
     assert found.residual.max() < 0.1
 
 
-def test_residuals_are_zero_on_the_lattice_only():
+def test_residuals_of_lattice_points_are_zero():
     known = chart(TRUE, COARSE_SETUP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
@@ -49,13 +53,14 @@ def test_slopes_equal_finite_differences():
     presses = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
     values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], presses.ravel()])
     columns = two.slopes(values)
-    for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter of the law, x of the first press, y of the second
+    # i is the index of a parameter of the law, then of x of the first press, then of y of the second press.
+    for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):
         change = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
         expected = (two.residuals(values + change) - two.residuals(values)) / change.max()
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_unlabelled_presses_determine_parameters(monkeypatch):
+def test_unlabelled_presses_determine_the_parameters_of_the_law(monkeypatch):
     monkeypatch.setattr(inversion, "ROUNDS_N", 1)
     rest_uT, presses_uT = at_rest_uT(TRUE, COARSE_SETUP).ravel(), fields_uT()[::2]
     found = fit_unlabelled(presses_uT, rest_uT, COARSE_SETUP)

@@ -12,7 +12,11 @@ FIRST_mm, FIRST_SD_mm, LOG_N = np.array([1.0, -2.0]), 1.2, 0.8
 
 
 def total() -> np.ndarray:
-    """Return deviances [4, hypotheses] of a Gaussian, a sharper and noisy Gaussian, a noisy one, and a flat one."""
+    """Return the deviances of all hypotheses for four readings, as an array [4, hypotheses].
+
+    In this order, the likelihoods are: a Gaussian, a noisy Gaussian that is sharper, a noisy Gaussian, and a nearly
+    flat Gaussian.
+    """
     of_place = ((AT.place_mm - FIRST_mm) ** 2).sum(axis=1) / FIRST_SD_mm**2
     of_force = (AT.log_N - LOG_N) ** 2 / 0.5
     of_all = (of_place[:, None] + of_force).ravel() + 300.0
@@ -21,7 +25,7 @@ def total() -> np.ndarray:
 
 
 def with_best(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the deviances and the most likely hypothesis of each row."""
+    """Return the deviances, and the index of the most likely hypothesis in each row."""
     return total, total.argmin(axis=1)
 
 
@@ -36,17 +40,17 @@ def spread(of_place: np.ndarray, about_mm: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_means_are_sums_over_all_hypotheses(power):
+def test_means_equal_sums_over_all_hypotheses(power):
     place_mm, sd_mm, force_N = means(*with_best(total()), AT, power)
     of_place = probabilities(power).sum(axis=2)
-    # hypotheses below e^-25 of the maximum are omitted
+    # The tolerance covers hypotheses below e^-25 of the maximum, which the compiled loop omits.
     np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)
     np.testing.assert_allclose(sd_mm, spread(of_place, place_mm), atol=1e-6)
     np.testing.assert_allclose(np.log(force_N), probabilities(power).sum(axis=1) @ AT.log_N, atol=1e-6)
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_product_equals_marginal_distribution_times_normal_distributions(power):
+def test_product_equals_numpy_product_of_map_and_normal_distributions(power):
     rng = rng_for(1, "answers")
     normals = np.column_stack(
         [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
@@ -64,7 +68,7 @@ def test_product_equals_marginal_distribution_times_normal_distributions(power):
     np.testing.assert_allclose(map_log_N, of_map / of_map.sum(axis=1, keepdims=True) @ AT.log_N, atol=1e-6)
 
 
-def test_product_of_two_gaussians():
+def test_product_of_two_gaussians_has_the_closed_form():
     second_mm, second_sd = np.array([2.5, 0.0]), np.array([1.0, 0.8])
     second = np.concatenate([second_mm, second_sd, np.ones(2)])[None]
     place_mm, sd_mm, *_ = products(*with_best(total()[:1]), AT, second, 1.0, 1.0, 1.0)
@@ -73,7 +77,8 @@ def test_product_of_two_gaussians():
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
 
 
-def test_excluded_place_keeps_the_minimum_probability():
+def test_place_that_the_map_excludes_can_still_be_estimated_by_the_network():
+    """Each place keeps a minimum probability, so a network that is certain of another place determines the estimate."""
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0
     normals = np.array([[8.0, 8.0, 0.1, 0.1, 1.0, 1.0]])
@@ -82,7 +87,7 @@ def test_excluded_place_keeps_the_minimum_probability():
     assert np.isfinite(sd_mm).all()
 
 
-def test_nan_gives_nan():
+def test_nan_deviances_give_nan_estimates():
     none = np.full((1, total().shape[1]), np.nan, np.float32)
     normals = np.ones((1, 6))
     for found in (means(*with_best(none), AT, 1.0), products(*with_best(none), AT, normals, 1.0, 1.0, 1.0)):
@@ -114,6 +119,5 @@ def test_chi2_is_the_mahalanobis_distance(h):
     solved = np.stack([np.linalg.solve(cov[j], off[i, j]) for i, j in enumerate(which)])
     np.testing.assert_allclose(gaussians.solve(read, which), solved, rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(chi2, np.einsum("nhi,hij,nhj->nh", off, np.linalg.inv(cov), off), rtol=1e-4, atol=0.01)
-    np.testing.assert_allclose(
-        deviance - chi2, np.tile(np.linalg.slogdet(cov)[1], (5, 1)), atol=1e-3
-    )  # tolerance of single precision
+    # The tolerance is that of single precision.
+    np.testing.assert_allclose(deviance - chi2, np.tile(np.linalg.slogdet(cov)[1], (5, 1)), atol=1e-3)

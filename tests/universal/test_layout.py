@@ -1,4 +1,4 @@
-"""Tests of the layouts of boards: those of the project, and the messages for wrong files."""
+"""Tests of board layouts: the layouts in the project are valid, and wrong files are refused with a message."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from reskin.universal.population import DEFAULT_FORCES, draw_places, grid
 TEXT = (FOLDER / "reskin.yaml").read_text()
 
 
-def test_layout_of_the_paper_equals_the_constants_of_the_shipped_model():
+def test_layout_of_the_papers_board_equals_the_constants_of_the_shipped_model():
     layout = paper_layout()
     setup = layout.setup()
     rigid = BoardDesign.model_validate_json(BoardDesign(
@@ -38,11 +38,11 @@ def test_layouts_of_the_project_can_be_simulated(name):
     places_mm[1] = 0.9 * np.array(layout.half_mm) / 1.5
     db_uT = law.simulate_uT(layout.law, layout.setup(), places_mm, np.array(layout.force_N))
     assert db_uT.shape == (2, len(layout.chips), 3)
-    # A press at the largest force changes the field by more than the noise, and by less than the range of a chip.
+    # A press with the largest force must change the field by more than the noise, and by less than a chip's range.
     assert 10 < np.abs(db_uT[1]).max() < 50_000
 
 
-def test_areas_are_scaled_and_rectangles_keep_their_corners():
+def test_areas_are_scaled_and_only_octagons_lose_their_corners():
     wide = law.Area(12.0, 6.0)
     np.testing.assert_array_equal(grid(wide), grid() * [1.5, 0.75])
     inner_mm = np.random.default_rng(0).uniform(-1, 1, (500, 2)) * [12.0, 6.0]
@@ -56,7 +56,7 @@ def test_areas_are_scaled_and_rectangles_keep_their_corners():
     assert len(lattice_mm(law.Area(40.0, 40.0))) == 28
 
 
-def test_cells_of_larger_skins_are_larger():
+def test_cells_of_the_quadrature_are_larger_on_larger_skins():
     large = TEXT.replace("size_mm: [20.0, 20.0]", "size_mm: [20.0, 40.0]")
     assert large != TEXT
     assert read_text(large).setup().rule == Quadrature(1.6e-3, 5)
@@ -101,7 +101,7 @@ def test_wrong_layouts_are_refused(old, new, message, tmp_path):
         read_layout(file)
 
 
-def test_missing_layouts_are_refused(tmp_path):
+def test_missing_layout_files_are_reported(tmp_path):
     with pytest.raises(ParamsError, match="none.yaml: file not found"):
         read_layout(tmp_path / "none.yaml")
     with pytest.raises(ParamsError, match="reskim: not a YAML file, .*anyskin, eflesh, reskin.*Did you mean reskin"):

@@ -1,4 +1,4 @@
-"""Tests of the network, which is conditioned on a set of presses: any order, any number including none."""
+"""Tests of the network, whose estimates depend on a set of presses: any number of presses (also none), in any order."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
 
 def test_order_of_presses_does_not_matter():
     forward, backward = predict([ONE], READ_uT, REST_uT, PRESSES_uT), predict([ONE], READ_uT, REST_uT, PRESSES_uT[::-1])
-    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # sums in another order
+    # The tolerance is rounding, because sums are computed in another order.
+    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)
     other = predict([ONE], READ_uT, REST_uT, 2 * PRESSES_uT)
     assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
@@ -31,14 +32,15 @@ def test_masked_press_is_ignored():
     assert np.isfinite(none.place_mm).all()
 
 
-def test_inputs_are_direction_and_length():
+def test_inputs_are_the_direction_and_the_log_length_of_field_changes():
+    """Fields that are five times as large have the same direction, and a log length that is larger by log(5)."""
     rest = torch.zeros(1, 15)
     near, far = (inputs(torch.from_numpy(size * READ_uT[None].astype(np.float32)), rest) for size in (1.0, 5.0))
     torch.testing.assert_close(near[..., :15], far[..., :15])
     torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
 
 
-def test_spread_of_networks_adds_to_the_variance():
+def test_disagreement_of_networks_adds_to_the_variance():
     one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
     both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
     np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
@@ -65,5 +67,6 @@ def test_numpy_equals_pytorch(presses_n):
         mean, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(presses, rest, kept)))
     found_mean = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
     found_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
-    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # sums in another order
+    # The tolerance is rounding, because sums are computed in another order.
+    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(np.log(found_sd), log_sd, rtol=1e-5, atol=1e-5)

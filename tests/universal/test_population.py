@@ -1,4 +1,4 @@
-"""Tests that simulated skins are reproducible and follow the prior."""
+"""Tests that random simulated skins are reproducible, and that their parameters follow the prior."""
 
 from dataclasses import fields, replace
 
@@ -27,7 +27,7 @@ COARSE = replace(SETUP, rule=COARSE_RULE)
 
 
 def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
-    # a single thickness, because tables for each thickness and tip take seconds
+    # Only one thickness and one tip are simulated, because the tables for each combination take seconds.
     monkeypatch.setattr(population, "THICKNESSES", {1.0: 1.0})
     monkeypatch.setattr(population, "TIPS", {1.0: 1.0})
     one, two = (draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
@@ -39,7 +39,7 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     weighed = draw_population(
         NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(DEFAULT_FORCES, weight_N=5.0)
     )
-    # an additional press with a known weight does not change the others
+    # If a press with a known weight is added, the other presses stay the same.
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
@@ -48,7 +48,8 @@ def test_parameters_have_the_given_spreads_and_bounds():
     rng = rng_for(1, "laws")
     laws = [draw_law(NOMINAL, NOMINAL_SPREADS, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):
-        # Tolerance: the standard error of a standard deviation of 300 draws is 4 %.
+        # The tolerance of 16 % is four standard errors: the standard deviation of 300 draws has a standard error of 4
+        # %.
         assert np.std([getattr(law, name) for law in laws]) == pytest.approx(NOMINAL_SPREADS[name], rel=0.16)
     for name, least in LEAST.items():
         assert min(getattr(law, name) for law in laws) >= least
@@ -60,12 +61,13 @@ def test_presses_cover_the_grid_and_stay_on_the_skin():
     place_mm = draw_places(rng_for(2, "places"))
     assert place_mm.shape == (2 * PLACES_N, 2)
     assert inside(place_mm).all()
-    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3  # six standard deviations of the random offset
+    # Places are points of the grid with a random offset. The limit is six standard deviations of this offset.
+    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3
     assert len(np.unique(grid(), axis=0)) == PLACES_N
     assert inside(grid()).all()
 
 
-def test_filler_scales_and_shifts_fields(monkeypatch):
+def test_random_density_of_filler_scales_fields_and_varies_along_the_skin(monkeypatch):
     place_mm, force_N = np.array([[1.0, 2.0]]), np.array([3.0])
     twice = replace(COARSE.rest, moments_A_m2=2 * COARSE.rest.moments_A_m2)
     plain_uT = simulate_uT(NOMINAL, COARSE, place_mm, force_N)
@@ -73,11 +75,12 @@ def test_filler_scales_and_shifts_fields(monkeypatch):
     np.testing.assert_allclose(at_rest_uT(NOMINAL, COARSE, twice), 2 * at_rest_uT(NOMINAL, COARSE), rtol=1e-9)
     filled = fill(COARSE.rest, rng_for(3, "filler"))
     part = np.linalg.norm(filled.moments_A_m2, axis=1) / np.linalg.norm(COARSE.rest.moments_A_m2, axis=1)
-    # 0.15 is the average over many skins; a single skin is only about six correlation lengths wide
+    # The standard deviation is 0.15 on the average over many skins. A single skin is only about six correlation lengths
+    # wide, so its standard deviation can be far from the average.
     assert 0.05 < np.std(np.log(part)) < 0.3
 
 
-def test_chips_read_nearly_the_true_field():
+def test_errors_of_chip_gains_are_small_with_the_given_spread():
     gain = draw_gains(2000, rng_for(4, "gains"))
     np.testing.assert_allclose(gain.mean(axis=0), np.eye(3), atol=0.005)
     turn = np.deg2rad(population.CHIP_TURN_DEG)

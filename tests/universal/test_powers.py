@@ -1,4 +1,7 @@
-"""Tests of likelihood powers and of the variance inflation from cross-validated labels."""
+"""Tests of likelihood powers and of the variance inflation from cross-validated labels.
+
+A likelihood is raised to a power below 1 if the model's errors are correlated, so that intervals are not too narrow.
+"""
 
 import numpy as np
 import pytest
@@ -29,13 +32,13 @@ def test_every_label_is_held_out_once(labels_n):
     assert all(len(held_out) for _, held_out in parts)
 
 
-def test_inflation_of_normal_and_doubled_residuals():
+def test_variance_inflation_of_normal_residuals_is_one_and_of_doubled_residuals_four():
     off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
     assert variance_inflation(off) == pytest.approx(1, abs=0.01)
     assert variance_inflation(2 * off) == pytest.approx(4, rel=0.01)
 
 
-def test_inflation_from_few_residuals_is_shrunk_to_the_prior():
+def test_variance_inflation_from_few_residuals_is_shrunk_to_one():
     assert variance_inflation(np.zeros((0, 2))) == 1
     none_off = variance_inflation(np.zeros((5, 2)))
     assert none_off == pytest.approx((PRIOR_N / (PRIOR_N + 10)) ** 2)
@@ -48,7 +51,7 @@ def test_inflation_from_few_residuals_is_shrunk_to_the_prior():
     )
 
 
-def test_each_likelihood_power_has_its_variance_inflation():
+def test_variance_inflation_is_estimated_for_each_likelihood_power():
     at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
     parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
     assert variance_inflations(2, parts) == pytest.approx(
@@ -62,7 +65,7 @@ def test_likelihood_powers_are_at_most_one():
     assert [lower_by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
 
 
-def test_powers_are_interpolated_between_label_counts():
+def test_likelihood_powers_are_interpolated_between_numbers_of_labels():
     powers = LikelihoodPowers({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
     assert [powers.power_for(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
     assert [powers.power_for(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])

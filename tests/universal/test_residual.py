@@ -1,4 +1,7 @@
-"""Tests of the residual model, which predicts the part of the law's errors that is common to all boards."""
+"""Tests of the residual model, which predicts the part of the law's errors that is common to all boards.
+
+The law is the formula that gives the field change for a place and a force.
+"""
 
 import numpy as np
 import pytest
@@ -6,21 +9,22 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal.map import NOISE, SHARED, fit_residual, kernel, no_residual
 
-APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])  # too far apart to correlate
+# The places are so far apart that errors at them are not correlated.
+APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])
 FORCE_N = np.ones(3)
 ERRORS = rng_for(0, "missed").standard_normal((3, 15))
 
 
 @pytest.mark.parametrize("boards_n", [1, 2, 5])
-def test_equal_errors_predict_their_shared_part(boards_n):
+def test_prediction_from_boards_with_equal_errors_is_the_shared_part(boards_n):
     found = fit_residual([APART_MM] * boards_n, [FORCE_N] * boards_n, [ERRORS] * boards_n).at(APART_MM, np.zeros(3))
-    # Expected: Gaussian conditioning on n equal values with variance 1 + noise. All covariances are SHARED, including
-    # those with the new board.
+    # Expected: the conditional mean of a normal variable, given n equal values. Each value has the variance 1 + NOISE.
+    # The covariance of two boards is SHARED, and so is the covariance of each board with the new board.
     part = boards_n * SHARED / (1 + NOISE + (boards_n - 1) * SHARED)
     np.testing.assert_allclose(found, part * ERRORS, rtol=1e-9)
 
 
-def test_no_error_without_presses_or_boards():
+def test_predicted_error_is_zero_far_from_presses_and_without_boards():
     far_mm = np.array([[100.0, 100.0]])
     assert np.abs(fit_residual([APART_MM], [FORCE_N], [ERRORS]).at(far_mm, np.zeros(1))).max() < 1e-9
     assert (no_residual(15).at(far_mm, np.zeros(1)) == 0).all()

@@ -39,7 +39,10 @@ def skin() -> Universal:
 
 
 def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
-    """Return readings of the nominal skin at the lattice points nearest to `PLACES_MM`, in the axes of the chips."""
+    """Return field changes of presses on the nominal skin at the lattice points nearest to `PLACES_MM`.
+
+    They are along the axes of the chips.
+    """
     tables = skin.tables
     lattice_i = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
     return to_chips(tables.mean_uT[lattice_i[:, 0], lattice_i[:, 1], force_i])
@@ -53,7 +56,7 @@ def test_error_on_the_nominal_skin_is_at_most_one_lattice_step(skin):
     assert ((found[:, 2] > tables.force_N[1]) & (found[:, 2] < tables.force_N[5])).all()
 
 
-def test_labels_move_estimates_towards_them(skin):
+def test_labels_move_estimates_towards_the_labelled_places(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, shifted_mm = pokes(skin) + rest_uT, PLACES_MM + (0.8, -0.5)
     before = skin.zero(rest_uT).predict(read_uT)
@@ -61,7 +64,7 @@ def test_labels_move_estimates_towards_them(skin):
     assert np.abs(after[:, :2] - shifted_mm).mean() < 0.5 * np.abs(before[:, :2] - shifted_mm).mean()
 
 
-def test_misfit_of_signals_that_are_not_pokes_is_large(skin):
+def test_misfit_of_noise_is_ten_times_that_of_pokes(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     of_pokes = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
     of_noise = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
@@ -69,26 +72,27 @@ def test_misfit_of_signals_that_are_not_pokes_is_large(skin):
     assert of_noise.min() > 10 * of_pokes.max()
 
 
-def test_card_describes_the_model(skin):
+def test_model_card_describes_the_shipped_model(skin):
     assert skin.card["source"] == "simulated"
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
     assert len(skin.networks) == skin.card["training"]["seeds_n"]
-    assert FILE.stat().st_size <= 5e6  # limit on the size of the file in bytes
+    assert FILE.stat().st_size <= 5e6  # The limit on the size of the model's file is 5 MB.
     assert tuple(skin.card["spreads"]) == skin.tables.names
 
 
-def test_other_boards_are_refused(skin):
+def test_readings_with_a_wrong_number_of_channels_are_refused(skin):
     for b_uT, got in ((np.zeros((2, 12)), r"shape \(2, 12\)"), (np.zeros(14), "14 numbers")):
         with pytest.raises(SchemaError, match=f"b_uT has {got}.* 15 numbers per reading"):
             skin.predict(b_uT)
-    for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):  # wrong types, which only users' programs can pass
+    # The types of these arguments are wrong. Without type checks, a user's program can pass them.
+    for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):
         with pytest.raises(SchemaError, match="b_uT: .* is not an array of numbers"):
             inspect.unwrap(check_shape)(b_uT)
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
 
 
-def test_use_before_zero_is_refused(skin):
+def test_estimates_before_the_no_load_reading_are_refused(skin):
     read_uT = pokes(skin)
     uses = [skin.predict, skin.estimate, skin.see, skin, lambda b_uT: skin.label(PLACES_MM, np.ones(4), b_uT)]
     for use in uses:
@@ -113,10 +117,10 @@ def test_fields_in_mT_are_refused(skin):
     assert "no-load field is weaker than the earth's" in skin.warnings[0]
     assert skin.zero(rest_uT).warnings == []
     lightest_uT = pokes(skin, 0)[:1]
-    assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # a single light touch is accepted
+    assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # A single light touch in uT is accepted.
 
 
-def test_field_changes_instead_of_readings_are_refused(skin):
+def test_field_changes_passed_as_readings_are_refused(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     changes_uT = pokes(skin.zero(rest_uT))
     places = (PLACES_MM, np.ones(len(PLACES_MM)))
@@ -125,9 +129,8 @@ def test_field_changes_instead_of_readings_are_refused(skin):
             calibrate(changes_uT)
     assert skin.presses_n == 0
     skin.see(changes_uT + rest_uT)
-    skin.zero(np.zeros(CHANNELS_N)[None]).see(
-        changes_uT
-    )  # readings of a board that subtracts the no-load reading itself
+    # Some boards subtract the no-load reading themselves. Their no-load reading is zero, so field changes are accepted.
+    skin.zero(np.zeros(CHANNELS_N)[None]).see(changes_uT)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +165,7 @@ def test_repr_of_models_is_one_line(skin):
     assert "chips_m=[5, 3]" in repr(board)
 
 
-def test_adapting_to_presses_singly_or_together_is_equivalent(skin):
+def test_presses_one_by_one_calibrate_nearly_as_presses_together(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
     at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean
@@ -172,7 +175,7 @@ def test_adapting_to_presses_singly_or_together_is_equivalent(skin):
     assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
-def test_inconsistent_labels_raise_uncertainty_and_new_labels_replace_earlier_ones(skin):
+def test_inconsistent_labels_lower_the_likelihood_power_until_new_labels_replace_them(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
@@ -187,7 +190,7 @@ def test_inconsistent_labels_raise_uncertainty_and_new_labels_replace_earlier_on
     assert skin.power == pytest.approx(skin.powers.power_for(0, 0, even=False))
 
 
-def test_order_of_data_and_queries_does_not_matter(skin):
+def test_estimates_do_not_depend_on_the_order_of_presses_labels_and_queries(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
     off_mm = PLACES_MM + np.random.default_rng(0).standard_normal(PLACES_MM.shape)
@@ -210,7 +213,7 @@ def test_order_of_data_and_queries_does_not_matter(skin):
 def test_invalid_labels_are_refused_and_change_nothing(skin, place_mm, force_N, rule):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT = pokes(skin)[:1] + rest_uT
-    # arguments for a single poke need no list
+    # The arguments of a single press need not be lists.
     before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)
     with pytest.raises(SchemaError, match=rule):
         skin.label(place_mm, force_N, read_uT)
@@ -220,7 +223,7 @@ def test_invalid_labels_are_refused_and_change_nothing(skin, place_mm, force_N, 
     np.testing.assert_array_equal(skin.predict(read_uT), before)
 
 
-def test_changed_model_is_refused(skin, tmp_path):
+def test_model_file_that_was_modified_is_refused(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE.with_suffix(".json"), file.with_suffix(".json"))
     content = bytearray(FILE.read_bytes())
@@ -231,7 +234,7 @@ def test_changed_model_is_refused(skin, tmp_path):
             load_universal(file=file)
 
 
-def test_model_in_the_previous_file_format_is_read(skin, tmp_path):
+def test_model_card_in_the_previous_format_is_read(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE, file)
     card = dict(skin.card)
@@ -241,7 +244,7 @@ def test_model_in_the_previous_file_format_is_read(skin, tmp_path):
     assert load_universal(file=file).powers == skin.powers
 
 
-def test_model_of_an_earlier_version_is_refused(skin, tmp_path):
+def test_model_in_an_old_format_is_refused(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE, file)
     io.write_json(file.with_suffix(".json"), skin.card | {"format": "reskin-universal-2"})
@@ -249,7 +252,7 @@ def test_model_of_an_earlier_version_is_refused(skin, tmp_path):
         load_universal(file=file)
 
 
-def test_saved_skin_has_equal_estimates_and_follows_drift(skin, tmp_path):
+def test_saved_skin_has_equal_estimates_and_can_be_zeroed_again_after_drift(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
     further_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (1, 2, 3, 4)]) + rest_uT
@@ -266,17 +269,18 @@ def test_saved_skin_has_equal_estimates_and_follows_drift(skin, tmp_path):
     assert again.zero(drifted_uT).presses_n == 0
 
 
-def test_calibration_of_another_skin_is_reported(skin, tmp_path):
+def test_saved_calibration_of_another_skin_is_reported(skin, tmp_path):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     other_uT = np.roll(rest_uT.reshape(-1, 3), 1, axis=0).reshape(1, -1)
     skin.zero(rest_uT).see(pokes(skin) + rest_uT).save(tmp_path / "s0.safetensors")
     loaded = load_universal(tmp_path / "s0.safetensors")
     assert loaded.warnings == loaded.zero(1.05 * rest_uT, keep=True).warnings == []
     assert any("from that of the saved calibration" in text for text in loaded.zero(other_uT, keep=True).warnings)
-    assert not any("saved calibration" in text for text in loaded.zero(other_uT).warnings)  # nothing was kept
+    # Without `keep`, the saved calibration is discarded, so there is nothing to report.
+    assert not any("saved calibration" in text for text in loaded.zero(other_uT).warnings)
 
 
-def test_adaptation_keeps_labels_on_request(skin):
+def test_earlier_labels_are_kept_on_request(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
     at_once = skin.zero(rest_uT).label(shifted_mm, force_N, read_uT).predict(read_uT)
@@ -290,7 +294,7 @@ def test_adaptation_keeps_labels_on_request(skin):
     assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
 
 
-def test_saved_skin_includes_pokes_added_one_by_one(skin, tmp_path):
+def test_saved_skin_includes_presses_added_one_by_one(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     skin.zero(rest_uT)
     for one_uT in np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT:
@@ -302,11 +306,11 @@ def test_saved_skin_includes_pokes_added_one_by_one(skin, tmp_path):
 
 
 def repeated_labels(labels_n):
-    """Return data of a saved skin with this number of equal labels in the middle of the skin."""
+    """Return arrays of a saved skin with `labels_n` equal labels in the middle of the skin."""
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
-def test_saved_skin_keeps_the_area_and_which_forces_are_known(skin, tmp_path):
+def test_saved_skin_keeps_presses_over_the_area_and_which_forces_are_known(skin, tmp_path):
     rest_uT, read_uT = to_chips(skin.tables.rest_uT[None]), pokes(skin)
     skin.zero(rest_uT).see(rest_uT + np.tile(read_uT, (4, 1)), area=True)
     skin.label(PLACES_MM[:2], None, rest_uT + read_uT[:2])
@@ -371,7 +375,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         load_universal(file)
 
 
-def test_no_readings_give_empty_estimates():
+def test_empty_arrays_of_readings_give_empty_estimates():
     model = load_universal().zero(np.zeros(15))
     assert model.predict(np.empty((0, 15))).shape == (0, 3)
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
@@ -380,7 +384,7 @@ def test_no_readings_give_empty_estimates():
 
 
 @pytest.mark.parametrize("force_N", [0.1, 0.5])
-def test_light_touches_on_unseen_skins(force_N):
+def test_median_force_of_light_touches_on_new_skins_is_within_40_percent(force_N):
     model, read_N, rng = load_universal(), [], rng_for(0, "light")
     for name in ("b0", "b1", "b2", "b3"):
         board = draw_board(RIGID, SPREADS, seed=5, name=name)

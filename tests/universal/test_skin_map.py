@@ -1,4 +1,7 @@
-"""Tests of the map: it is conditioned like a Gaussian process and reproduces labelled places."""
+"""Tests of the map, the model of a skin that gives the likelihood of each place and force for a reading.
+
+The map is conditioned on presses like a Gaussian process, and reproduces labelled places.
+"""
 
 from dataclasses import replace
 
@@ -33,16 +36,16 @@ def presses(number=NUMBER, seed=0):
     return grid(), force_N, poked_uT(grid(), force_N, number)
 
 
-def test_conditioning_on_the_no_load_field_equals_that_of_a_gaussian(skin):
+def test_conditioning_on_the_no_load_field_equals_conditioning_of_a_gaussian(skin):
     noload_uT = rng_for(1, "rest").normal(0, 300, 15)
     found = map.condition_on_noload(skin, noload_uT)
-    # Reference in covariance form; the map is computed in information form.
+    # The reference computes with covariances. The map computes with their inverses.
     gain = REST_SLOPE_uT.T @ np.linalg.inv(REST_SLOPE_uT @ REST_SLOPE_uT.T + OFFSET_uT**2 * np.eye(15))
     np.testing.assert_allclose(found.mean, gain @ noload_uT, rtol=1e-9)
     np.testing.assert_allclose(found.cov, np.eye(3) - gain @ REST_SLOPE_uT, rtol=1e-9, atol=1e-12)
 
 
-def test_deviance_is_that_of_a_gaussian(skin):
+def test_deviance_equals_that_of_a_multivariate_normal_distribution(skin):
     skin = replace(skin, mean=np.array([0.3, -0.2, 0.5]))
     hypothesis = [300, 1100, 2000]
     mean_uT, slope_uT = skin.hypotheses.mean_uT[hypothesis], skin.hypotheses.slope_uT[hypothesis]
@@ -57,20 +60,22 @@ def test_deviance_is_that_of_a_gaussian(skin):
         chi2 = off_uT @ np.linalg.solve(cov, off_uT)
         deviance = chi2 + np.linalg.slogdet(cov)[1]
         found = skin.evaluator.evaluate(db_uT[row : row + 1])
-        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # tolerance of single precision
+        # The tolerance is the rounding of chi^2, which is in single precision.
+        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)
         assert found.deviance[0, i] == pytest.approx(deviance, abs=0.02)
 
 
-def test_presses_of_the_tabulated_skin_are_located(skin):
+def test_presses_on_the_tabulated_skin_are_located_within_1_mm(skin):
     place_mm, force_N, db_uT = presses(np.zeros(3))
     found = skin.evaluator.estimate(db_uT)
     assert np.abs(found.place_mm - place_mm).max() < 1.0
     assert np.abs(np.log(found.force_N / force_N)).mean() < 0.3
 
 
-def test_labelled_place_overrides_the_law(skin):
+def test_labels_override_the_law(skin):
     place_mm, force_N, db_uT = presses()
-    wrong_uT = db_uT[::-1] * 0.9  # each place has the field of the opposite place
+    # The labels contradict the law: each place is labelled with the field of the opposite place.
+    wrong_uT = db_uT[::-1] * 0.9
     labelled = [12, 32, 50]
     found = condition_on_labels(skin, place_mm[labelled], force_N[labelled], wrong_uT[labelled]).evaluator.estimate(
         wrong_uT[labelled]
@@ -85,28 +90,29 @@ def test_order_of_labels_does_not_matter(skin):
     order = rng_for(2, "order").permutation(10)
     maps = [condition_on_labels(skin, place_mm[i], force_N[i], db_uT[i]) for i in (np.arange(10), order)]
     one, other = (each.evaluator.estimate(db_uT) for each in maps)
-    # tolerance in mm: deviances are in single precision
+    # The tolerance in mm is the effect of rounding, because deviances are in single precision.
     np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)
     np.testing.assert_allclose(one.sd_mm, other.sd_mm, atol=1e-3)
 
 
 @pytest.mark.parametrize("gap", [-1.5, 1.5])
-def test_unlabelled_presses_improve_the_parameters(skin, gap):
+def test_unlabelled_presses_move_a_parameter_towards_its_true_value(skin, gap):
     _, _, db_uT = presses(np.array([0.0, 0.0, gap]))
     found = condition_on_presses(skin, db_uT + rng_for(3, "noise").normal(0, 3, db_uT.shape))
-    # The tolerance is wide because the estimated place and force of each press absorb part of the parameter's effect.
+    # The tolerance is wide: places and forces of the presses are unknown, and their estimates absorb a part of the
+    # effect of the parameter.
     assert abs(found.mean[2] - gap) < 0.8 * abs(gap)
     assert found.cov[2, 2] < skin.cov[2, 2]
 
 
-def test_evenly_spread_presses_determine_the_middle_of_the_labels(skin):
-    shifted = np.array([2.0, -1.0, 0.0])  # shift in standard deviations of 0.25 mm
+def test_mean_of_evenly_spread_presses_determines_the_origin_of_the_places(skin):
+    shifted = np.array([2.0, -1.0, 0.0])  # The shift of the origin, in standard deviations of 0.25 mm each.
     _, _, db_uT = presses(shifted)
     found = condition_on_even_presses(skin, db_uT)
     assert np.linalg.norm((found.mean - shifted)[:2]) < 0.5 * np.linalg.norm(shifted)
 
 
-def test_indefinite_covariance_is_an_error(skin):
+def test_covariance_that_is_not_positive_definite_is_refused(skin):
     broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
     with pytest.raises(SchemaError, match="covariances of its hypotheses are not positive definite"):
         _ = broken.evaluator

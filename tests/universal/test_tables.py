@@ -1,4 +1,4 @@
-"""Tests that tables contain the simulated fields of the law and the slopes of these fields."""
+"""Tests that the tables contain the simulated fields, and the slopes of the fields with respect to each parameter."""
 
 from dataclasses import asdict, replace
 
@@ -20,13 +20,15 @@ def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
         np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
         moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
         np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
-    # finite difference: fields are linear in the amplitude, whose logarithm has the spread
+    # Expected slope of the amplitude. Fields are proportional to the amplitude, and the spread is that of its
+    # logarithm. Therefore the relative finite difference for a step is exp(STEP * spread) - 1, divided by STEP.
     grown = (np.exp(STEP * 0.2) - 1) / STEP
     np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
 
 
-def test_mean_law_has_the_design_seat():
+def test_mean_law_averages_boards_but_keeps_the_designed_seat():
+    """The seat (the position of the skin on the board) is random on each board, so its mean is not used."""
     weak, strong = replace(NOMINAL, amplitude=1.0, seat_x_mm=0.4), replace(NOMINAL, amplitude=4.0, gap_mm=2.0)
     found = mean_law([weak, strong])
     assert (found.amplitude, found.gap_mm) == pytest.approx((2.0, 1.8))
@@ -34,7 +36,7 @@ def test_mean_law_has_the_design_seat():
 
 
 @pytest.mark.parametrize("spreads", [RIG_SPREADS, NOMINAL_SPREADS])
-def test_perturbation_is_reversible(spreads):
+def test_perturbing_a_parameter_and_back_changes_nothing(spreads):
     assert set(spreads) <= set(asdict(NOMINAL))
     assert set(LOGARITHMIC) <= set(spreads)
     for name, spread in spreads.items():

@@ -1,4 +1,4 @@
-"""Tests that a short training run learns and is reproducible."""
+"""Tests that a short training run of the network learns from simulated skins and is reproducible."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def weights():
     return train(SKINS, PRIOR, 80, rng_for(0, "training"))
 
 
-def test_short_training_beats_the_mean_on_unseen_skins(weights):
+def test_short_training_predicts_new_skins_better_than_the_mean(weights):
     tested = slice(PLACES_N, None)
     fresh, off_mm2, off_log2 = make_population(5, rng_for(1, "fresh")), [], []
     for db_uT, rest_uT, place_mm, force_N in zip(
@@ -33,12 +33,12 @@ def test_short_training_beats_the_mean_on_unseen_skins(weights):
     assert np.mean(off_log2) < 0.5 * np.log(fresh.force_N).var()
 
 
-def test_weights_follow_the_generator():
+def test_equal_generators_give_equal_weights():
     one, other = (train(SKINS, PRIOR, 3, rng_for(2, "same")) for _ in range(2))
     assert all((one[name] == other[name]).all() for name in one)
 
 
-def test_law_errors_have_the_given_size():
+def test_random_errors_of_the_law_have_the_given_size():
     db_uT = np.full((400, 20, 15), 100.0, np.float32)
     rng = rng_for(3, "errors")
     place_mm = rng.uniform(-8, 8, (400, 20, 2)).astype(np.float32)
@@ -46,10 +46,11 @@ def test_law_errors_have_the_given_size():
     assert off_uT.std() == pytest.approx(30.0, rel=0.05)
     same_mm = np.zeros((400, 20, 2), np.float32)
     together_uT = add_error(db_uT, same_mm, np.zeros((400, 20), np.float32), (0.3, 0.3), rng)
-    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01  # the error is equal for equal place and force
+    # Presses at equal places with equal forces have equal errors.
+    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01
 
 
-def test_number_of_conditioning_presses_varies():
+def test_number_of_conditioning_presses_varies_from_none_to_all():
     kept_n = draw_kept(4000, rng_for(4, "kept")).sum(axis=1)
     assert (kept_n == 0).mean() == pytest.approx(0.25, abs=0.03)
     assert kept_n[kept_n > 0].min() == 1
@@ -57,13 +58,13 @@ def test_number_of_conditioning_presses_varies():
     assert kept_n[kept_n > 0].mean() == pytest.approx((PLACES_N + 1) / 2, abs=1.5)
 
 
-def test_batches_mix_recorded_boards_and_simulated_skins():
+def test_batches_contain_recorded_boards_and_simulated_skins():
     place_mm = SKINS.place_mm[0, :40]
     force_N = np.repeat(SKINS.force_N[0, :40, None], 3, axis=1)
     db_uT = np.repeat(fields_uT(place_mm, force_N[:, 0])[:, None], 3, axis=1).astype(np.float32)
     board = RecordedBoard(db_uT, np.ones(15, np.float32), place_mm, force_N)
     drawn = draw_recorded(board, rng_for(5, "recorded"))
-    assert drawn[0].shape == (PRESSES_N, 15)  # drawn from 40 presses, with repetitions
+    assert drawn[0].shape == (PRESSES_N, 15)  # The board has only 40 presses, so some of them are drawn repeatedly.
     np.testing.assert_allclose(drawn[0], fields_uT(drawn[2], np.exp(drawn[3])), rtol=1e-4, atol=1e-2)
 
     residual = fit_residual([place_mm.astype(float)], [force_N[:, 0].astype(float)], [np.full((40, 15), 0.1)])

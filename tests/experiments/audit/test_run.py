@@ -1,4 +1,8 @@
-"""Tests of the audit stage on a tiny scene: files without leaks pass, and each planted leak is detected and named."""
+"""Tests of the audit stage on a tiny scene.
+
+The audit looks for leaks, such as test rows that were used in training. Files without leaks must pass, and each leak
+that a test plants must be detected and named.
+"""
 
 import shutil
 from collections.abc import Callable
@@ -30,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
-COPY = "b3_s0"  # a copy of skin b0_s0, labelled as a skin of another board
+COPY = "b3_s0"  # A copy of skin b0_s0, which is labelled as a skin of another board.
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded_scene(
@@ -55,7 +59,10 @@ CHOICE = {
 
 
 def capture(skin: str) -> Readings:
-    """Return readings of two passes over a grid. Each skin's field depends on the place and exceeds the noise."""
+    """Return readings of two passes over a grid of places.
+
+    The field of each skin depends on the place, and its changes exceed the noise.
+    """
     rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
     place_i = np.tile(np.arange(PLACES_N), PASSES_N)
     x, y = place_i // 4, place_i % 4
@@ -74,7 +81,7 @@ def capture(skin: str) -> Readings:
 
 
 def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
-    """Write the files that the stages of a scene write, with untrained networks."""
+    """Write the files that the stages of a scene would write. Their networks are not trained."""
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "scene.json", SCENE)
@@ -125,7 +132,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # stages write their costs to the working folder
+    monkeypatch.chdir(tmp_path)  # Stages write their costs to the working folder.
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 
@@ -176,12 +183,12 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
     variants = {check["where"] for check in checks if check["what"] == "settings: recipe"}
     assert variants == {"train_single", "train_multi", "train_triplet", "adapt"}
-    # only the paper's random split fails
+    # Only the paper's random split has a leak.
     assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
 
-def test_settings_that_affect_only_speed_need_no_tuning(scene):
+def test_settings_that_affect_only_speed_need_no_record_of_their_choice(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in run_audit(scene))
@@ -210,7 +217,7 @@ def test_scaler_fitted_to_test_rows_is_detected(scene, stage, name, seen_n):
 
 
 def change_fold(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
-    """Change the fold of board b0 in folds.json."""
+    """Change the fold that holds out board b0, in file folds.json."""
     data = load_scene_data(folder)
     folds = [change(fold, data) if (fold.experiment, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
     io.write_json(
@@ -256,7 +263,7 @@ def test_fold_that_trains_on_test_rows_is_detected(scene, leak, sentence):
     assert_leak(scene, f"audit of tiny, lobo/b0, {sentence}")
 
 
-def test_copied_capture_is_detected_until_it_is_accepted(tmp_path):
+def test_copied_capture_is_reported_until_the_scene_accepts_it(tmp_path):
     folder = build(tmp_path / "scene", (*SKINS, COPY))
     found = r"100.0 % of the 16 compared indentations of capture b0_s0 match skin b3_s0\. Rule: .*"
     remedy = r"reskin remove tiny b0_s0\. .*tiny.yaml: similar_skins: \[\[b0_s0, b3_s0\]\]"
@@ -295,7 +302,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
     ],
     ids=["another rate", "no choice"],
 )  # fmt: skip
-def test_setting_that_differs_from_the_choice_is_reported(scene, chosen, stage, found):
+def test_recipe_that_differs_from_the_chosen_settings_is_reported(scene, chosen, stage, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
     rows = {check["where"]: check for check in run_audit(scene) if check["what"] == "settings: recipe"}
     assert (rows[stage]["found"], rows[stage]["holds"]) == (found, True)

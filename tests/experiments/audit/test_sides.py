@@ -1,4 +1,8 @@
-"""Tests of the audit's checks, with leaks planted in the split, captures (copies), scaler, settings and pool."""
+"""Tests of the checks of the audit, with planted leaks.
+
+Leaks are planted in the split, in captures (copies), in the scaler, in the settings and in the pool of presses for
+adaptation.
+"""
 
 import doctest
 from dataclasses import replace
@@ -25,12 +29,16 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # noise of x, y, z in the lab recordings
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # The noise of x, y and z in the lab recordings.
 UNSEEN = ("lobo", "sensors", "transfer")
 
 
 def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Return presses of two skins per board. All skins share a response; each has its own, a third as large."""
+    """Return presses of two skins per board, with three readings each.
+
+    The response of a skin is the sum of a part that all skins share and of a part of its own, which is a third as
+    large.
+    """
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):
@@ -97,32 +105,32 @@ FIRST_SKIN = LABELS.skin[LABELS.board == "b0"] == "b0_s0"
     ],
     ids=["a skin of the board", "five indentations of a skin", "one reading"],
 )
-def test_split_leak_is_detected(leak, named):
+def test_training_rows_from_the_test_side_are_detected(leak, named):
     checks = run_audit(moved_to_train(leak), LABELS, DB_uT)
     assert not passes(checks)
     assert failing(checks) == named
     assert checks[1].found == "1 of 1 test boards are also in training: b0"
 
 
-def test_shared_reading_is_detected_within_a_skin():
+def test_reading_on_both_sides_of_a_split_within_a_skin_is_detected():
     rows = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides("single_random", "repeat0", rows[:100], NONE, rows[99:])
     assert failing(run_audit(fold, LABELS, DB_uT)) == ["readings", "indentations"]
     assert not passes(run_audit(fold, LABELS, DB_uT))
 
 
-def test_papers_random_readings_are_a_known_leak():
+def test_leak_of_the_papers_random_split_is_reported_as_known():
     rows = np.flatnonzero(LABELS.skin == "b0_s0")
     checks = run_audit(Sides("single_random", "repeat0", rows[::2], NONE, rows[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
-    # each indentation has 3 readings, of which 2 are on one side of the split and 1 is on the other side
+    # Each press has 3 readings. Two of them are on one side of the split, and one is on the other side.
     assert leak.found.startswith("60 of 60 test indentations are also in training")
     assert passes(checks)
 
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
-def test_indentations_within_a_skin_must_be_separate(experiment):
+def test_press_with_readings_on_both_sides_is_detected(experiment):
     rows = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides(experiment, "b0_s0", rows[: 20 * READINGS_N], NONE, rows[20 * READINGS_N :])
     assert failing(run_audit(fold, LABELS, DB_uT)) == []
@@ -131,7 +139,7 @@ def test_indentations_within_a_skin_must_be_separate(experiment):
     assert not passes(run_audit(split_indentation, LABELS, DB_uT))
 
 
-def test_pool_must_be_untested_pokes_of_held_out_skins():
+def test_pool_for_adaptation_must_be_untested_presses_of_held_out_skins():
     fold = held_out(LABELS)
     pool, test = fold.test[: 10 * READINGS_N], fold.test[10 * READINGS_N :]
     assert failing(run_audit(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
@@ -152,7 +160,7 @@ def with_copy(
 
 
 @pytest.mark.parametrize(("sd_uT", "factor"), [(0, 1), (3, 1), (5, 1), (5, 1.05), (3, 0.9), (0, 1.3)])
-def test_perturbed_copy_is_detected(sd_uT, factor):
+def test_copy_of_another_skin_with_noise_or_another_factor_is_detected(sd_uT, factor):
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=sd_uT, factor=factor)
     checks = run_audit(held_out(LABELS), LABELS, planted)
     assert failing(checks) == ["copies"]
@@ -174,27 +182,29 @@ def test_copied_capture_is_detected_among_others():
     assert not check.holds
 
 
-def test_copy_is_detected_in_a_sample(monkeypatch):
+def test_copy_is_detected_if_only_a_sample_of_presses_is_compared(monkeypatch):
     monkeypatch.setattr(audit, "PAIRS_MAX_N", 12_000)
     monkeypatch.setattr(audit, "SAMPLE_MIN_N", 1)
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
     check = run_audit(held_out(LABELS), LABELS, planted)[-1]
-    # 12,000 compared pairs / (240 training indentations x 2 captures)
+    # The sample has 12,000 pairs. Each test press is compared with 240 training presses in 2 captures, so 25 test
+    # presses are compared.
     assert "of the 25 compared indentations" in check.found
     assert not check.holds
     assert run_audit(held_out(LABELS), LABELS, DB_uT)[-1].holds
 
 
-def test_equal_directions_with_other_magnitudes_are_not_a_copy():
+def test_fields_with_equal_directions_and_random_magnitudes_are_not_a_copy():
     planted, on_skin = DB_uT.copy(), LABELS.skin == "b0_s1"
     factor = rng_for(4, "factor").uniform(1, 4, (on_skin.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
     planted[on_skin] = factor * DB_uT[LABELS.skin == "b2_s1"]
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_response_rotated_by_ten_degrees_is_not_a_copy():
-    # Re-seating a skin rotates the fields by more than 10 degrees. Here, each rotated field differs from the nearest
-    # multiple of the original field by 0.17 |dB|, which is at least 39 uT.
+def test_fields_rotated_by_ten_degrees_are_not_a_copy():
+    # If a skin is taken off and placed on its board again, its fields rotate by more than 10 degrees. Here, they rotate
+    # by 10 degrees, and each rotated field differs from the nearest multiple of the original field by 0.17 |dB|, which
+    # is at least 39 uT.
     planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
     one, other = source[:, :14:2], source[:, 1:14:2]
     cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
@@ -203,7 +213,7 @@ def test_response_rotated_by_ten_degrees_is_not_a_copy():
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_fields_within_the_noise_are_undecidable():
+def test_skins_whose_fields_are_within_the_noise_cannot_be_checked_for_copies():
     checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
     assert checks[-1].found == "not checked, because no field change exceeds 153 µT: b0_s1"
@@ -215,28 +225,30 @@ def test_fields_within_the_noise_are_undecidable():
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
 @settings(max_examples=30, deadline=None)
-def test_audit_does_not_depend_on_row_order(draw, copied, experiment):
+def test_result_of_the_audit_does_not_depend_on_the_order_of_rows(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    new_index = np.argsort(order)  # new index of each old row
+    new_index = np.argsort(order)  # Maps the old index of each row to its new index.
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=new_index[fold.train], test=new_index[fold.test])
     assert run_audit(moved, shuffled, db_uT[order]) == run_audit(fold, LABELS, db_uT)
 
 
-def test_nearest_ray_is_at_the_smallest_angle(monkeypatch):
-    monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)  # so that the pairs are processed in several chunks
+def test_nearest_ray_has_the_smallest_angle_to_the_row(monkeypatch):
+    # The pairs are processed in several chunks, because a chunk holds only 100 pairs.
+    monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)
     rng = rng_for(2, "rays")
     rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
     nearest, off_uT = nearest_rays(rows, others)
     for row, i, off in zip(rows.astype(float), nearest, off_uT, strict=True):
         angles = [np.arccos(row @ o / np.linalg.norm(row) / np.linalg.norm(o)) for o in others.astype(float)]
         assert i == np.argmin(angles)
-        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)  # rays are float32
+        # The relative tolerance allows for rays in single precision.
+        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)
 
 
-def test_lab_recordings_pass_and_a_copy_fails(shared_data):
+def test_lab_recordings_pass_and_a_planted_copy_fails(shared_data):
     frames = {
         board: pd.concat([pd.read_csv(shared_data / f"lab/{board}_depth{i}.csv").assign(depth_i=i) for i in (1, 3)])
         for board in ("board1", "board2")
@@ -257,7 +269,7 @@ def test_lab_recordings_pass_and_a_copy_fails(shared_data):
 
 
 @pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
-def test_empty_side_or_unknown_experiment_is_an_error(experiment):
+def test_fold_with_an_empty_side_or_an_unknown_experiment_is_refused(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "one side of the fold has no rows: 720 to train on, 0",
@@ -288,7 +300,7 @@ def test_scaler_of_training_rows_passes(scaling, draw):
 
 @pytest.mark.parametrize("scaling", list(FIT))
 @pytest.mark.parametrize("seen_n", [1, 20, 360])
-def test_scaler_leak_of_a_single_row_is_detected(scaling, seen_n):
+def test_scaler_fitted_to_at_least_one_test_row_is_detected(scaling, seen_n):
     fold = held_out(LABELS)
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
     check = scaler_check(FIT[scaling](DB_uT[seen], TARGET[seen]).arrays(), fold, DB_uT, scaling)
@@ -297,7 +309,7 @@ def test_scaler_leak_of_a_single_row_is_detected(scaling, seen_n):
 
 
 @pytest.mark.parametrize("scaling", list(FIT))
-def test_one_test_row_in_100000_is_detected(scaling):
+def test_scaler_fitted_to_one_test_row_among_100000_rows_is_detected(scaling):
     copies_n = 100_000 // len(DB_uT)
     db_uT, target = np.tile(DB_uT, (copies_n, 1)), np.tile(TARGET, (copies_n, 1))
     train = np.arange(len(db_uT) - 2)
@@ -313,20 +325,20 @@ def test_one_test_row_in_100000_is_detected(scaling):
     assert [check.holds for check in checks] == [True, False]
 
 
-def test_rounding_differences_of_a_scaler_pass():
+def test_scaler_that_differs_only_by_rounding_passes():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     rounded = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
     assert scaler_check(rounded, fold, DB_uT, "standard").holds
 
 
-def test_scaler_fitted_to_both_sides_fails_even_if_close():
+def test_scaler_fitted_to_both_sides_is_detected_even_if_it_is_close():
     fold = held_out(LABELS)
 
     def fit(db_uT, target):
         return {"shift": np.array([1 + 1e-10 * len(db_uT)])}
 
-    arrays = fit(DB_uT, TARGET)  # fitted to all rows: the training side and the test side
+    arrays = fit(DB_uT, TARGET)  # The scaler is fitted to all rows, those of the training side and of the test side.
     check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
     assert check.found == (
         "relative difference 3.6e-08 from a scaler of the training rows, 0 from one of training and test rows"
@@ -334,7 +346,7 @@ def test_scaler_fitted_to_both_sides_fails_even_if_close():
     assert not check.holds
 
 
-def test_nan_scaler_fails_and_missing_array_is_an_error():
+def test_scaler_with_nan_fails_and_scaler_without_an_array_is_refused():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
@@ -356,13 +368,13 @@ def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 
-def test_choice_on_another_seed_passes():
+def test_settings_chosen_with_another_seed_pass():
     assert failing(choice_checks()) == []
     assert failing(choice_checks(source="recorded")) == []
 
 
 @pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
-def test_choice_on_test_data_is_detected(source, seed):
+def test_settings_chosen_on_test_boards_are_detected(source, seed):
     checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
     assert failing(checks) == ["settings: boards", "settings: skins"]
     assert checks[1].found == "1 of 3 tested skins were used to choose the settings: b0_s0"
@@ -377,13 +389,13 @@ def test_choice_on_test_data_is_detected(source, seed):
         ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (study: 4000), tau 1 (study: absent)"),
     ],
 )  # fmt: skip
-def test_recipe_that_differs_from_the_choice_is_reported(recipe, found):
+def test_recipe_that_differs_from_the_chosen_settings_is_reported(recipe, found):
     checks = choice_checks(recipes={"train_multi": recipe})
     assert passes(checks)
     assert checks[-1].found == f"not chosen by the study: {found}"
 
 
-def test_missing_choice_is_reported_and_broken_record_is_an_error():
+def test_missing_record_of_the_choice_is_reported_and_a_broken_one_is_refused():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
     assert checks[-1].found == "not chosen by the study: it chose no recipe for this stage"

@@ -1,4 +1,4 @@
-"""Tests of departures: differences between a capture and the skin of its scene that suggest wrong labels."""
+"""Tests of departures, which are differences between a capture and the scene's skin that suggest wrong labels."""
 
 from dataclasses import replace
 from itertools import product
@@ -34,7 +34,7 @@ from tests.recordings.test_recordings import ingest
 
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> Readings:
-    """Return every third poke of a recording of lab board 1, with five readings per poke."""
+    """Return every third press of a recording of lab board 1, with five readings per press."""
     readings, _ = ingest(lab, shared_data / "lab/board1_depth2.csv", tmp_path_factory.mktemp("lab"))
     return select(readings, (readings.indentation % 3 == 0) & (readings.reading_i < 5))
 
@@ -44,11 +44,11 @@ def select(readings: Readings, rows: np.ndarray) -> Readings:
     return replace(readings, **arrays)
 
 
-def test_agreeing_recording_has_no_departure(real):
+def test_recording_that_agrees_with_the_scene_has_no_departure(real):
     assert find_departure([real], SECTION, DESIGN) is None
 
 
-def test_swapped_chips_are_named(real):
+def test_exchanged_chips_are_named(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
     assert find_departure([swapped], SECTION, DESIGN) == "Against the scene, chips 1 and 2 are exchanged."
@@ -59,7 +59,7 @@ def test_mirrored_labels_are_named(real):
     assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
 
 
-def test_incomplete_captures_have_no_departure(real):
+def test_captures_with_missing_data_have_no_departure(real):
     unknown = np.full(len(real), np.nan, np.float32)
     few = select(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
@@ -76,7 +76,7 @@ def test_orientation_is_found_without_forces(real):
     assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
 
 
-# A square board with four chips: its layout, as a scene's file states it.
+# The layout of a square board with four chips, as the file of a scene states it.
 SQUARE = read_yaml(FOLDER / "reskin.yaml") | {
     "name": "square",
     "centre_mm": [10.0, 12.0],
@@ -93,7 +93,7 @@ def square_section(**changes: object) -> Compare:
 
 
 def square_recording(section: Compare) -> Readings:
-    """Return simulated presses at 5 x 5 places of the square board, without forces."""
+    """Return simulated presses at 5 x 5 places of the square board. Their forces are unknown."""
     setup, turns = make_setup(section, DESIGN), chip_rotations(section)
     place_mm = np.stack(np.meshgrid(*[np.linspace(-6, 6, 5)] * 2), axis=-1).reshape(-1, 2)
     db_uT = np.einsum("kij,nki->nkj", turns, nominal_uT(setup, place_mm, np.full(25, 2.0))).reshape(25, 12)
@@ -105,7 +105,7 @@ def square_recording(section: Compare) -> Readings:
     )  # fmt: skip
 
 
-def test_departures_from_a_layout_name_the_layout():
+def test_departures_from_a_layout_name_the_layout_instead_of_the_scene():
     section = square_section()
     recording = square_recording(section)
     assert find_departure([recording], section, DESIGN) is None
@@ -114,7 +114,7 @@ def test_departures_from_a_layout_name_the_layout():
     assert sentence == "Against layout square, chips 1 and 3 are exchanged."
 
 
-def test_presses_outside_the_skin_are_reported_instead_of_orientations():
+def test_presses_outside_the_skin_are_reported_before_orientations_are_compared():
     section = square_section()
     recording = square_recording(section)
     elsewhere = replace(recording, x_mm=recording.x_mm + 20, y_mm=recording.y_mm - 5)
@@ -127,7 +127,7 @@ def test_presses_outside_the_skin_are_reported_instead_of_orientations():
     assert check_frames(aligned, make_setup(section, DESIGN), section)["sentence"] == sentence
 
 
-def test_boards_without_forces_have_only_the_table_of_axes(monkeypatch):
+def test_boards_without_known_forces_have_only_the_table_of_axes(monkeypatch):
     monkeypatch.setattr(compare, "FITTED_MAX_N", 22)
     section = square_section()
     boards = pool_skins([square_recording(section)], with_force=False)
@@ -149,6 +149,6 @@ def test_boards_without_forces_have_only_the_table_of_axes(monkeypatch):
         ({"layout": SQUARE | {"gap": 1.0}}, "compare.layout: gap is not a known parameter"),
     ],
 )
-def test_invalid_layout_of_a_scene_is_an_error(changes, message):
+def test_layout_that_a_scene_states_wrongly_is_refused(changes, message):
     with pytest.raises(ParamsError, match=message):
         square_section(**changes)

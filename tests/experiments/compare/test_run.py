@@ -1,4 +1,7 @@
-"""Tests that experiment compare recovers parameters and axes, from simulated and from real recordings."""
+"""Tests of experiment compare, which fits the simulation to recordings.
+
+It must recover parameters and axes, from simulated and from real recordings.
+"""
 
 import itertools
 from dataclasses import asdict, replace
@@ -33,17 +36,19 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
-# The nominal skin is pressed with the same tip, because tables for another tip would take seconds to compute.
+# The nominal skin is pressed with the same tip as the boards, because tables for another tip would take seconds to
+# compute.
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
-# Tolerances: errors of a fit to 50 pokes with 3 uT of noise; errors of gap and amplitude are correlated.
+# The tolerances are the errors of a fit to 50 presses with 3 uT of noise. Those of gap and amplitude are large, because
+# an error of one compensates an error of the other.
 TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 ROTATIONS = chip_rotations(SECTION)
 
 
 def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
-    """Return simulated presses at 25 places and two forces, with these parameters, in the axes of scene lab."""
+    """Return simulated presses at 25 places with two forces each, along the axes of scene lab."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
@@ -66,14 +71,14 @@ def sentence(pokes: RecordedPresses) -> str:
     return check_frames(to_board_axes(pokes, SECTION), SETUP, SECTION)["sentence"]
 
 
-def test_fit_recovers_the_true_parameters(recorded):
+def test_fit_recovers_the_parameters_of_a_simulated_skin(recorded):
     fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(TOLERANCES)
     assert {
         name: (fitted[name], true) for name, true in asdict(TRUE).items() if abs(fitted[name] - true) > near[name]
     } == {}
 
 
-def test_refit_for_a_board_changes_only_its_parameters(recorded):
+def test_second_fit_for_a_single_board_changes_only_the_parameters_of_this_board(recorded):
     start = replace(fit.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
     fitted = fit.fit(
         to_board_axes(simulated_presses(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start
@@ -83,17 +88,17 @@ def test_refit_for_a_board_changes_only_its_parameters(recorded):
     assert [getattr(fitted, name) for name in fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
 
 
-def test_agreeing_recording_has_no_departure(recorded):
+def test_recording_that_agrees_with_the_scene_has_no_departure(recorded):
     assert sentence(recorded) == "Labels, chips and skin are oriented as the scene states."
 
 
-def test_swapped_chips_are_named(recorded):
+def test_exchanged_chips_are_named(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
     assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_mirrored_axis_is_named(recorded, axis):
+def test_axis_along_which_all_chips_are_mirrored_is_named(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
         f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
@@ -109,7 +114,7 @@ def test_rotated_chip_is_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_mirrored_labels_are_named(recorded, axis):
+def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
@@ -117,19 +122,19 @@ def test_mirrored_labels_are_named(recorded, axis):
     )
 
 
-def test_flipped_skin_is_named(recorded):
+def test_skin_with_exchanged_poles_is_named(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
     assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
 
 
-def test_sixteen_orientations_are_distinct():
+def test_sixteen_orientations_of_a_skin_are_distinct():
     matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in compare.TURNS}
     assert len(matrices) == len(compare.TURNS) == 16
     assert compare.TURNS[0].describe() == ""
     assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
-def test_flipped_skin_is_a_rotated_checkerboard():
+def test_flipped_checkerboard_equals_one_rotated_by_a_quarter_turn():
     plain, flipped = (replace(SETUP, skin_flipped=is_flipped).rest for is_flipped in (False, True))
     turn = compare.quarter_turn(1)
     moments_by_node = {
@@ -141,37 +146,40 @@ def test_flipped_skin_is_a_rotated_checkerboard():
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
-def test_law_without_slide_and_offsets_equals_the_nominal_skin():
+def test_law_without_slide_equals_the_nominal_skin():
     plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
-    lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
-               np.geomspace(0.2, 8, 30)]  # one of these forces gives nearly the depth of `nominal_uT`  # fmt: skip
+    # The depth of `nominal_uT` is fixed, so the force of this depth is found by trying many forces.
+    lengths = [
+        np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N)))
+        for force_N in np.geomspace(0.2, 8, 30)
+    ]
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
-def test_pokes_beyond_the_greatest_depth_are_counted_and_clamped():
+def test_presses_beyond_the_greatest_depth_are_counted_and_computed_at_this_depth():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
     layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    # With a slide, the field would change with the force even at a constant depth.
+    # The slide is switched off. Otherwise, the field would change with the force even at a constant depth.
     without_slide = replace(TRUE, away_um_mm=0.0)
     held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
-    # a skin with half the modulus is indented as deeply by half the force
+    # A skin with half the modulus is indented as deeply by half the force.
     soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 
 
-def test_nominal_skin_counts_pokes_beyond_its_force_curve():
+def test_presses_beyond_the_force_curve_of_the_nominal_skin_are_counted():
     known_N, _ = law._nominal_curve(SETUP)
     assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
 
 
-def test_direction_magnitude_and_growth_of_known_fields():
+def test_cosine_explained_part_and_growth_of_simple_fields():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
     assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
@@ -182,21 +190,23 @@ def test_direction_magnitude_and_growth_of_known_fields():
     assert growth(replace(pokes, force_N=np.ones(50)), power_uT) is None
 
 
-def test_memory_is_estimated_despite_no_load_drift():
+def test_field_memory_is_estimated_while_the_no_load_field_drifts():
     pokes, rng = simulated_presses(), rng_for(1, "compare")
     for part in (0.0, 0.07):
         rest_uT = np.linspace(0, 60, 50)[:, None, None] ** 2 / 60 + 0.3 * rng.standard_normal((50, 5, 3))
         rest_uT[1:] += part * pokes.db_uT[:-1]
         assert memory(pokes, pokes.db_uT, rest_uT) == pytest.approx(part, abs=0.004)
-    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # unknown with a single no-load reading
+    # The memory cannot be estimated if all no-load readings are the same.
+    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None
 
 
-def test_presses_are_means_of_readings_with_force():
+def test_presses_are_means_of_the_readings_with_a_force():
     one = readings(f=6, indentation=np.array([0, 0, 0, 1, 1, 2], np.int32), x_mm=np.zeros(6, np.float32),
                    Fz_N=np.array([1, 2, 3, 4, 4, np.nan], np.float32))  # fmt: skip
     pokes = pool([one])
     assert pokes.force_N.tolist() == [2.0, 4.0]
-    assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # means of rows 0-2 and of rows 3-4; row 5 has no force
+    # The first press is the mean of rows 0 to 2, the second one the mean of rows 3 and 4. Row 5 has no force.
+    assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]
     assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
     with pytest.raises(SchemaError, match="experiment compare: board .* has no press with a known place and force"):
@@ -205,7 +215,7 @@ def test_presses_are_means_of_readings_with_force():
         to_board_axes(pokes, SECTION)
 
 
-def test_presses_of_arbitrary_depths_are_grouped_by_thirds_of_depth():
+def test_presses_of_many_different_depths_are_grouped_by_thirds_of_depth():
     depths_mm = np.arange(60, 0, -5, np.float32) / 100
     one = readings(
         f=12, indentation=np.arange(12, dtype=np.int32), depth_mm=np.append(depths_mm[:-1], np.float32(np.nan))
@@ -214,7 +224,7 @@ def test_presses_of_arbitrary_depths_are_grouped_by_thirds_of_depth():
     assert pokes.groups == ("c0", "c0 0.1 to 0.267 mm", "c0 0.267 to 0.433 mm", "c0 0.433 to 0.6 mm")
     assert pokes.group_i.tolist() == [3] * 4 + [2] * 3 + [1] * 4 + [0]
     ten = replace(one, depth_mm=np.append(depths_mm[:-2], depths_mm[:2]))
-    assert len(pool([ten]).groups) == 10  # one group per depth
+    assert len(pool([ten]).groups) == 10  # With ten different depths, each depth is a group.
 
 
 @pytest.fixture(scope="module")
@@ -230,9 +240,9 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
 
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
-def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
-    # Parameters fitted to a third of the places (22 of 65 in each of three recordings) must agree with those fitted to
-    # all places.
+def test_fit_to_a_third_of_the_places_predicts_all_places(real):
+    # Parameters are fitted to a third of the places (22 of 65 in each of three recordings). With them, the simulation
+    # must agree with the presses at all places.
     third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
     numbers, figure_data = compare_boards(third, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}
@@ -258,7 +268,7 @@ def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_of_real_and_simulated_no_load_readings(real):
+def test_memory_of_recordings_is_recovered_and_that_of_the_simulation_is_the_set_one(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
         fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]

@@ -58,7 +58,7 @@ def test_table_compares_simulations_with_bounds():
         assert words in table.attrs["meaning"]
 
 
-def test_single_board_of_equal_forces_has_no_growth_or_refit():
+def test_table_for_one_board_with_equal_forces_has_no_growth_and_no_second_fit():
     alone = copy.deepcopy(BOARD)
     for section in (alone, alone["nominal"]):
         del section["growth"]
@@ -71,14 +71,14 @@ def test_single_board_of_equal_forces_has_no_growth_or_refit():
     assert "simulated" in texts_of(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
 
 
-def test_tables_of_axes_and_parameters():
+def test_tables_list_axes_and_parameters():
     found = tables(NUMBERS, "recorded")
     assert found["compare_frames"]["orientation"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
     assert {"gap, mm", "slide to the middle, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
 
-def test_figure_labels():
+def test_figures_have_labels():
     svgs = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in texts_of(svgs["compare_arrows.svg"])
@@ -88,7 +88,7 @@ def test_figure_labels():
     assert figures(NUMBERS, DRAWN, "recorded") == svgs
 
 
-def test_friction_table_has_the_field_of_a_light_touch():
+def test_friction_table_states_the_field_of_a_light_touch():
     table = tables(NUMBERS, "recorded")["compare_grip"]
     assert table["k / mu, N/mm"].tolist() == ["1e-06", "8.75"]
     assert table["|dB| at 1 mN, µT (median place)"].tolist() == ["300", "3"]

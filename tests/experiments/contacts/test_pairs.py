@@ -1,4 +1,7 @@
-"""Tests of readings of two contacts, made by adding the field changes of two pokes; of predictions and thresholds."""
+"""Tests of readings of two contacts, which are made by adding the field changes of two presses.
+
+Further tests are about predictions for such readings, and about thresholds for detecting them.
+"""
 
 from dataclasses import replace
 
@@ -25,7 +28,7 @@ SKINS = ("b0_s0", "b0_s1", "b1_s0")
 
 
 def grid_rows(force=True):
-    """Return rows of several skins: each place of the grid twice per skin, at random forces."""
+    """Return rows of several skins. On each skin, each place of the grid is pressed twice, with random forces."""
     skins = np.repeat(SKINS, 130)
     rows = tables.rows([name[:2] for name in skins], skins)
     target = np.column_stack([np.tile(points_mm(), (6, 1)), rng_for(0, "force").uniform(0, 3, len(skins))])
@@ -47,21 +50,22 @@ def test_pairs_are_on_one_skin_at_the_given_distance(separation_mm):
     assert (ROWS.skin[pairs.weaker] == ROWS.skin[pairs.stronger]).all()
     assert set(ROWS.board[pairs.weaker]) == {"b0"}
     apart_mm = np.linalg.norm(ROWS.target[pairs.weaker, :2] - ROWS.target[pairs.stronger, :2], axis=1)
-    assert np.abs(apart_mm - separation_mm).max() <= TOLERANCE_MM + 1e-5  # rounding of 16 mm to float32
+    # The tolerance includes the rounding of 16 mm to single precision.
+    assert np.abs(apart_mm - separation_mm).max() <= TOLERANCE_MM + 1e-5
     assert (ROWS.target[pairs.weaker, 2] <= ROWS.target[pairs.stronger, 2]).all()
     assert len(pairs.weaker) == 80
 
 
-def test_only_distance_zero_pairs_one_place_with_itself():
+def test_place_is_paired_with_itself_only_at_distance_zero():
     same = pairs_at(0.0)
     np.testing.assert_array_equal(ROWS.target[same.weaker, :2], ROWS.target[same.stronger, :2])
-    # neighbouring places are 0.4 mm apart
+    # The grid is scaled, so that neighbouring places are 0.4 mm apart. This is less than the tolerance of distances.
     close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))
     pairs = pairs_at(0.4, rows=close)
     assert (close.target[pairs.weaker, :2] != close.target[pairs.stronger, :2]).any(axis=1).all()
 
 
-def test_without_forces_the_weaker_contact_has_the_smaller_field():
+def test_if_forces_are_unknown_the_weaker_contact_has_the_smaller_field():
     rows = grid_rows(force=False)
     pairs = pairs_at(4.0, rows=rows)
     length = [np.linalg.norm(rows.db_uT[side], axis=1) for side in (pairs.weaker, pairs.stronger)]
@@ -77,7 +81,7 @@ def test_reading_of_a_pair_is_the_sum_of_field_changes():
         np.testing.assert_array_equal(pairs.sum_uT(ROWS.db_uT)[i], both)
 
 
-def test_distance_without_places_is_an_error():
+def test_distance_that_no_two_places_have_is_refused():
     with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm. Correct contacts.separations_mm"):
         pairs_at(31.0)
 
@@ -86,11 +90,11 @@ def contacts_of(*rows):
     return np.array(rows, np.float32)
 
 
-def test_prediction_between_two_known_contacts():
+def test_prediction_is_compared_with_two_known_contacts():
     weaker, stronger = contacts_of([0, 0, 1], [0, 0, 1]), contacts_of([4, 0, 3], [0, 8, 3])
     predicted = contacts_of([3, 0.5, 4], [0, 5, 2])
     numbers = compare_prediction(weaker, stronger, predicted)
-    # only the first prediction is within 1 mm of a contact in x and in y
+    # Only the first prediction is within 1 mm of a contact, both in x and in y.
     assert numbers["near_either_pct"] == 50
     assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
     assert numbers["along"] == pytest.approx((3 / 4 + 5 / 8) / 2)
@@ -104,7 +108,8 @@ def test_perpendicular_offset_does_not_change_the_position_along_the_line(share,
     weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
     predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
-    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # tolerance of float32
+    # The tolerance is that of single precision.
+    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -115,13 +120,13 @@ def test_perpendicular_offset_does_not_change_the_position_along_the_line(share,
         (["b0", "b0", "b0"], ["s0", "s0", "s0"], [0, 1, 2], [2], "pass"),
     ],
 )
-def test_thresholds_come_from_another_board_skin_or_pass(boards, skins, passes, aside, what):
+def test_thresholds_are_fitted_to_another_board_or_skin_or_pass(boards, skins, passes, aside, what):
     fit, kept, unit = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
     assert (kept.tolist(), unit) == (aside, what)
     assert sorted([*fit, *kept]) == [0, 1, 2]
 
 
-def test_single_pass_of_one_skin_is_an_error():
+def test_thresholds_from_a_single_pass_of_one_skin_are_refused():
     with pytest.raises(ParamsError, match="of a single board, skin and pass"):
         keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
 
@@ -130,7 +135,7 @@ def scores(name, shift=0.0, n=400):
     return {"odd": rng_for(0, "scores", name).normal(shift, 1, n)}
 
 
-def test_thresholds_depend_only_on_held_out_contacts():
+def test_thresholds_depend_only_on_contacts_that_are_set_aside():
     aside, double = scores("aside"), {0.0: scores("same"), 4.0: scores("four", 2)}
     one = detection_rates(aside, scores("single"), double, 0.1)
     other = detection_rates(aside, scores("single", 5), double, 0.1)
@@ -138,14 +143,14 @@ def test_thresholds_depend_only_on_held_out_contacts():
     assert detection_rates(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
 
 
-def test_total_auc_excludes_pairs_at_one_place():
+def test_overall_roc_area_excludes_pairs_at_one_place():
     single, separated = scores("single"), scores("four", 2)
     found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: separated}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]
     assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
 
 
-def test_nested_numbers_are_summarised_over_boards():
+def test_nested_numbers_are_averaged_over_boards():
     trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
     assert summarise_nested(trees) == {
         "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "values": [1.0, 3.0]}},

@@ -1,4 +1,4 @@
-"""Tests of experiment contacts on a linear skin, with a predictor that is exact for single contacts."""
+"""Tests of experiment contacts on a skin whose field is linear, with a predictor that is exact for single contacts."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,8 @@ def scene_data():
     rows = tables.rows(boards, [f"{board}_s0" for board in boards])
     force_N = rng_for(0, "forces").uniform(0.5, 3, len(boards))
     places_mm = np.tile(points_mm(), (12, 1))
-    # Each of nine channels reads the force, weighted by the distance between the contact and a spot of the channel.
+    # Each of nine channels reads the force, multiplied by a weight that falls with the distance between the contact and
+    # a place of the channel.
     spots_mm = np.array([[x, y] for x in (2, 8, 14) for y in (2, 8, 14)])
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
@@ -34,7 +35,7 @@ def scene_data():
 
 
 def nearest_neighbour(data):
-    """Return a predictor that returns the target of the most similar row, which is exact for single contacts."""
+    """Return a predictor that returns the targets of the most similar row. It is exact for single contacts."""
 
     def predict(db_uT):
         known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
@@ -51,22 +52,24 @@ FOLD = Fold("lobo", "b0", np.flatnonzero(DATA.rows.board != "b0"), TEST, np.zero
 NUMBERS, DRAWN = evaluate_board(DATA, FOLD, SECTION, [nearest_neighbour(DATA)])
 
 
-def test_distant_contacts_are_detected_better():
+def test_contacts_far_apart_are_detected_better_than_close_ones():
     found = NUMBERS["by_separation"]
     for detector in ("direction and length", "direction above noise", "residual"):
-        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # chance level is 0.5
-        assert NUMBERS["false_alarm_pct"][detector] < 25  # the threshold aims at 10 %
+        # The ROC area at chance level is 0.5.
+        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)
+        # The threshold is chosen for 10 % false alarms on the contacts that are set aside.
+        assert NUMBERS["false_alarm_pct"][detector] < 25
 
 
-def test_prediction_is_between_the_contacts_and_nearer_the_stronger():
+def test_predicted_place_is_between_the_contacts_and_nearer_to_the_stronger_one():
     assert 0.5 < NUMBERS["falls"][8.0]["along"] < 1.0
     assert NUMBERS["falls"][4.0]["nearest_mm"] < NUMBERS["falls"][8.0]["nearest_mm"]
-    # two contacts at one place equal one contact with the sum of the forces
+    # Two contacts at one place equal a single contact with the sum of their forces.
     assert NUMBERS["falls"][0.0]["near_either_pct"] == 100
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
-def test_disagreement_of_networks_needs_two_networks():
+def test_disagreement_between_networks_is_undefined_for_one_network():
     assert "networks disagree" not in NUMBERS["auc"]
     numbers, _ = evaluate_board(
         DATA, FOLD, SECTION, [nearest_neighbour(DATA), lambda db_uT: nearest_neighbour(DATA)(-db_uT)]
@@ -74,5 +77,5 @@ def test_disagreement_of_networks_needs_two_networks():
     assert "networks disagree" in numbers["auc"]
 
 
-def test_evaluation_is_reproducible():
+def test_equal_seeds_give_equal_results():
     assert evaluate_board(DATA, FOLD, SECTION, [nearest_neighbour(DATA)]) == (NUMBERS, DRAWN)

@@ -1,4 +1,7 @@
-"""Tests of the superposition error: the sum of the field changes of two contacts, compared with both at once."""
+"""Tests of the superposition error.
+
+This is the difference between the sum of the field changes of two contacts and the field change of both at once.
+"""
 
 import numpy as np
 import pytest
@@ -35,11 +38,12 @@ def rms(values):
     return np.sqrt((values**2).mean())
 
 
-def test_single_contact_equals_the_simulator():
+def test_field_change_of_a_single_contact_equals_that_of_the_simulator():
     poke_m = np.array([[2e-3, -3e-3, DEPTH_M]])
     ((_, before, after),) = moved_dipoles(SKIN, poke_m - [0, 0, SKIN.depth_zero_m])
     theirs_T = change_of_field(before, after, BOARD.chips_m)
-    # Interpolation between the five heights used here has an error of 1 %; between the nine of the experiment, 0.3 %.
+    # The tolerance is the error of interpolation: 1 % between the five heights used here, and 0.3 % between the nine
+    # heights of the experiment.
     assert rms(pressed_T(poke_m[0]) - theirs_T) < 0.02 * rms(theirs_T)
 
 
@@ -48,15 +52,15 @@ def test_superposition_error_falls_with_distance_and_rises_with_depth():
         (row["depth_mm"], row["separation_mm"]): row["error_pct"] for row in superposition(SCENE, (4.0, 12.0), seed=1)
     }
     assert sorted(rows) == [(0.6, 4), (0.6, 12), (1.2, 4), (1.2, 12)]
-    # The error is a product of two displacements. Relative to the field change, the error is therefore proportional to
-    # the depth.
+    # The error is a product of the displacements by the two contacts, so it is quadratic in the depth. Relative to the
+    # field change, which is linear in the depth, the error is therefore proportional to the depth.
     for separation_mm in (4, 12):
         assert rows[0.6, separation_mm] < 0.7 * rows[1.2, separation_mm]
     for depth_mm in (0.6, 1.2):
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]
 
 
-def test_field_is_from_both_contacts():
+def test_field_of_two_contacts_is_caused_by_both():
     a_m, b_m = (-5e-3, 0, DEPTH_M), (5e-3, 1e-3, DEPTH_M)
     together_T = pressed_T(a_m, b_m)
     for one_m in (a_m, b_m):
@@ -64,8 +68,9 @@ def test_field_is_from_both_contacts():
     assert rms(together_T - pressed_T(a_m) - pressed_T(b_m)) < 0.1 * rms(together_T)
 
 
-def test_rotated_moments_keep_their_length():
+def test_moments_rotated_by_two_contacts_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
     length, before = (np.linalg.norm(vectors, axis=1) for vectors in (moments, SKIN.moments_A_m2))
-    # Interpolation between two rotated vectors is along a chord, so the result is too short by up to (angle^2) / 8.
+    # The tolerance is that of interpolation between two rotated vectors, which follows a chord. The result is too short
+    # by up to the squared angle divided by 8.
     np.testing.assert_allclose(length, before, rtol=0.05)

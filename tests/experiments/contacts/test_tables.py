@@ -25,7 +25,7 @@ SUPERPOSED = [{"depth_mm": 1.2, "separation_mm": 4.0, "pairs_n": 6, "error_pct":
 DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
 
 
-def test_table_has_a_row_for_each_distance_and_for_single_contacts():
+def test_table_has_a_row_for_single_contacts_and_for_each_distance():
     table = tables(NUMBERS, "recorded")["contacts"]
     assert table["distance of the contacts, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
@@ -36,17 +36,17 @@ def test_table_has_a_row_for_each_distance_and_for_single_contacts():
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
-def test_recorded_scenes_have_no_superposition_table():
+def test_recorded_scenes_have_no_table_of_superposition_errors():
     assert set(tables(NUMBERS, "recorded")) == {"contacts"}
     table = tables(NUMBERS | {"superposition": SUPERPOSED}, "simulated")["superposition"]
     assert table["error of the sum, % of the change of field"].tolist() == ["13.2"]
 
 
-def test_figure_labels():
+def test_figure_has_labels():
     svgs = figures(NUMBERS, DRAWN, "recorded")
     labels = texts_of(svgs["contacts.svg"])
     for label in ("direction", "residual", "stronger contact", "distance of the contacts / mm", "%", "(recorded)"):
         assert label in labels
     assert figures(NUMBERS, DRAWN, "recorded") == svgs
     nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")
-    assert nearer != svgs  # contacts at one place are plotted too
+    assert nearer != svgs  # Two contacts at one place have no distance, but are plotted too.

@@ -13,11 +13,14 @@ LATE = {
     "network_board": ["b0", "b1", "b2", "b3"],
 }  # fmt: skip
 CONTACTS_N = [5000, 10_000, 15_000, 20_000]
-BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # relative differences of the errors of four networks
+BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # Relative differences between the errors of four networks, one per board.
 
 
 def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True) -> dict[str, np.ndarray]:
-    """Return errors [network, window] in four windows, which grow by `per_window` from one window to the next."""
+    """Return errors in four windows of contacts, as arrays [network, window].
+
+    From one window to the next, the errors grow by `per_window`.
+    """
     places = np.array([[start * (1 + more) + i * per_window * (1 + more) for i in range(4)] for more in by_seed])
     return {"mse_xy_mm2": places} | ({"mse_f_N2": places / 100} if force else {})
 
@@ -37,7 +40,7 @@ def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
     return {name: one["verdict"] for name, one in findings_by_name(networks, late).items()}
 
 
-def test_errors_like_the_papers_support_all_findings():
+def test_all_findings_are_supported_by_errors_like_those_of_the_paper():
     assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
     assert all(one["holds"] for one in findings_by_name(PAPER).values())
 
@@ -45,21 +48,22 @@ def test_errors_like_the_papers_support_all_findings():
 @pytest.mark.parametrize(
     ("finding", "changed", "late"),
     [
-        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # the errors are higher but do not grow faster
-        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # the errors grow faster but are not higher
+        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # The errors are higher, but do not grow faster.
+        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # The errors grow faster, but are not higher.
         (OFFSET, {"initial": errors(0.1, 0.0)}, LATE),
         (EACH_IS_WORSE, {"each": errors(0.1, 0.01)}, LATE),
         (OVERESTIMATES, {}, LATE | {"bias_N": -0.02, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]}),
     ],
 )
-def test_opposite_finding_is_contradicted(finding, changed, late):
+def test_finding_is_contradicted_by_significant_opposite_errors(finding, changed, late):
     one = findings_by_name(PAPER | changed, late)[finding]
     assert (one["holds"], one["verdict"]) == (False, CONTRADICTED)
 
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
 def test_finding_is_undecided_if_boards_disagree(finding):
-    # factors of the difference, one per board; the mean over boards agrees with the paper
+    # Factors of the difference between two policies, one per board. Their mean agrees with the paper, but one has the
+    # opposite sign.
     signs = (-1.0, 1.2, 0.3, 0.1)
     near = errors(0.2, 0.01)
     disagreeing = {
@@ -70,20 +74,20 @@ def test_finding_is_undecided_if_boards_disagree(finding):
     assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
-def test_single_network_has_no_verdict():
+def test_findings_from_a_single_network_have_no_verdict():
     alone = {policy: {name: values[:1] for name, values in metrics.items()} for policy, metrics in PAPER.items()}
     findings = findings_by_name(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
     assert {one["verdict"] for one in findings.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
 
 
-def test_networks_of_one_board_have_no_verdict_over_boards():
+def test_findings_from_networks_of_one_board_have_no_verdict_over_boards():
     one_board = findings_by_name(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in one_board.values()} == {SUPPORTED}
 
 
-def test_repeated_networks_do_not_narrow_the_interval():
+def test_more_networks_per_board_do_not_narrow_the_interval_over_boards():
     twice = {
         policy: {name: np.repeat(values, 2, axis=0) for name, values in metrics.items()}
         for policy, metrics in PAPER.items()
@@ -95,22 +99,22 @@ def test_repeated_networks_do_not_narrow_the_interval():
     assert again[OFFSET]["measured"] == once[OFFSET]["measured"]
 
 
-def test_finding_is_contradicted_if_one_metric_contradicts_it():
+def test_finding_is_contradicted_if_one_of_its_metrics_contradicts_it():
     falls = PAPER["initial"] | {"mse_f_N2": 0.02 - 0.004 * np.arange(4) + np.array([[0.0], [1e-5], [2e-5], [3e-5]])}
     assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == CONTRADICTED
     unclear = PAPER["initial"] | {"mse_f_N2": PAPER["regular"]["mse_f_N2"] + np.array([[-1.0], [1.0], [0.3], [0.1]])}
     assert verdicts(PAPER | {"initial": unclear})[OFFSET] == UNDECIDED
 
 
-def test_policies_are_compared_over_all_windows():
+def test_no_load_policies_are_compared_by_the_mean_over_all_windows():
     last_good = {name: values.copy() for name, values in errors(1.0, 0.5).items()}
     for values in last_good.values():
         values[:, -1] = 0
     assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
-def test_paired_differences_cancel_errors_common_to_both_policies():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # errors of a seed that are equal under both policies
+def test_errors_common_to_two_policies_cancel_in_paired_differences():
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # Errors of each network that are equal under both policies.
     regular = {name: values + shared for name, values in PAPER["regular"].items()}
     each_contact = {name: values + shared for name, values in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE] == SUPPORTED
@@ -124,10 +128,12 @@ def test_paired_differences_cancel_errors_common_to_both_policies():
     ("bias_N", "se_N", "networks_N", "verdict"),
     [
         (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], SUPPORTED),
-        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),  # the bias is only two standard errors over indentations
+        # The bias is only two standard errors, where the standard error is that over indentations.
+        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),
         (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
         (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),
-        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # the networks differ by more than the bias
+        # The biases of the four networks differ by more than their mean.
+        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),
     ],
 )
 def test_bias_must_exceed_the_variation_over_indentations_and_networks(bias_N, se_N, networks_N, verdict):
@@ -141,7 +147,7 @@ def test_without_forces_only_place_errors_are_judged():
     assert not any("MSE_F" in one["measured"] for one in findings_by_name(two, None).values())
 
 
-def test_untestable_findings_are_omitted():
+def test_findings_that_cannot_be_tested_are_omitted():
     assert findings_by_name({"initial": errors(1, 1)}, None) == {}
     one_window = {
         policy: {name: values[:, :1] for name, values in metrics.items()} for policy, metrics in PAPER.items()
@@ -150,14 +156,14 @@ def test_untestable_findings_are_omitted():
 
 
 @given(st.lists(st.floats(0, 10), min_size=2, max_size=9))
-def test_growth_equals_the_slope_of_numpys_fit(values):
+def test_growth_of_errors_equals_the_slope_of_numpys_linear_fit(values):
     contacts_n = [5000 * i for i in range(len(values))]
     slope = np.polyfit(np.array(contacts_n) / 10_000, values, 1)[0]
-    # rounding in double precision
+    # The tolerance is rounding in double precision.
     assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)
 
 
-def test_measured_text_has_policies_difference_and_interval():
+def test_text_of_a_finding_has_both_policies_their_difference_and_its_interval():
     first, offset, third, late = (one["measured"] for one in findings_by_name(PAPER).values())
     assert first.startswith("MSE_xy, mean over windows: initial 1.75, regular 0.215, difference +1.5 [")
     assert "MSE_xy, growth in 10,000 contacts: initial 1, regular 0.02, difference +0.98 [" in first

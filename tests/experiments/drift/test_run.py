@@ -1,4 +1,4 @@
-"""Tests of experiments drift and variation with the settings of scene ci, on a skin whose field is a simple formula."""
+"""Tests of experiments drift and variation on a skin whose field is a simple formula, with the settings of scene ci."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +21,16 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 
 ROOT = Path(__file__).resolve().parents[3]
-# 390 contacts per capture; the no-load field of every channel drifts by DRIFT_uT per contact
+# A capture has 390 contacts. With each contact, the no-load field of every channel drifts by DRIFT_uT.
 DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3
 EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 
 
 def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
-    """Return a capture: two readings per contact, field change linear in place and force, drifting no-load field."""
+    """Return a capture with two readings per contact.
+
+    The field change is linear in place and force, and the no-load field drifts.
+    """
     places = np.tile(points_mm(), (len(DEPTHS_MM) * PASSES_N, 1))[:pokes_n]
     depth_mm = np.tile(np.repeat(DEPTHS_MM, 65), PASSES_N)[:pokes_n]
     n = len(places)
@@ -53,7 +56,10 @@ def write(folder: Path, *captures: Readings) -> Path:
 
 @pytest.fixture
 def scene(tmp_path, monkeypatch) -> dict[str, Any]:
-    """Return the command-line options of both stages: scene ci with longer training, cached in the test's folder."""
+    """Return the command-line options of both stages.
+
+    They select scene ci with longer training, and a cache in the folder of the test.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
@@ -69,7 +75,7 @@ def drift_section(scene: dict[str, Any]) -> Drift:
     return scene["settings"].section(Drift, "drift")
 
 
-def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
+def test_on_a_drifting_skin_the_no_load_reading_from_the_start_has_the_largest_errors(scene, tmp_path):
     drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
@@ -78,8 +84,8 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
-    # No-load readings before each contact remove the drift. The initial reading removes no drift. Regular readings
-    # leave the drift of at most 20 contacts.
+    # Under policy "each", a no-load reading before each contact removes the whole drift. Under policy "initial",
+    # nothing is removed. Under policy "regular", the drift of at most 20 contacts remains.
     off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
     assert off_uT["each"] == 0
     assert off_uT["initial"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(np.arange(300, 330) ** 2.0)), rel=1e-3)
@@ -87,13 +93,14 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert off_uT["regular"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(ranks**2.0)), rel=1e-3)
     last = {policy: numbers[policy][-1]["mse_xy_mm2"] for policy in off_uT}
     assert last["initial"] > 2 * max(last["regular"], last["each"])
-    assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # the skin does not soften
+    # The skin does not soften, so all of the force is left.
+    assert numbers["late"]["force_left_pct"] == pytest.approx(100)
     assert numbers["late"]["indentations_n"] == len(results["drawn"]["late"]["true_N"]) == 30
     assert len(numbers["late"]["network_bias_N"]) == 2
     assert all(row["spread"]["mse_xy_mm2"] > 0 for policy in off_uT for row in numbers[policy])
     assert all(numbers["last_window"][policy]["mse_xy_mm2"]["sd_seeds"] > 0 for policy in off_uT)
     assert {one["verdict"] for one in numbers["findings"]} == {"not judged (fewer than 4 boards)"}
-    # The size of the field change does not depend on the no-load policy.
+    # The size of the field change of a contact does not depend on the policy.
     db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
     assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
     assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
@@ -102,8 +109,8 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
     svgs = drift_pages.figures(numbers, results["drawn"], "simulated")
     assert set(svgs) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
-    # With steps of 0 uT, the random walk has the errors of the last window. Readings before every contact remove any
-    # walk.
+    # A random walk with steps of 0 uT adds nothing, so the errors are those of the last window. Under policy "each",
+    # the errors do not depend on the walk, because its no-load readings remove any walk.
     for policy, (without_walk, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
         assert {name: without_walk[name] for name in last} == pytest.approx(last)
@@ -111,7 +118,7 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 
-def test_recorded_scenes_have_no_added_walk(scene, tmp_path):
+def test_adding_a_random_walk_to_recordings_is_refused(scene, tmp_path):
     wear = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT is .* but a recorded scene"):
         drift(section=drift_section(scene), indentations=wear, **scene)
@@ -127,13 +134,13 @@ def test_recorded_scenes_have_no_added_walk(scene, tmp_path):
         ),
     ],
 )
-def test_captures_without_order_or_windows_are_an_error(scene, tmp_path, captures, sentence):
+def test_captures_of_unknown_order_or_too_few_contacts_are_refused(scene, tmp_path, captures, sentence):
     with pytest.raises(ParamsError, match=sentence):
         drift(section=drift_section(scene), indentations=write(tmp_path / "wear", *captures), **scene)
     assert not (tmp_path / ".reskin").exists()
 
 
-def test_variation_recovers_drift_and_gain(scene, tmp_path):
+def test_variation_recovers_the_drift_and_the_gain_of_a_skin(scene, tmp_path):
     wear = write(tmp_path / "wear", capture("s0-wear"))
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
@@ -141,16 +148,18 @@ def test_variation_recovers_drift_and_gain(scene, tmp_path):
     variation(section=scene["settings"].section(Variation, "variation"), main=main, indentations=wear, **scene)
     results = io.read_json(scene["results"])
     assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
-    # the plotted visits are those of the first 200 contacts
+    # The plotted visits are those within the first 200 contacts.
     assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)
-    # temperatures are float32
+    # The relative tolerance is for temperatures, which are in single precision.
     assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)
     for place in results["numbers"]["places"]:
-        assert place["time"]["visits_n"] == 2  # two of three passes visit the place within the first 200 contacts
+        # There are three passes. Two of them visit the place within the first 200 contacts.
+        assert place["time"]["visits_n"] == 2
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
-        assert place["time"]["db_change_uT"] < 1e-3  # rounding of fields of 1000 uT to float32
-        assert place["skins"]["skins"] == ["s0", "s1"]  # the first skin of each board
-        # The second skin has 1.5 times the field of the first, so they differ by half the weaker field. The
+        # The tolerance is the rounding of fields of 1000 uT to single precision.
+        assert place["time"]["db_change_uT"] < 1e-3
+        assert place["skins"]["skins"] == ["s0", "s1"]  # The first skin of each board.
+        # The second skin has 1.5 times the field of the first, so the two fields differ by half the weaker one. The
         # spread is relative to the rms of both fields.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
     assert set(variation_pages.figures(results["numbers"], results["drawn"], "simulated")) == {
@@ -166,17 +175,19 @@ def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
     line = capture("s0-wear")
     further = add_walk(line, step_uT, after_n=AFTER_N, seed=seed)
     np.testing.assert_allclose(further.b_uT - line.b_uT, further.noload_uT - line.noload_uT, atol=2e-3)
-    return (further.noload_uT - line.noload_uT)[::2].astype(float)  # two readings per contact
+    # There are two readings per contact, of which the first is used.
+    return (further.noload_uT - line.noload_uT)[::2].astype(float)
 
 
-def test_added_walk_starts_after_training_and_grows_with_the_root_of_contacts():
+def test_added_random_walk_starts_after_the_training_contacts_and_grows_with_their_root():
     walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
     assert np.abs(walk[:AFTER_N]).max() == 0
     for contacts_n in (1, 16, 256):
         rms_uT = np.sqrt((walk[AFTER_N - 1 + contacts_n] ** 2).mean())
-        assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)  # rms over 300 walks
+        # The tolerance is for an rms over 300 walks.
+        assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)
 
 
-def test_added_walk_is_proportional_to_its_step():
+def test_added_random_walk_is_proportional_to_its_step():
     np.testing.assert_allclose(walk_uT(2.0), 2 * walk_uT(1.0), atol=2e-3)
     assert np.abs(walk_uT(0.0)).max() == 0

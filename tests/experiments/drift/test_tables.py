@@ -8,7 +8,10 @@ from pipeline.report.formatting import to_markdown
 
 
 def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
-    """Return the numbers of two windows and three policies; with `spread`, there are standard deviations over seeds."""
+    """Return the numbers of two windows and three no-load policies.
+
+    With `spread`, the numbers include standard deviations over seeds.
+    """
     policies = {}
     for i, policy in enumerate(("initial", "regular", "each")):
         metrics = {"accuracy_pct": 50.0 + i, "mse_xy_mm2": 2.0 - i / 2} | (
@@ -42,7 +45,7 @@ DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_table_has_a_row_per_window_with_all_policies(source):
+def test_table_has_a_row_per_window_with_all_policies_beside_each_other(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
     assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02000 ± 0.00040"] * 2
@@ -50,7 +53,7 @@ def test_table_has_a_row_per_window_with_all_policies(source):
     assert set(table["source"]) == {source}
 
 
-def test_findings_table_has_verdicts_and_sizes():
+def test_findings_table_has_a_verdict_and_the_measured_differences():
     table = tables(numbers(), "simulated")["drift_findings"]
     assert table["holds"].tolist() == ["yes", "no", "not judged (fewer than 4 boards)"]
     assert table["over these training runs"].tolist() == ["yes", "no", "yes"]
@@ -65,7 +68,7 @@ def test_findings_table_has_verdicts_and_sizes():
     )
 
 
-def test_note_states_the_protocol_and_omitted_contacts():
+def test_note_states_the_protocol_and_how_many_contacts_were_omitted():
     assert "first 5,000 indentations of each skin, tested on 1,000 indentations after every 5,000" in to_markdown(
         tables(numbers(), "simulated")["drift"]
     )
@@ -86,27 +89,27 @@ def test_note_states_the_time_per_contact():
     assert "The times of the contacts are not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
-def test_note_states_what_the_spread_is_taken_over():
+def test_note_states_over_what_standard_deviations_are_taken():
     text = to_markdown(tables(numbers(), "simulated")["drift"])
     assert "± is the standard deviation over 2 network seeds, all tested on the same contacts." in text
     text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
     assert "± is the standard deviation over 4 skins with 2 network seeds each." in text
 
 
-def test_single_network_has_no_spread():
+def test_table_of_a_single_network_has_no_standard_deviations():
     text = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
     assert "of one network" in text
     assert "±" not in text
 
 
-def test_unknown_forces_are_not_shown():
+def test_table_without_known_forces_has_no_force_errors():
     unknown = numbers(force=False)
     assert "MSE_xy, mm² (before every contact)" in tables(unknown, "recorded")["drift"]
     assert list(svgs := figures(unknown, {}, "recorded")) == ["drift.svg"]
     assert "MSE_xy / mm²" in svgs["drift.svg"]
 
 
-def test_figure_labels():
+def test_figure_has_labels():
     svgs = figures(numbers(), DRAWN, "simulated")
     words = {name: " ".join(" ".join(ET.fromstring(svg).itertext()).split()) for name, svg in svgs.items()}
     for text in words.values():
@@ -118,7 +121,7 @@ def test_figure_labels():
         assert label in words["drift_force.svg"]
 
 
-def test_table_of_the_added_walk_has_a_row_per_step():
+def test_table_of_the_added_random_walk_has_a_row_per_step():
     steps = {
         policy: [
             {
@@ -142,15 +145,15 @@ def test_table_of_the_added_walk_has_a_row_per_step():
     assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")
 
 
-def test_each_policy_has_a_fixed_colour():
+def test_each_no_load_policy_has_a_fixed_colour():
     both = numbers()
     del both["regular"], both["late"]
     colours = set(re.findall(r"stroke: (#\w{6})", figures(both, {}, "recorded")["drift.svg"]))
-    assert "#d55e00" in colours  # the third colour: policy "before every contact"
+    assert "#d55e00" in colours  # Policy "before every contact" has the third colour.
     assert "#0072b2" not in colours
 
 
-def test_figures_are_reproducible():
+def test_equal_data_give_equal_figures():
     points = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
     first, again, other = (figures(numbers(), figure_data, "simulated") for figure_data in (DRAWN, DRAWN, points))
     assert first == again != other

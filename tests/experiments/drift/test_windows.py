@@ -28,7 +28,10 @@ from tests.data.tables import readings
 
 
 def predictions(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1, **changes) -> WindowPredictions:
-    """Return predictions with place errors of 0.5 mm and a force bias of `bias_N`, two readings per indentation."""
+    """Return predictions with two readings per indentation.
+
+    Their place errors are 0.5 mm, and their forces have the bias `bias_N`.
+    """
     rng = rng_for(0, "answers", policy, skin, window_i)
     true = np.repeat(rng.uniform(0.5, 3, (n // 2, 3)), 2, axis=0).astype(np.float32)
     error = rng_for(seed_i, "errors", policy, window_i).normal(0, 0.5, true.shape) + [0, 0, bias_N]
@@ -39,7 +42,7 @@ def predictions(policy="each", skin="s0", seed_i=0, window_i=0, n=40, bias_N=0.1
     return WindowPredictions(policy, f"board of {skin}", skin, seed_i, window_i, **(values | changes))
 
 
-def test_window_has_mean_and_standard_deviation_over_skins_and_seeds():
+def test_errors_in_a_window_have_a_mean_and_a_standard_deviation_over_skins_and_seeds():
     networks = [predictions(skin=skin, seed_i=seed_i) for skin in ("s0", "s1") for seed_i in (0, 1)]
     [row] = window_means(score_windows([*networks, predictions("initial")]), "each")
     for name in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
@@ -51,7 +54,7 @@ def test_window_has_mean_and_standard_deviation_over_skins_and_seeds():
     assert row["contacts_n"] == 5000
 
 
-def test_window_without_forces_has_no_force_error_and_single_network_no_spread():
+def test_without_forces_there_is_no_force_error_and_for_one_network_no_standard_deviation():
     true = predictions().true.copy()
     true[:, 2] = np.nan
     [row] = window_means(score_windows([predictions(true=true)]), "each")
@@ -76,7 +79,7 @@ def test_bias_and_standard_error_over_indentations_equal_scipy():
     bias = force_bias(contact_forces(networks))
     errors_N = np.array(predicted_N) - np.array(true_N)
     assert bias["indentations_n"] == 40
-    # rounding of forces to float32 is 1e-7 N
+    # The absolute tolerance is the rounding of forces to single precision, which is 1e-7 N.
     assert bias["bias_N"] == pytest.approx(errors_N.mean(), rel=1e-5)
     assert bias["bias_se_N"] == pytest.approx(sem(errors_N), rel=1e-5)
     assert bias["slope"] == pytest.approx(linregress(true_N, predicted_N).slope, rel=1e-5)
@@ -86,24 +89,26 @@ def test_bias_and_standard_error_over_indentations_equal_scipy():
 @given(st.floats(-0.5, 0.5))
 def test_constant_force_error_changes_only_the_bias(more_N):
     plain, more = (force_bias(contact_forces([predictions(bias_N=bias_N)])) for bias_N in (0.0, more_N))
-    assert more["bias_N"] - plain["bias_N"] == pytest.approx(more_N, abs=1e-6)  # forces are float32
+    # The tolerance is rounding, because forces are in single precision.
+    assert more["bias_N"] - plain["bias_N"] == pytest.approx(more_N, abs=1e-6)
     assert more["slope"] == pytest.approx(plain["slope"], abs=1e-6)
 
 
 def readings_at(points_mm: list, force_N: list):
-    """Return readings with these x, y and depth in mm."""
+    """Return readings at these places x, y and depths in mm."""
     x_mm, y_mm, depth_mm = np.array(points_mm, np.float32).T
     return readings(f=len(points_mm), x_mm=x_mm, y_mm=y_mm, depth_mm=depth_mm, Fz_N=np.array(force_N, np.float32))
 
 
 @given(st.floats(0.5, 1.0), st.permutations(range(4)))
-def test_remaining_force_is_measured_at_equal_places_and_depths(left, order):
+def test_remaining_force_compares_readings_at_equal_places_and_depths(left, order):
     points_mm, force_N = [[0, 0, 1], [2, 0, 1], [0, 0, 2], [4, 4, 1]], [1.0, 2.0, 4.0, np.nan]
     early = readings_at([points_mm[i] for i in order], [force_N[i] for i in order])
     late = readings_at(
         [points_mm[1], points_mm[0], points_mm[0], points_mm[3], [6, 6, 1]], [2 * left, left, left, 9.0, 9.0]
     )
-    assert force_left(early, late) == pytest.approx(100 * left, rel=1e-6)  # forces are float32
+    # The tolerance is rounding, because forces are in single precision.
+    assert force_left(early, late) == pytest.approx(100 * left, rel=1e-6)
 
 
 def test_remaining_force_without_repeated_places_is_unknown():
@@ -115,7 +120,8 @@ def test_plotted_points_are_rounded_and_limited_in_number():
     contacts = contact_forces([predictions(n=6000)])
     plotted = points(contacts)
     assert len(plotted["true_N"]) == len(plotted["predicted_N"]) == 1500 <= POINTS_MAX_N
-    np.testing.assert_allclose(plotted["true_N"], contacts.true_N[::2], atol=5e-4)  # rounded
+    # Plotted forces are rounded to 0.001 N.
+    np.testing.assert_allclose(plotted["true_N"], contacts.true_N[::2], atol=5e-4)
 
 
 def test_network_errors_are_ordered_by_skin_and_seed():
@@ -131,26 +137,28 @@ def test_network_errors_are_ordered_by_skin_and_seed():
     np.testing.assert_allclose(found["mse_f_N2"], expected)
 
 
-def test_late_bias_is_the_mean_over_networks():
+def test_bias_in_the_late_window_is_the_mean_over_networks():
     networks = [predictions(seed_i=seed_i, bias_N=bias_N) for seed_i, bias_N in enumerate((0.1, -0.2, 0.4))]
     numbers, _ = late_force(networks, "each", 0)
     assert len(numbers["network_bias_N"]) == 3
     errors_N = [float((one.predicted - one.true)[:, 2].mean()) for one in networks]
-    assert numbers["network_bias_N"] == pytest.approx(errors_N, abs=1e-6)  # forces are float32
+    # The tolerance is rounding, because forces are in single precision.
+    assert numbers["network_bias_N"] == pytest.approx(errors_N, abs=1e-6)
     assert numbers["bias_N"] == pytest.approx(np.mean(errors_N), abs=1e-6)
 
 
-def test_late_forces_are_by_seed_and_points_are_of_the_first_seed():
+def test_forces_in_the_late_window_are_kept_per_seed_and_plotted_for_the_first_seed():
     high, low = predictions(seed_i=0, bias_N=0.3), predictions(seed_i=1, bias_N=-0.3)
     numbers, plotted = late_force([low, high], "each", 0)
     alone = [force_bias(contact_forces([one])) for one in (high, low)]
     for name in ("bias_N", "bias_pct", "bias_se_N", "slope"):
         assert numbers[name] == pytest.approx(np.mean([one[name] for one in alone]))
     assert numbers["indentations_n"] == 20
-    assert plotted == points(contact_forces([high]))  # not the points of the mean over networks
+    # The plotted points are those of one network, and not of the mean over networks.
+    assert plotted == points(contact_forces([high]))
 
 
-def test_last_window_has_the_spread_over_seeds():
+def test_last_window_has_standard_deviations_over_seeds():
     networks = [predictions(skin=skin, seed_i=seed_i) for skin in ("s0", "s1") for seed_i in (0, 1, 2)]
     mse_N2 = np.array([score(one.true, one.predicted)["mse_f_N2"] for one in networks]).reshape(2, 3)
     found = last_window(score_windows(networks), "each")["mse_f_N2"]
@@ -181,7 +189,9 @@ def test_field_sizes_exclude_rows_without_contact():
         f=4000, indentation=np.arange(4000, dtype=np.int32), b_uT=b_uT, noload_uT=noload_uT, x_mm=x_mm,
     )  # fmt: skip
     sizes = field_sizes([one])
-    assert sizes["contact_uT"] == pytest.approx(3, rel=1e-5)  # rounding of fields of 100 uT to float32
-    assert sizes["noload_noise_uT"] == pytest.approx(1.5, rel=0.02)  # 60,000 draws: five standard errors are 2 %
+    # The tolerance is the rounding of fields of 100 uT to single precision.
+    assert sizes["contact_uT"] == pytest.approx(3, rel=1e-5)
+    # The tolerance of 2 % is five standard errors for 60,000 draws.
+    assert sizes["noload_noise_uT"] == pytest.approx(1.5, rel=0.02)
     both = field_sizes([one, replace(one, b_uT=noload_uT + np.float32(4))])
     assert both["contact_uT"] == pytest.approx(np.sqrt((3**2 + 4**2) / 2), rel=1e-5)

@@ -1,4 +1,8 @@
-"""Tests of the reader of layout `eflesh`: a folder of three tables becomes presses (scan) or strokes (force gauge)."""
+"""Tests of the reader of layout `eflesh`, in which a recording is a folder of three tables.
+
+The recording is either a scan, which becomes presses, or was made with a force gauge, and becomes strokes (down and
+up).
+"""
 
 from pathlib import Path
 
@@ -24,7 +28,10 @@ def lines_of(rows: list[list[float]]) -> str:
 
 
 def write(folder: Path, places: list[list[float]], noload_uT: list[float]) -> Path:
-    """Write a recording: row i is at `places[i]` (x, y, z [, grams]); field change of channel c = 500 + i + 10 c uT."""
+    """Write a recording, whose row i is at `places[i]` (x, y, z and, if known, grams).
+
+    In row i, the field change of channel c is 500 + i + 10 c uT.
+    """
     raw = [[500.0 + i + 10.0 * c for c in range(3 * CHIPS_N)] for i in range(len(places))]
     changes = [[float(np.float32(b - base)) for b in row] for row, base in zip(raw, noload_uT, strict=True)]
     time_s = [START_s + 4.25 * i for i in range(len(places))]
@@ -40,7 +47,10 @@ def scan(folder: Path, passes_n: int = 3) -> Path:
 
 
 def strokes(folder: Path, strokes_n: int = 3) -> Path:
-    """Write strokes at one place: down and up in five rows, after a new baseline. Top rows have no new weight."""
+    """Return strokes at one place, each after a new baseline.
+
+    A stroke goes down and up in five rows. In the top rows, the gauge has no new weight.
+    """
     stroke = [(288.0, -1.0), (284.0, 100.0), (280.0, 1000.0), (284.0, 150.0), (288.0, -1.0)]
     places = [[315.0, -100.0, z, weight] for z, weight in stroke] * strokes_n
     return write(folder, places, [450.0 + i // len(stroke) for i in range(len(places))])
@@ -60,25 +70,25 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def test_places_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
+def test_coordinates_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
 
 
-def test_depth_is_relative_to_the_highest_place(tmp_path: Path) -> None:
+def test_depth_is_measured_from_the_highest_position_of_the_tip(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.depth_mm[:4].tolist() == [0.75, 0.5, 0.25, 0]
 
 
-def test_noload_is_the_subtracted_baseline(tmp_path: Path) -> None:
+def test_noload_field_is_the_baseline_that_the_recorder_subtracted(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.b_uT[5], 505 + 10 * np.arange(6))
-    # 300 + i and the differences have no rounding error in float32.
+    # The numbers 300 + i and the differences are exact in single precision.
     np.testing.assert_array_equal(readings.noload_uT[5], np.full(6, 305))
 
 
-def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
+def test_new_pass_begins_where_places_repeat(tmp_path: Path) -> None:
     readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 4 + [1] * 4 + [2] * 4
     assert account["passes_n"] == 3
@@ -86,17 +96,17 @@ def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
     assert np.isnan(readings.Fz_N).all()
 
 
-def test_new_baseline_begins_a_stroke(tmp_path: Path) -> None:
+def test_new_stroke_begins_at_a_new_baseline(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path), GAUGED, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
-def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
+def test_weights_in_grams_become_newtons_and_missing_ones_nan(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, DEFAULT_POLICY)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
-    # float32 has seven digits
+    # The tolerance is that of single precision, which has seven digits.
     np.testing.assert_allclose(readings.Fz_N, expected, rtol=1e-6)
     assert account["no_new_force_rows_n"] == 2
     assert account["force_sign_unknown_rows_n"] == 0
@@ -105,7 +115,7 @@ def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_gauge_axis_comes_from_the_header(tmp_path: Path, axis: str) -> None:
+def test_axis_of_the_force_gauge_is_read_from_the_header(tmp_path: Path, axis: str) -> None:
     readings, account = eflesh.read(
         strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}), DEFAULT_POLICY
     )
@@ -117,7 +127,7 @@ def test_gauge_axis_comes_from_the_header(tmp_path: Path, axis: str) -> None:
 
 
 @pytest.mark.parametrize("options", [{}, {"force_axis": "up"}])
-def test_weight_without_axis_is_refused(tmp_path: Path, options: dict[str, str]) -> None:
+def test_weights_are_refused_if_the_header_has_no_axis(tmp_path: Path, options: dict[str, str]) -> None:
     header = GAUGED.model_copy(update={"options": options})
     assert "option force_axis must be x, y or z" in error_of(strokes(tmp_path), header)
 
@@ -131,14 +141,14 @@ def test_every_row_becomes_a_reading(tmp_path_factory: pytest.TempPathFactory, p
     assert (np.diff(readings.t_s) > 0).all()
 
 
-def test_three_files_are_collected(tmp_path: Path) -> None:
+def test_three_files_of_a_recording_are_found(tmp_path: Path) -> None:
     files = eflesh.collect(scan(tmp_path))
     assert sorted(files) == sorted(eflesh.FILES)
     assert eflesh.count_chips(files) == CHIPS_N
 
 
 @pytest.mark.parametrize("name", eflesh.FILES)
-def test_missing_file_is_an_error(tmp_path: Path, name: str) -> None:
+def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
     (scan(tmp_path) / name).unlink()
     with pytest.raises(CaptureError, match=f"no {name}"):
         eflesh.collect(tmp_path)
@@ -146,7 +156,7 @@ def test_missing_file_is_an_error(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", eflesh.FILES)
 @pytest.mark.parametrize("cell", ["nan", "-inf", "", "1,5", "x"])
-def test_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
     edit(scan(tmp_path) / name, 3, 2, cell)
     message = error_of(tmp_path)
     assert name in message
@@ -154,7 +164,7 @@ def test_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
 
 
 @pytest.mark.parametrize("name", eflesh.FILES)
-def test_unequal_row_counts_are_refused(tmp_path: Path, name: str) -> None:
+def test_tables_with_different_numbers_of_rows_are_refused(tmp_path: Path, name: str) -> None:
     path = scan(tmp_path) / name
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
     message = error_of(tmp_path)
@@ -169,19 +179,19 @@ def test_unequal_row_counts_are_refused(tmp_path: Path, name: str) -> None:
         (eflesh.STATES, f"{START_s + 8.6}", "line 3: its time differs by 0.100 s from the time in sensor.csv"),
     ],
 )
-def test_disagreeing_clocks_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
+def test_clocks_that_disagree_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
     edit(scan(tmp_path) / name, 3, 0, cell)
     assert expected in error_of(tmp_path)
 
 
-def test_decreasing_clock_is_refused(tmp_path: Path) -> None:
+def test_clock_that_runs_backwards_is_refused(tmp_path: Path) -> None:
     scan(tmp_path)
     for name in eflesh.FILES:
         edit(tmp_path / name, 3, 0, f"{START_s}")
     assert "time does not increase in line 3" in error_of(tmp_path)
 
 
-def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
     message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 16" in message
     assert ": 7 columns" in message
@@ -233,7 +243,7 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, factor: float) -> Non
     assert "G to uT" in error_of(tmp_path)
 
 
-def test_constant_height_gives_no_depth(tmp_path):
+def test_scan_at_constant_height_has_no_depth(tmp_path):
     places = [[x, y, 142.0] for x, y in GRID] * 3
     readings, account = eflesh.read(
         write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, DEFAULT_POLICY
@@ -242,7 +252,7 @@ def test_constant_height_gives_no_depth(tmp_path):
     assert account["no_depth_rows_n"] == len(readings) == len(places)
 
 
-def test_nearly_constant_height_gives_no_depth(tmp_path):
+def test_scan_at_nearly_constant_height_has_no_depth(tmp_path):
     z_mm = np.linspace(143.0, 143.0177, 3 * len(GRID))
     places = [[x, y, z] for (x, y), z in zip(GRID * 3, z_mm, strict=True)]
     readings, account = eflesh.read(

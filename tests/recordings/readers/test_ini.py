@@ -1,4 +1,7 @@
-"""Tests of the reader of layout `ini`: two text files become passes over a raster of places."""
+"""Tests of the reader of layout `ini`, in which two text files become passes over a raster of places.
+
+One file has the readings of the chips, the other one the labels. The fields can be some rows late.
+"""
 
 from pathlib import Path
 
@@ -16,8 +19,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# Labels of one pass: two rows at the corner (one has the label of the last place), then presses. One press is too weak
-# for the gauge.
+# Labels of one pass: two rows at the corner without contact (one still has the label of the last place), then presses.
+# One press is too weak for the gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
@@ -32,7 +35,7 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """Return the text X, Y, Z, T of a chip; from row to row, the field rises by one LSB."""
+    """Return the text X, Y, Z, T of a chip. From one row to the next, the field rises by one step (LSB)."""
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 
@@ -75,7 +78,7 @@ def test_every_row_becomes_a_press_of_its_pass(tmp_path: Path) -> None:
     assert readings.temperature_degC[0].tolist() == [28.5, 29.5, 30.5]
 
 
-def test_contact_is_decided_by_force(tmp_path: Path) -> None:
+def test_rows_with_a_force_are_in_contact_and_others_have_no_place(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()
@@ -85,7 +88,7 @@ def test_contact_is_decided_by_force(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == [7, 7, 7, 8, 9, 9, 10, 11]
 
 
-def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
+def test_noload_field_is_the_mean_of_the_first_rows_of_each_pass(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER, DEFAULT_POLICY)
     for pass_i in (0, 1):
         corner_uT = (field_uT(8 * pass_i) + field_uT(8 * pass_i + 1)) / 2
@@ -94,30 +97,30 @@ def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
     assert account["corner_rows_n"] == 4
 
 
-def test_recording_without_repeated_places_is_one_pass(tmp_path: Path) -> None:
+def test_recording_in_which_no_place_repeats_is_one_pass(tmp_path: Path) -> None:
     _, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert account["passes_n"] == 1
 
 
-def test_unrecorded_quantities_are_nan(tmp_path: Path) -> None:
+def test_quantities_that_the_layout_does_not_contain_are_nan(tmp_path: Path) -> None:
     readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     for name in ("depth_mm", "Fx_N", "Fy_N", "t_s"):
         assert np.isnan(getattr(readings, name)).all()
 
 
-def test_pass_that_begins_in_contact_has_no_noload(tmp_path: Path) -> None:
+def test_pass_that_begins_in_contact_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS[2:6] * 3))
     assert "truths.txt line 1: this pass does not begin with a fault-free row" in message
 
 
-def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
+def test_row_with_a_failed_read_is_dropped(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 2)
     edit(tmp_path / ini.READINGS, 2, f"{chip_line(1, 0)} {FAILED} {chip_line(1, 2)}")
     edit(tmp_path / ini.READINGS, 4, f"{FAILED} {FAILED} {FAILED}")
     readings, account = ini.read(tmp_path, HEADER, DEFAULT_POLICY)
     assert account["dropped_failed_read_rows_n"] == 2
     assert readings.indentation.tolist() == [0, 2, *range(4, 16)]
-    # The corner row with a failed read is not included in the no-load mean.
+    # The corner row with a failed read is not part of the mean of the no-load rows.
     np.testing.assert_array_equal(readings.noload_uT[0], field_uT(0).astype(np.float32))
 
 
@@ -140,7 +143,10 @@ def header_with_lateness(rows_late: str) -> Header:
 
 
 def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: int) -> Path:
-    """Write a recording whose fields grow with the force and are `late_n` rows late."""
+    """Write a recording whose fields grow with the force.
+
+    The fields are `late_n` rows late: they belong to the label of an earlier row.
+    """
     write(folder, truths)
     force = [truths[max(i - late_n, 0)][2] for i in range(len(truths))]
     lines = []
@@ -154,7 +160,9 @@ def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: i
 
 @settings(max_examples=10, deadline=None)
 @given(late_n=st.integers(0, 5))
-def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFactory, late_n: int) -> None:
+def test_number_of_rows_by_which_fields_are_late_is_reported(
+    tmp_path_factory: pytest.TempPathFactory, late_n: int
+) -> None:
     folder = write_late(tmp_path_factory.mktemp("ini"), ONE_PASS * 5, late_n)
     for declared in ("0", str(late_n)):
         _, account = ini.read(folder, header_with_lateness(declared), DEFAULT_POLICY)
@@ -163,8 +171,8 @@ def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.mark.parametrize("late_n", [0, 1, 4])
-@pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # recordings of 104 and of 40 rows
-def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n, passes_n, is_long):
+@pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # The recordings have 104 and 40 rows.
+def test_lateness_is_corrected_if_the_recording_is_long_enough(tmp_path, late_n, passes_n, is_long):
     _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, DEFAULT_POLICY)
     assert account["best_rows_late_n"] == late_n
     assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if is_long else 0)
@@ -172,7 +180,7 @@ def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n,
 
 @settings(max_examples=12, deadline=None)
 @given(late_n=st.integers(0, 5), failed=st.sets(st.integers(10, 20), max_size=1))
-def test_late_fields_are_paired_with_their_labels(
+def test_late_fields_are_paired_with_the_labels_to_which_they_belong(
     tmp_path_factory: pytest.TempPathFactory, late_n: int, failed: set[int]
 ) -> None:
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)
@@ -196,7 +204,7 @@ def test_late_fields_are_paired_with_their_labels(
 
 
 @pytest.mark.parametrize("rows_late", ["6", "-1", "one", ""])
-def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
+def test_invalid_option_rows_late_is_refused(tmp_path: Path, rows_late: str) -> None:
     assert "option rows_late must be 0 to 5" in error_of(write(tmp_path, ONE_PASS), header_with_lateness(rows_late))
 
 
@@ -206,7 +214,7 @@ def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
     )
 
 
-def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> None:
+def test_fields_of_a_public_recording_are_one_row_late(tmp_path: Path, shared_data: Path) -> None:
     for name, source in (
         (ini.READINGS, "b20_artillery_AFG_board2_50_screw.txt"),
         (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
@@ -227,7 +235,7 @@ def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> 
         (slice(2, 3), 1e3, "Convert grams or mN to N"),
     ],
 )
-def test_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
+def test_labels_in_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
     truths = np.array(ONE_PASS)
     truths[:, columns] *= factor
     truths[:, 2] = np.where(factor == 1e-3, np.array(ONE_PASS)[:, 2], truths[:, 2])
@@ -236,22 +244,26 @@ def test_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, 
     assert ini.TRUTHS in message
 
 
-def test_stuck_chip_loses_its_rows(tmp_path: Path) -> None:
+def test_pass_whose_first_rows_have_a_stuck_chip_is_refused(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 8)
     for row_i in range(20, 64):
         edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
-    # A chip counts as stuck from the 20th equal reading on; all corner rows of the last passes are stuck.
+    # A chip counts as stuck from the 20th equal reading on. In the last passes, all corner rows have a stuck chip, so
+    # there is no no-load field.
     assert "truths.txt line 41: this pass does not begin with a fault-free row" in error_of(tmp_path)
 
 
-def test_recording_of_failed_reads_is_refused(tmp_path: Path) -> None:
+def test_recording_in_which_all_reads_failed_is_refused(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS)
     (tmp_path / ini.READINGS).write_text(f"{FAILED} {FAILED} {FAILED}\n" * len(ONE_PASS))
     assert "failed" in error_of(tmp_path)
 
 
 def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: int = 3) -> Path:
-    """Write passes in which the chips `reset` read with power-on settings in the given rows."""
+    """Write passes in which some chips lose their settings.
+
+    In the given rows, the chips `reset` read with the settings that they have after power-on.
+    """
     write(folder, ONE_PASS * passes_n)
     lines = []
     for row_i in range(len(ONE_PASS) * passes_n):
@@ -263,32 +275,32 @@ def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: 
     return folder
 
 
-def test_reset_chip_is_named(tmp_path: Path) -> None:
+def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
     message = error_of(recording_with_resets(tmp_path, {1}, range(24)))
     assert "chip 1 must be that of the other chips" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_recording_with_all_chips_reset_is_refused(tmp_path: Path) -> None:
+def test_recording_in_which_all_chips_have_power_on_settings_is_refused(tmp_path: Path) -> None:
     message = error_of(recording_with_resets(tmp_path, {0, 1, 2}, range(24)))
     assert "chip 0, 1, 2 must" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_chip_reset_during_the_recording_is_named(tmp_path: Path) -> None:
-    # The reader checks the 2400 rows in two blocks.
+def test_chip_that_loses_its_settings_during_the_recording_is_named(tmp_path: Path) -> None:
+    # There are 2400 rows, which the reader checks in two blocks.
     message = error_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
     assert "from row 1201: the LSB of chip 1 must" in message
 
 
-def test_other_lsb_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_steps_that_differ_from_the_settings_in_the_header_are_refused(tmp_path: Path) -> None:
     firmware = Firmware(gain_sel=6, lsb_xy_uT=0.2, lsb_z_uT=0.3227)
     message = error_of(write(tmp_path, ONE_PASS * 3), HEADER.model_copy(update={"firmware": firmware}))
     assert "must be (0.2, 0.3227) uT; got 0.15 uT in x, y" in message
 
 
 @pytest.mark.parametrize("name", ["b20_stand.txt", "stand.txt"])
-def test_truth_file_is_found_by_name(tmp_path: Path, name: str) -> None:
+def test_file_of_labels_is_found_by_its_name(tmp_path: Path, name: str) -> None:
     recording, truths = tmp_path / name, tmp_path / "truths_stand.txt"
     recording.write_text(f"{reading_line(0)}\n")
     with pytest.raises(CaptureError, match=r"no .*truths_stand\.txt"):
@@ -303,7 +315,7 @@ def test_truth_file_is_found_by_name(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("cell", ["nan", "-inf", "1e30", "1,5", "x"])
 @pytest.mark.parametrize("name", ini.FILES)
-def test_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     edit(path, 3, f"{cell} {path.read_text().splitlines()[2].partition(' ')[2]}")
     message = error_of(tmp_path)
@@ -322,13 +334,13 @@ def test_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
         assert "in line 3" in message
 
 
-def test_unequal_row_counts_are_refused(tmp_path: Path) -> None:
+def test_files_with_different_numbers_of_rows_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path, ONE_PASS) / ini.TRUTHS
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
     assert f"8 in {ini.READINGS} and 7 in {ini.TRUTHS}" in error_of(tmp_path)
 
 
-def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 20" in message
     assert ": 12 columns" in message

@@ -1,4 +1,4 @@
-"""Tests of the reader of layout `lab`: a CSV file becomes presses."""
+"""Tests of the reader of layout `lab`, which turns a CSV file into presses."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ HEADER = make_header(layout="lab", chips_n=CHIPS_N, contacts_before_n=7)
 
 
 def row(indent: int, phase: str, b_uT: float, *, place: str = "4,6", force: str = "0.1,-0.2,-3.5") -> str:
-    """Return one CSV line; the field of channel c is b_uT + 10 c."""
+    """Return one line of the CSV file. The field of channel c is b_uT + 10 c."""
     c = [f"{b_uT + 10 * i:.4f}" for i in range(3 * CHIPS_N)]
     return f"{indent},{phase},{place},21.5,{','.join(c[:3])},22.5,{','.join(c[3:])},{force}"
 
@@ -48,7 +48,7 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_single_noload_rows_are_read_with_their_press(tmp_path: Path) -> None:
+def test_press_with_a_single_no_load_row_is_read(tmp_path: Path) -> None:
     press_i, b_uT = lab.read_noload(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert press_i.tolist() == [0, 0, 1]
     assert b_uT[:, 0].tolist() == [100, 104, 90]
@@ -56,7 +56,7 @@ def test_single_noload_rows_are_read_with_their_press(tmp_path: Path) -> None:
     np.testing.assert_allclose(readings.noload_uT[0], b_uT[press_i == 0].mean(axis=0))
 
 
-def test_contact_rows_become_readings(tmp_path: Path) -> None:
+def test_rows_in_contact_become_readings(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.indentation.tolist() == [0, 0, 0, 1]
     assert readings.reading_i.tolist() == [0, 1, 2, 0]
@@ -68,20 +68,20 @@ def test_contact_rows_become_readings(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == [7, 7, 7, 8]
 
 
-def test_noload_is_the_mean_of_the_noload_rows_of_the_same_press(tmp_path: Path) -> None:
+def test_noload_field_is_the_mean_of_the_no_load_rows_of_the_same_press(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.noload_uT[:, 0].tolist() == [102, 102, 102, 90]
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
-def test_forces_are_converted_from_gauge_to_skin_axes(tmp_path: Path) -> None:
+def test_forces_are_converted_from_the_axes_of_the_gauge_to_those_of_the_skin(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
     np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
     np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([0.2] * 3))
 
 
-def test_missing_quantities_are_nan(tmp_path: Path) -> None:
+def test_quantities_without_a_column_are_nan(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.depth_mm).all()
     assert np.isnan(readings.t_s).all()
@@ -89,7 +89,7 @@ def test_missing_quantities_are_nan(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(counts=st.lists(st.tuples(st.integers(1, 4), st.integers(1, 5)), min_size=1, max_size=6))
-def test_every_row_is_a_reading_or_noload(
+def test_every_row_is_a_reading_or_a_no_load_row(
     tmp_path_factory: pytest.TempPathFactory, counts: list[tuple[int, int]]
 ) -> None:
     rows = []
@@ -112,7 +112,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     assert account["dropped_failed_read_rows_n"] == 2
     assert (account["rows_n"], account["noload_rows_n"], account["rows_read_n"]) == (3, 2, 7)
     assert readings.b_uT[:, 0].tolist() == [160, 162, 50]
-    # The no-load row with a failed read is not included in the mean.
+    # The no-load row with a failed read is not part of the mean.
     assert readings.noload_uT[:, 0].tolist() == [100, 100, 90]
 
 
@@ -126,14 +126,14 @@ def test_column_order_does_not_matter(tmp_path: Path) -> None:
     np.testing.assert_array_equal(lab.read(folder, HEADER, DEFAULT_POLICY)[0].b_uT, original.b_uT)
 
 
-def test_unknown_column_is_counted(tmp_path: Path) -> None:
+def test_unknown_columns_are_ignored_and_counted(tmp_path: Path) -> None:
     _, account = lab.read(
         write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER, DEFAULT_POLICY
     )
     assert account["ignored_columns_n"] == 1
 
 
-def test_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
+def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Path) -> None:
     recording = tmp_path / "board1_depth1.csv"
     recording.write_text(f"{NAMES}\n{PRESSES[0]}\n")
     files = lab.collect(recording)
@@ -161,7 +161,7 @@ def test_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
         (8, row(0, "noload", 90.0), "indent 0 begins again in line 8"),
     ],
 )
-def test_broken_row_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
+def test_row_that_cannot_be_read_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
     rows = list(PRESSES)
     rows[line_n - 2] = broken
     assert expected in error_of(write(tmp_path, *rows))
@@ -179,14 +179,14 @@ def test_duplicate_column_is_refused(tmp_path: Path) -> None:
     assert "two columns are named Fz" in error_of(folder)
 
 
-def test_millitesla_is_refused(tmp_path: Path) -> None:
+def test_fields_in_millitesla_are_refused(tmp_path: Path) -> None:
     rows = [row(0, "noload", -20.0), row(0, "contact", -21.0)]
     tiny = [",".join(str(float(c) / 1e3) if "." in c and "0000" in c else c for c in r.split(",")) for r in rows]
     assert "Convert mT or G to uT" in error_of(write(tmp_path, *tiny))
 
 
 def scale_column(column: str, factor: float) -> list[str]:
-    """Return the lines of PRESSES with all columns of a kind (B, place or F) multiplied by `factor`."""
+    """Return the lines of PRESSES, with all columns of one kind (B, place or F) multiplied by `factor`."""
     names = NAMES.split(",")
     chosen = {i for i, name in enumerate(names) if name.startswith(column) or name.endswith(column)}
     return [
@@ -213,7 +213,7 @@ def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: 
     assert expected in error_of(write(tmp_path, *scale_column(column, factor)))
 
 
-def test_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:
+def test_real_recording_converted_to_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:
     lines = (shared_data / "lab" / "board1_depth1.csv").read_text().splitlines()[:1101]
     names = lines[0].split(",")
     rows = [
@@ -226,7 +226,7 @@ def test_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> Non
     assert "G to uT" in message
 
 
-def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
     assert "2 chips, but the header says 5" in message
 

@@ -1,4 +1,7 @@
-"""Tests of the reader of layout `leaphand`: pads of a hand without contact, no-load rows, joint positions."""
+"""Tests of the reader of layout `leaphand`, which contains recordings of a moving hand without contact.
+
+The hand has several pads. Joint positions are recorded with the fields.
+"""
 
 from pathlib import Path
 
@@ -18,7 +21,7 @@ HEADER = make_header(layout="leaphand", options={"pad": "2"}, contacts_before_n=
 
 
 def numbers(rows_n: int = ROWS_N, pads_n: int = PADS_N) -> np.ndarray:
-    """Return rows of a hand that is in another pose in the first row, then rests for five rows, then moves."""
+    """Return rows of a hand. In the first row, it is in another pose. Then it rests for five rows, then it moves."""
     steps = rng_for(0, "leaphand").integers(-20, 20, (rows_n, leaphand.CHANNELS_N * pads_n))
     joints = np.tile(2000 + 100 * np.arange(leaphand.JOINTS_N * pads_n), (rows_n, 1))
     joints[0] -= 300
@@ -39,11 +42,12 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_rows_after_the_rest_become_readings_without_contact(tmp_path):
+def test_rows_after_the_hand_has_rested_become_readings_without_contact(tmp_path):
     rows = numbers()
     readings, account = leaphand.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
     own_uT = rows[:, leaphand.CHANNELS_N : 2 * leaphand.CHANNELS_N]
-    np.testing.assert_allclose(readings.b_uT, own_uT[6:], rtol=1e-6)  # float32
+    # The relative tolerance is that of single precision.
+    np.testing.assert_allclose(readings.b_uT, own_uT[6:], rtol=1e-6)
     np.testing.assert_allclose(readings.noload_uT, np.tile(own_uT[1:6].mean(axis=0), (6, 1)), rtol=1e-5, atol=1e-5)
     assert readings.reading_i.tolist() == [0, 1, 2, 3, 4, 5]
     assert set(readings.Fz_N) == {0}
@@ -54,7 +58,7 @@ def test_rows_after_the_rest_become_readings_without_contact(tmp_path):
     assert account["ignored_pads_n"] == 1
 
 
-def test_motion_has_the_joints_of_the_readings(tmp_path):
+def test_motion_contains_the_joint_positions_of_the_readings(tmp_path):
     rows = numbers()
     motion = leaphand.read_motion(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(motion.joint_counts, rows[6:, PADS_N * leaphand.CHANNELS_N :])
@@ -62,7 +66,7 @@ def test_motion_has_the_joints_of_the_readings(tmp_path):
 
 
 @pytest.mark.parametrize("row_i", [0, 3, 8])
-def test_every_row_is_counted_if_a_read_failed(tmp_path, row_i):
+def test_rows_with_failed_reads_are_counted(tmp_path, row_i):
     rows = numbers()
     rows[row_i, leaphand.CHANNELS_N : leaphand.CHANNELS_N + 3] = FAILED_B_uT
     readings, account = leaphand.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)

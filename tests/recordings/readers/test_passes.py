@@ -1,4 +1,4 @@
-"""Tests that passes are found from the repetition of places in a recording."""
+"""Tests that the passes of a recording are found from the repetition of its places."""
 
 import time
 from itertools import pairwise
@@ -12,7 +12,7 @@ from reskin.recordings.readers.alignment import find_passes
 
 
 def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:
-    """Return the places of one pass over a 2 mm grid, with `presses_n` rows per place."""
+    """Return the places of one pass over a grid with steps of 2 mm, with `presses_n` rows per place."""
     places = [(2.0 * x, 2.0 * y) for x in range(columns_n) for y in range(rows_n)]
     return np.repeat(np.array(places), presses_n, axis=0)
 
@@ -22,7 +22,7 @@ grids = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 6))
 
 @settings(deadline=None)
 @given(grid=grids, passes_n=st.integers(2, 5))
-def test_passes_begin_where_the_raster_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
+def test_new_pass_begins_where_the_raster_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
     once = raster(*grid)
     place_mm = np.tile(once, (passes_n, 1))
     expected = np.repeat(np.arange(passes_n), len(once))
@@ -31,7 +31,7 @@ def test_passes_begin_where_the_raster_repeats(grid: tuple[int, int, int], passe
 
 @settings(deadline=None)
 @given(seed=st.integers(0, 1000), passes_n=st.integers(4, 8))
-def test_places_without_contact_do_not_matter(seed: int, passes_n: int) -> None:
+def test_places_of_rows_without_contact_do_not_change_the_passes(seed: int, passes_n: int) -> None:
     once = raster(4, 4, 3)
     place_mm = np.tile(once, (passes_n, 1))
     contact = seeds.rng_for(seed, "contact").random(len(place_mm)) > 0.1
@@ -42,25 +42,25 @@ def test_places_without_contact_do_not_matter(seed: int, passes_n: int) -> None:
 
 @settings(deadline=None)
 @given(grid=grids, passes_n=st.integers(2, 4), shift_mm=st.floats(-50, 50))
-def test_shift_of_the_grid_does_not_matter(grid: tuple[int, int, int], passes_n: int, shift_mm: float) -> None:
+def test_passes_are_found_on_a_shifted_grid(grid: tuple[int, int, int], passes_n: int, shift_mm: float) -> None:
     place_mm = np.tile(raster(*grid), (passes_n, 1))
     contact = np.ones(len(place_mm), bool)
     np.testing.assert_array_equal(find_passes(place_mm + shift_mm, contact), find_passes(place_mm, contact))
 
 
-def test_last_pass_may_be_incomplete() -> None:
+def test_last_pass_may_have_fewer_rows() -> None:
     once = raster(3, 3, 2)
     place_mm = np.tile(once, (3, 1))[:-5]
     assert np.bincount(find_passes(place_mm, np.ones(len(place_mm), bool))).tolist() == [18, 18, 13]
 
 
-def test_single_mislabelled_row_does_not_matter() -> None:
+def test_single_row_with_a_wrong_label_does_not_change_the_passes() -> None:
     place_mm = np.tile(raster(9, 9, 6), (5, 1))
     place_mm[700] = (-1.0, -1.0)
     assert find_passes(place_mm, np.ones(len(place_mm), bool)).max() == 4
 
 
-def test_places_that_never_repeat_are_one_pass() -> None:
+def test_recording_in_which_no_place_repeats_is_one_pass() -> None:
     for place_mm in (raster(5, 5, 3), raster(1, 1, 40)):
         assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
 
@@ -70,7 +70,7 @@ def test_recording_without_contact_is_one_pass() -> None:
 
 
 def passes_naively(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
-    """Reference: try every period, and accept the first after which the places repeat."""
+    """Return the reference: of all periods, the shortest one after which the places repeat."""
     rows_n = len(place_mm)
     touched = np.flatnonzero(contact).tolist()
     pairs = pairwise(touched)
@@ -88,7 +88,7 @@ def passes_naively(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
 
 @settings(deadline=None, max_examples=60)
 @given(seed=st.integers(0, 10000), once_n=st.integers(2, 30), touch=st.floats(0.3, 1.0), kinds_n=st.integers(1, 4))
-def test_passes_equal_exhaustive_search(seed: int, once_n: int, touch: float, kinds_n: int) -> None:
+def test_passes_equal_those_of_an_exhaustive_search(seed: int, once_n: int, touch: float, kinds_n: int) -> None:
     rng = seeds.rng_for(seed, "passes")
     place_mm = np.tile(rng.integers(0, kinds_n, (once_n, 2)).astype(float), (3, 1))[: rng.integers(2, 3 * once_n + 1)]
     contact = rng.random(len(place_mm)) < touch
@@ -97,9 +97,9 @@ def test_passes_equal_exhaustive_search(seed: int, once_n: int, touch: float, ki
     np.testing.assert_array_equal(find_passes(place_mm, contact), passes_naively(place_mm, contact))
 
 
-def test_long_recording_without_repeats_is_fast() -> None:
+def test_long_recording_without_repeated_places_is_searched_fast() -> None:
     place_mm = seeds.rng_for(0, "never").random((20000, 2))
     begin_s = time.process_time()
     assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
-    # The exhaustive search would take 17 s; `find_passes` takes 0.1 to 0.3 s.
+    # An exhaustive search would take 17 s, and `find_passes` takes 0.1 to 0.3 s.
     assert time.process_time() - begin_s < 5

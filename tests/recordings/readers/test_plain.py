@@ -1,4 +1,7 @@
-"""Tests of the reader of layout `table`: CSV and Parquet tables, unknown quantities, errors with line numbers."""
+"""Tests of the reader of layout `table`, which reads CSV and Parquet tables.
+
+Tested are unknown quantities, and errors that name the line.
+"""
 
 import re
 from pathlib import Path
@@ -35,7 +38,7 @@ def table(presses_n: int = 6, noload_n: int = 3, contact_n: int = 4, seed: int =
 
 
 def write(folder: Path) -> Path:
-    """Write a capture folder with a table that has all columns."""
+    """Write the folder of a capture, with a table that has all columns."""
     table().to_csv(folder / plain.CSV, index=False)
     return folder
 
@@ -59,7 +62,7 @@ def read(folder: Path, rows: pd.DataFrame, name: str = "mine.csv"):
     return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)), DEFAULT_POLICY)
 
 
-def test_byte_order_mark_changes_nothing(tmp_path):
+def test_byte_order_mark_is_ignored(tmp_path):
     without_mark, _ = read(tmp_path / "a", table())
     table().to_csv(tmp_path / "mine.csv", index=False, encoding="utf-8-sig")
     (tmp_path / "b").mkdir()
@@ -69,7 +72,7 @@ def test_byte_order_mark_changes_nothing(tmp_path):
     np.testing.assert_array_equal(with_mark.b_uT, without_mark.b_uT)
 
 
-def test_contact_rows_become_readings_with_noload_mean(tmp_path):
+def test_rows_in_contact_have_the_mean_of_their_no_load_rows(tmp_path):
     rows = table()
     readings, account = read(tmp_path, rows)
     contact, fields = rows[rows.phase == "contact"], plain.columns_of(CHIPS_N)[3:9]
@@ -86,7 +89,7 @@ def test_contact_rows_become_readings_with_noload_mean(tmp_path):
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(2, 8), st.integers(1, 4), st.integers(1, 4))
-def test_indent_numbers_are_optional(tmp_path_factory, presses_n, noload_n, contact_n):
+def test_column_of_indentation_numbers_is_optional(tmp_path_factory, presses_n, noload_n, contact_n):
     rows = table(presses_n, noload_n, contact_n)
     numbered = rows.assign(indentation=np.repeat(np.arange(presses_n), noload_n + contact_n) + 7)
     without, with_numbers = (read(tmp_path_factory.mktemp("t"), part)[0] for part in (rows, numbered))
@@ -94,7 +97,7 @@ def test_indent_numbers_are_optional(tmp_path_factory, presses_n, noload_n, cont
     assert without.reading_i.tolist() == list(range(contact_n)) * presses_n
 
 
-def test_empty_columns_are_unknown_quantities(tmp_path):
+def test_quantities_of_empty_columns_are_unknown(tmp_path):
     rows = table().reindex(columns=plain.columns_of(CHIPS_N))
     readings, account = read(tmp_path, rows)
     assert np.isnan(readings.depth_mm).all()
@@ -102,19 +105,19 @@ def test_empty_columns_are_unknown_quantities(tmp_path):
     assert account["ignored_columns_n"] == 0
 
 
-def test_noload_blocks_may_have_numbers(tmp_path):
+def test_no_load_rows_may_be_numbered(tmp_path):
     rows = table().assign(indentation=np.repeat(np.arange(12), [3, 4] * 6))
     readings, _ = read(tmp_path, rows)
     assert readings.indentation.tolist() == np.repeat(np.arange(6), 4).tolist()
 
 
-def test_parquet_reads_like_csv(tmp_path):
+def test_parquet_table_is_read_like_csv(tmp_path):
     one, other = read(tmp_path / "a", table())[0], read(tmp_path / "b", table(), "mine.parquet")[0]
     np.testing.assert_array_equal(one.b_uT, other.b_uT)
     np.testing.assert_array_equal(one.noload_uT, other.noload_uT)
 
 
-def test_noload_places_may_be_empty(tmp_path):
+def test_no_load_rows_may_have_no_place(tmp_path):
     rows = table().assign(operator="me", note="")
     rows.loc[rows.phase == "noload", ["x_mm", "y_mm", "Fz_N"]] = np.nan
     readings, account = read(tmp_path, rows)
@@ -122,7 +125,7 @@ def test_noload_places_may_be_empty(tmp_path):
     assert np.isfinite(readings.x_mm).all()
 
 
-def test_constant_zero_depth_is_unknown(tmp_path):
+def test_depth_that_is_always_zero_is_unknown(tmp_path):
     zero_depth, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
     assert np.isnan(zero_depth.depth_mm).all()
     assert account["no_depth_rows_n"] == len(zero_depth)
@@ -159,13 +162,13 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("what", MISTAKES)
-def test_error_names_the_line_or_column(tmp_path, what):
+def test_error_names_the_wrong_line_or_column(tmp_path, what):
     change, message = MISTAKES[what]
     with pytest.raises(CaptureError, match=re.escape(message)):
         read(tmp_path, change(table()))
 
 
-def test_table_converted_by_the_script_in_the_docs_equals_layout_eflesh(tmp_path, shared_data, monkeypatch):
+def test_recording_converted_by_the_script_in_the_docs_equals_that_of_layout_eflesh(tmp_path, shared_data, monkeypatch):
     recording = shared_data / "eflesh/normal_force/20250401_014340_probe"
     script = re.search(r"```python\n(import pandas as pd.*?)```", (ROOT / "data/README.md").read_text(), re.DOTALL)
     for file in recording.glob("*.csv"):
@@ -181,7 +184,7 @@ def test_table_converted_by_the_script_in_the_docs_equals_layout_eflesh(tmp_path
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
 
 
-def test_template_is_the_header_line(tmp_path):
+def test_template_of_a_table_is_its_header_line(tmp_path):
     out = tmp_path / "mine.csv"
     done = CliRunner().invoke(app, ["template", str(out), "--chips", "3"])
     assert done.exit_code == 0, done.output
@@ -193,7 +196,7 @@ def test_template_is_the_header_line(tmp_path):
         plain.read(capture, make_header(layout="table", chips_n=3), DEFAULT_POLICY)
 
 
-def test_passes_are_found_from_repeats_or_read_from_the_column(tmp_path):
+def test_passes_are_read_from_their_column_or_found_from_repeated_places(tmp_path):
     one = table(presses_n=9)
     three = pd.concat([one] * 3, ignore_index=True)
     found, account = read(tmp_path / "found", three)
@@ -207,14 +210,14 @@ def test_passes_are_found_from_repeats_or_read_from_the_column(tmp_path):
     assert account["passes_n"] == 1
 
 
-def test_constant_channels_are_named(tmp_path):
+def test_error_names_channels_that_never_change(tmp_path):
     rows = table()
     rows["Bz0"], rows["Bz1"] = 12.5, 0.0
     rows.to_csv(tmp_path / plain.CSV, index=False)
     assert "Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT) never changed in the whole recording" in error_of(tmp_path)
 
 
-def test_subtracted_baseline_is_named(tmp_path):
+def test_table_of_field_changes_instead_of_fields_is_refused(tmp_path):
     rows, columns = table(presses_n=2), plain.columns_of(CHIPS_N)[3:9]
     fields_uT = rows[columns].to_numpy()
     rest = (rows["phase"] == "noload").to_numpy()
@@ -226,6 +229,6 @@ def test_subtracted_baseline_is_named(tmp_path):
     assert "Convert mT or G to uT" in error_of(tmp_path)
 
 
-def test_decimal_commas_are_named(tmp_path):
+def test_error_says_that_numbers_have_decimal_commas(tmp_path):
     table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
     assert "semicolons in line 1" in error_of(tmp_path)

@@ -1,4 +1,4 @@
-"""Tests that the reader of every layout raises an error for random bytes, files without rows, and truncated lines."""
+"""Tests that every reader refuses random bytes, files without rows, and truncated lines."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -48,7 +48,7 @@ def test_random_bytes_are_refused(
 
 @settings(max_examples=120, deadline=None)
 @given(data=st.data(), file=st.sampled_from(FILES))
-def test_file_truncated_within_a_line_is_refused(
+def test_file_that_ends_within_a_line_is_refused(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, file: tuple[str, str]
 ) -> None:
     def cut(whole: bytes) -> bytes:

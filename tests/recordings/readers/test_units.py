@@ -1,4 +1,4 @@
-"""Tests of the unit checks, which raise an error for implausible values."""
+"""Tests of the checks of units, which refuse implausible values."""
 
 from typing import get_args
 
@@ -17,12 +17,15 @@ from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
-# LSB and typical field (uT) of real boards: ReSkin with ReSkin skins, eFlesh, eFlesh at another gain.
+# The step (LSB) and the typical field in uT of real boards: two with ReSkin skins, eFlesh, and eFlesh at another gain.
 BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
 
 
 def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
-    """Return 1000 noisy rows of five chips with fields of about `usual_uT`, rounded to multiples of `step_uT`."""
+    """Return 1000 noisy rows of five chips.
+
+    Fields are about `usual_uT`, and are rounded to multiples of `step_uT`.
+    """
     rng = seeds.rng_for(seed, "fields")
     axes = rng.standard_normal((5, 3))
     rest_uT = usual_uT * axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -48,13 +51,13 @@ def test_fields_of_a_board_are_accepted_only_in_microtesla(name: str, seed: int)
             check_fields(factor * b_uT, "here", first_line_n=1)
 
 
-def test_strong_fields_in_gauss_are_recognised_by_the_lsb() -> None:
+def test_strong_fields_in_gauss_are_recognised_by_the_step_of_the_chips() -> None:
     with pytest.raises(CaptureError, match="0.15 to 9.68 uT; got steps of 0.024. Convert G to uT"):
         check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
 
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
-def test_fields_without_lsb_are_accepted_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
+def test_fields_without_a_known_step_must_be_as_strong_as_the_earths_field(usual_uT: float) -> None:
     constant = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
     check_fields(constant, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
@@ -98,7 +101,7 @@ def test_places_are_accepted_only_in_millimetres(extent_mm: float, start_mm: flo
                 check_places(factor * place_mm, "here")
 
 
-def test_place_far_from_the_others_is_named_with_its_line() -> None:
+def test_error_names_the_line_of_a_place_far_from_all_others() -> None:
     place_mm = np.array([[np.nan, np.nan], *([float(i), 2.0] for i in range(19)), [999.0, 2.0]])
     with pytest.raises(CaptureError, match=r"line 22 \(999, 2 mm\) is far from the others"):
         check_places(place_mm, "here", first_line_n=2)
@@ -106,7 +109,7 @@ def test_place_far_from_the_others_is_named_with_its_line() -> None:
         check_places(1e3 * place_mm[:20], "here")
 
 
-def test_single_place_with_rounding_errors_is_accepted() -> None:
+def test_single_place_with_rounding_errors_counts_as_one_place() -> None:
     check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
     check_places(np.full((3, 2), np.nan), "here")
 
@@ -126,7 +129,7 @@ def test_depths_are_accepted_only_in_millimetres(deepest_mm: float, accepted: bo
 @pytest.mark.parametrize(
     ("text", "message"), [("", "the file is empty"), ("1,2\n1,2.8", "last line has no line break")]
 )
-def test_truncated_text_is_refused(tmp_path, text: str, message: str) -> None:
+def test_text_that_ends_within_a_number_is_refused(tmp_path, text: str, message: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(CaptureError, match=message):
         read_cells(tmp_path / "a.csv", "a.csv", separator=",")
@@ -136,7 +139,7 @@ def test_each_layout_has_a_reader() -> None:
     assert set(READERS) == set(get_args(ReaderLayout))
 
 
-def test_missing_quantities_are_nan() -> None:
+def test_quantities_that_were_not_recorded_are_nan() -> None:
     readings = make_readings(
         make_header(chips_n=2), np.array([True, False]), indentation=np.zeros(2), pass_i=np.zeros(2),
         b_uT=np.ones((2, 6)), noload_uT=np.ones((2, 6)), n_contacts=np.zeros(2),
