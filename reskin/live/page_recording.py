@@ -19,16 +19,24 @@ from reskin.recordings.labels import Dwell, DWELL_MIN_s, Label, ProbeLogWriter
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
 from reskin.recordings.stream_recorder import CaptureWriter
 
-# Assumed times for the no-load dwell of a labelled press. The dwell begins RECOVERY_S or more after the previous
-# contact, because the skin needs time to recover. It ends APPROACH_S before the press, because the tip may approach
-# slowly. It lasts between REST_MIN_S and REST_MAX_S.
+# Each labelled press has a no-load dwell, which is a time without contact before the press. The following times are
+# assumed. The dwell begins RECOVERY_S or more after the previous contact, because the skin needs time to recover. It
+# ends APPROACH_S before the press, because the tip may touch the skin slowly. It lasts between REST_MIN_S and
+# REST_MAX_S.
 REST_MAX_S, REST_MIN_S, RECOVERY_S, APPROACH_S = 1.0, 0.2, 0.3, 0.05
-PLATEAU = 0.8  # assumed: the press is held while |dB| is at least this fraction of its maximum
-PRESS_READINGS_MAX_N = 20_000  # maximum number of readings that are kept of one press, to limit memory; 50 s at 400 Hz
+# A press is considered to be held while |dB| is at least this fraction of its maximum in the press. The value is
+# assumed.
+PLATEAU = 0.8
+# Largest number of readings that are stored for one press, to limit the use of memory. At 400 Hz, these are the
+# readings of 50 s.
+PRESS_READINGS_MAX_N = 20_000
 
 
 class LabelledPress:
-    """Finds the next press in a stream of estimates: the time in which it is held, and the no-load dwell before it.
+    """The next press in a stream of estimates, for which the place and the force are known.
+
+    The object receives the estimates and finds the time in which the press is held, and the no-load dwell before the
+    press.
 
     Parameters
     ----------
@@ -38,7 +46,7 @@ class LabelledPress:
 
     def __init__(self, label: Label, *, learn: bool) -> None:
         self.label, self.learn = label, learn
-        self.problem = ""  # why the latest press was not accepted
+        self.problem = ""  # text for the user that states why the latest press was not accepted
         self.rest_s: tuple[float, float] | None = None  # start and end of the no-load dwell before the press
         self.held_s: tuple[float, float] | None = None  # start and end of the time in which the press was held
         self.db_uT: Float64[np.ndarray, " ch"] | None = None  # mean field change while the press was held
@@ -51,7 +59,7 @@ class LabelledPress:
         return self.held_s is not None
 
     def add(self, estimates: Estimates) -> None:
-        """Add the next readings. Faulty readings (NaN) are skipped and do not end a press."""
+        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a press."""
         known = np.isfinite(estimates.db_uT).all(axis=1)
         readings = zip(estimates.t_s[known].tolist(), estimates.db_uT[known], estimates.contact[known], strict=True)
         for t_s, db_uT, contact in readings:
@@ -87,17 +95,26 @@ class LabelledPress:
 
 
 class PageRecording:
-    """A recording of a board that `reskin live` reads, with labels from the page.
+    """A recording that the user has started on the page of `reskin live`, with labels that are entered on the page.
 
-    `source` states whether the board is emulated from a simulation. Raises `ReskinError` or `OSError` if the folder
-    cannot be created.
+    Parameters
+    ----------
+    board : the port and the wire format of the board
+    reader : the object that reads the bytes from the port
+    port_in_name : whether the name of the folder contains the port
+    source : "simulated" if the board is emulated from a simulation
+
+    Raises
+    ------
+    ReskinError, OSError
+        If the folder of the recording cannot be created.
     """
 
     def __init__(
         self, board: DetectedBoard, reader: Reader, *, port_in_name: bool, source: Source = "recorded"
     ) -> None:
         self.folder = new_folder()
-        if port_in_name:  # because two boards may start recording in the same second
+        if port_in_name:  # without the port, two recordings that start in the same second would have the same name
             port = re.sub(r"[^A-Za-z0-9]+", "-", board.port).strip("-")
             self.folder = self.folder.with_name(f"{self.folder.name}-{port}")
         self._part, self._header = begin_capture(
@@ -115,7 +132,7 @@ class PageRecording:
         return self._labels.touches_n if self._labels is not None else 0
 
     def add(self, press: LabelledPress) -> None:
-        """Write the label of a press to the probe log.
+        """Write the label of a press to the probe log, which is the file of the recording's labels.
 
         Raises
         ------
@@ -130,7 +147,8 @@ class PageRecording:
             )
         if self._labels is None:  # a capture without labels has no probe log
             self._labels = ProbeLogWriter(self._part)
-            # Labels and arrivals have times of the same clock, so a single mark with two equal times aligns them.
+            # The times of the labels and of the arriving bytes are from the same clock. A single mark, which has the
+            # same time for both, therefore suffices to align them.
             clock = Clock(kind="arrivals", rate_hz=None, marks=((self._begun_s, self._begun_s),))
             options = self._header.options | {"labels": "page"}
             self._change_header(clock=clock, options=options)
@@ -141,7 +159,13 @@ class PageRecording:
         io.write_text(self._part / HEADER_FILE, render(self._header))
 
     def end(self) -> str:
-        """Finish the capture; return a text for the user. Raises `OSError` if the header cannot be written."""
+        """Finish the recording; return a text for the user.
+
+        Raises
+        ------
+        OSError
+            If the header cannot be written.
+        """
         self._reader.write_to(None)
         if self._labels is not None:
             self._labels.close()

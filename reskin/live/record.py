@@ -1,4 +1,8 @@
-"""Record a board to a capture folder, with labels from prompts, a robot's CSV file, a force gauge or a program."""
+"""Record a board to a capture folder, optionally with labels.
+
+The labels can come from prompts that ask the user to press given places, from a CSV file that a robot writes, from a
+force gauge, or from a program.
+"""
 
 import sys
 import time
@@ -27,29 +31,31 @@ from reskin.recordings.stream_recorder import PortSettings
 from reskin.seeds import rng_for
 
 GAUGE_BAUD = 9600
-SILENCE_S = NO_FRAME_S = 5.0
+SILENCE_S = NO_FRAME_S = 5.0  # a recording ends if no data, or no complete frame, arrives for this time
 
 
 class RecordingResult(NamedTuple):
-    """The folder of a finished recording, and a summary for the user."""
+    """The result of a recording that has ended."""
 
     folder: Path
-    summary: str
-    error: Exception | None  # exception of the label source that ended the recording, if any
+    summary: str  # text for the user
+    error: Exception | None  # the exception, if the source of the labels ended the recording by raising an exception
 
 
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
 ) -> LabelSource | None:
-    """Create the source of labels from options of `reskin record`; return None if no labels are requested.
+    """Create the source of labels that the options of `reskin record` request; return None if none is requested.
 
     Parameters
     ----------
-    labels : places that the user is asked to press, such as `grid:5x5:4`, or a CSV file to which a robot appends labels
-    gauge : port of a force gauge, `PORT` or `PORT@BAUD`
-    scan : order of the prompts, "random" or "snake"; the default is "random"
+    labels : option `--labels`: either places that the user is asked to press, such as `grid:5x5:4`, or the name of a
+    CSV
+        file to which a robot appends labels
+    gauge : option `--gauge`: port of a force gauge, as `PORT` or `PORT@BAUD`
+    scan : option `--scan`: order of the prompts, "random" or "snake"; "random" by default
     dwell_s : time for which a label from a prompt is valid
-    say : called with the text of each prompt
+    say : function that is called with the text of each prompt
     """
     port, _, baud = (gauge or "").partition("@")
     if baud and not baud.isdecimal():
@@ -88,12 +94,13 @@ def record_board(
     Parameters
     ----------
     board : the port and its wire format
-    labels : source of labels during the recording, if any
-    folder : folder to create for the capture; the default is captures/DATE-TIME
+    labels : source of the labels; None for a recording without labels
+    folder : folder that is created for the capture; captures/DATE-TIME by default
     seconds : maximum duration
-    baud : baud rate; USB ports ignore it
-    names : values for the capture's header under the keys board and skin (names) and scan (order of the places)
-    source : "simulated" if the port is an emulated board that sends a simulation
+    baud : baud rate, which USB ports ignore
+    names : values for the capture's header: the keys `board` and `skin` have the names of the board and the skin, and
+        the key `scan` has the order of the places
+    source : "simulated" if an emulated board sends a simulation to the port
     """
     check_name(board.port)  # before a folder is created
     folder, health = folder or new_folder(), Health(board.chips_n)

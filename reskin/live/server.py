@@ -1,8 +1,11 @@
-"""The web server of `reskin live`: an HTML page, and one websocket per page and board.
+"""The web server of `reskin live`.
 
-By default, only this machine can connect. If the server listens on another address, requests need a token. A client can
-request only fixed files, boards and actions. The only file names that it can choose are those of saved skins, all of
-which are in one folder.
+The server sends an HTML page, and opens one websocket for each board on each open page.
+
+By default, only programs on the same machine can connect to the server. If the server listens on an address that other
+machines can reach, every request needs a token. A client can request only the files of the page, the boards, and the
+actions of the page's buttons. The only file names that a client can choose are those of saved skins, and all of these
+files are in one folder.
 """
 
 import asyncio
@@ -38,7 +41,10 @@ HEADERS = {
 
 
 class Server:
-    """Serves the page of one or more boards. If the token is empty, only requests to a local host name are allowed."""
+    """The server of the page for one or more boards.
+
+    If the token is empty, the server allows only requests that are addressed to a local host name.
+    """
 
     def __init__(self, sessions: Sequence[Session], token: str) -> None:
         self._sessions, self._token = sessions, token
@@ -63,7 +69,9 @@ class Server:
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             raise web.HTTPForbidden(text="token missing or wrong: use the address that reskin live printed\n")
-        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protection against DNS rebinding
+        # Without a token, the host name is checked. This is a protection against DNS rebinding, in which another web
+        # site lets its own host name point to this machine.
+        if not self._token and not LOCAL_HOST.fullmatch(request.host):
             raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
@@ -75,7 +83,10 @@ class Server:
         return response
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
-        """Serve one websocket until it is closed: send new data of a board, and receive button presses."""
+        """Serve one websocket until it is closed.
+
+        The server sends new data of a board, and receives the actions of the user.
+        """
         index = request.query.get("board", "0")
         if index not in map(str, range(len(self._sessions))):
             raise web.HTTPNotFound(text="there is no such board\n")
@@ -90,7 +101,8 @@ class Server:
                 sending = group.create_task(self._send(session, socket))
                 async for message in socket:
                     if message.type == WSMsgType.TEXT:
-                        await asyncio.to_thread(receive, session, message.data)  # a button may write files
+                        # The action is performed in another thread, because it may write files, which takes time.
+                        await asyncio.to_thread(receive, session, message.data)
                 sending.cancel()
         finally:
             sockets.discard(socket)
@@ -119,7 +131,7 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a JSON message from a page (see `Session.request`); ignore anything else."""
+    """Handle a JSON message from a page (see `Session.request`). A text that is not such a message is ignored."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):
@@ -131,8 +143,12 @@ def serve(
 ) -> None:
     """Serve the page of one or more boards until Ctrl-C.
 
-    As soon as the server listens, `say` is called with a text that contains the address of the page and `where`, which
-    names the folders of saved files.
+    Parameters
+    ----------
+    sessions : the boards
+    host, http_port : address and port on which the server listens
+    say : function that is called as soon as the server listens, with a text that contains the address of the page
+    where : text about the folders of saved files, which is added to this text
     """
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:
@@ -142,7 +158,7 @@ def serve(
         announcement = f"{', '.join(map(str, sessions))}: open {address}; press Ctrl-C to stop"
         announcement += f"\n{where}" if where else ""
         app = Server(sessions, token).application()
-        # aiohttp calls `print` once, when the server listens.
+        # aiohttp calls the function `print` once, as soon as the server listens.
         web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)
     except OSError as error:
         if isinstance(error, gaierror) or error.errno in (None, errno.EADDRNOTAVAIL):

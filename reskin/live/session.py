@@ -1,4 +1,8 @@
-"""One board on the page of `reskin live`: the thread that estimates, the messages to the page, and button actions."""
+"""One board on the page of `reskin live`.
+
+A session consists of the thread that estimates contacts, the messages to the page, and the actions of the page's
+buttons.
+"""
 
 import math
 import struct
@@ -24,36 +28,46 @@ from reskin.seeds import rng_for
 from reskin.universal.layout import BoardLayout, paper_layout
 
 POLL_S = 0.1
-# If there are several boards, frames are collected for this time and then estimated together, which needs less
-# computing time. This delay is not visible, because pages are redrawn at most 30 times per second.
+# If there are several boards, the frames of a board are collected for this time and then estimated together. This needs
+# less computing time than estimating every frame on arrival. The delay is not visible, because pages are redrawn at
+# most 30 times per second.
 GATHER_S = 0.02
 
-WINDOW_S, BIN_S = 10.0, 0.02  # duration and bin width of traces; must equal the values in page/trace.js
+# Duration of the traces (the curves of force and field change over time) and width of a bin of the traces. Both must
+# equal the values in page/trace.js.
+WINDOW_S, BIN_S = 10.0, 0.02
 BINS_N = round(WINDOW_S / BIN_S)
-LATENCIES_N = 4000  # number of latest latencies in the statistics; 10 s at 400 Hz
-UNCONFIRMED_MAX_N = 64  # maximum number of sent messages that wait for a confirmation
+# Number of latest latencies from which the page's statistics are computed. At 400 Hz, these are the latencies of 10 s.
+LATENCIES_N = 4000
+UNCONFIRMED_MAX_N = 64  # largest number of sent messages for which a page's confirmation is expected
 UNKNOWN_CONTACT = (math.nan,) * 3
-HEAD = struct.Struct("<IHHd")  # fields: message number, number of chips, number of bins, time of the last reading
-# The numbers are: x_mm, y_mm, F_N, standard deviations of x and y, contact, rate, number of lost bytes, four latencies
-# in ms, number of dropped frames, and the true x, y and F of an emulated board (NaN for real boards and without
-# contact).
+# The head of a binary message: message number, number of chips, number of bins, and time of the last reading.
+HEAD = struct.Struct("<IHHd")
+# The head is followed by these numbers: x_mm, y_mm, F_N, the standard deviations of x and y, whether there is contact,
+# the frame rate, the number of lost bytes, four latencies in ms, the number of dropped frames, and the true x, y and F
+# of an emulated board. The last three numbers are NaN for real boards, and while nothing touches the skin.
 NUMBERS_N = 16
 
-PRESSES_N = 12
-# Coordinates of the grid of places to press, along x and along y, relative to the board's centre and as fractions of
-# half the area's width.
+PRESSES_N = 12  # number of presses anywhere for a calibration
+# The places for guided presses form a square grid. These are their coordinates along x and along y, relative to the
+# board's centre and as fractions of half the width of the sensing area.
 GUIDED = 0.375 * np.array([-1.5, -0.5, 0.5, 1.5])
-READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
+READINGS_MIN_N = 4  # a contact with fewer readings is not counted as a press
 
 
 class Traces:
-    """Minima and maxima of the force and of the field changes in bins of 20 ms, for the last ten seconds."""
+    """The data for the curves on the page: force and field changes over the last ten seconds.
+
+    The time is divided into bins of 20 ms. For each bin, the minimum and the maximum of each curve are stored.
+    """
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
         self._chips_n = len(layout.chips_mm)
-        self._bin = np.full(BINS_N, -1)  # number of the bin in each slot of the ring; -1 for an empty slot
-        self._low = np.full((BINS_N, 1 + self._chips_n), np.nan, np.float32)  # force in N, then |dB| of each chip in uT
+        # The bins are stored in a ring buffer. This is the number of the bin in each slot, or -1 for an empty slot.
+        self._bin = np.full(BINS_N, -1)
+        # The columns are the force in N, followed by |dB| of each chip in uT.
+        self._low = np.full((BINS_N, 1 + self._chips_n), np.nan, np.float32)
         self._high = self._low.copy()
         self._last: Estimates | None = None
         self._message_i = 0
@@ -66,7 +80,7 @@ class Traces:
         return int(self._bin.max())
 
     def add(self, estimates: Estimates, now_s: float) -> None:
-        """Add estimates, computed at time `now_s`, to the bins of their arrival times."""
+        """Add estimates to the bins of their arrival times. `now_s` is the time at which they were computed."""
         self._last = estimates
         self.to_estimate_s.extend((now_s - estimates.t_s).tolist())
         chips_uT = np.linalg.norm(estimates.db_uT.reshape(len(estimates), -1, 3), axis=2)
@@ -88,10 +102,11 @@ class Traces:
         dropped_frames_n: int = 0,
         true_contact: Sequence[float] = UNKNOWN_CONTACT,
     ) -> bytes:
-        """Return a binary message with the last reading and the bins from `after_bin` on; b"" before the first reading.
+        """Return a binary message with the last reading and with all bins from `after_bin` on.
 
-        Bin `after_bin` was already sent and is sent again, because readings may have been added to it. `true_contact`
-        is x_mm, y_mm and F_N of an emulated board.
+        The bin `after_bin` was already sent with the previous message. It is sent again, because readings may have been
+        added to it since then. If there is no reading yet, the message is empty. `true_contact` is the true x_mm, y_mm
+        and F_N of an emulated board.
         """
         last = self._last
         if last is None:
@@ -115,30 +130,35 @@ class Traces:
             *latencies_ms,
             np.array([dropped_frames_n, *true_contact]),
             change_uT.ravel(),
-            numbers * BIN_S - t_s,  # relative to t_s, because a float32 cannot resolve 20 ms in a time of several days
+            # The times of the bins are relative to the last reading. After several days, the time since the start would
+            # be so large that a float32 could not resolve 20 ms.
+            numbers * BIN_S - t_s,
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
         return head + np.concatenate(parts).astype("<f4").tobytes()
 
     def bins_of(self, times_s: Sequence[float]) -> list[int]:
-        """Return the numbers of the bins of some times."""
+        """Return the number of the bin that contains each of the given times."""
         return [int((t_s - self._start_s) / BIN_S) for t_s in times_s]
 
     def confirm(self, message_i: int, now_s: float) -> None:
-        """Record the latency of a drawn message: the time from the arrival of its last reading until now."""
+        """Store the latency of a message that a page has drawn.
+
+        The latency is the time from the arrival of the last reading in the message until now.
+        """
         for sent_i, t_s in self._unconfirmed:
             if sent_i == message_i:
                 self.to_screen_s.append(now_s - t_s)
 
 
 class Presses:
-    """Collects presses for calibration, and stores the largest field change of each."""
+    """The presses that are collected for a calibration. For each press, the largest field change is stored."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
         self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
-        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change so far of the current contact
+        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change of the contact in progress
         self._readings_n = 0
 
     def __len__(self) -> int:
@@ -150,12 +170,12 @@ class Presses:
 
     @property
     def instruction(self) -> str:
-        """Instruction to the user for the next press."""
+        """The text that tells the user which press is next, and where."""
         return f"press {len(self) + 1} of {self.presses_n}, anywhere"
 
     @property
     def next_mm(self) -> list[float] | None:
-        """x and y in mm of the place to press next; None if the user may press anywhere."""
+        """x and y in mm of the place that the user should press next; None if the user may press anywhere."""
         return None
 
     @property
@@ -163,7 +183,7 @@ class Presses:
         return np.array(self._strongest_uT)
 
     def add(self, estimates: Estimates) -> None:
-        """Add the next readings. Faulty readings (NaN) are skipped and do not end a contact."""
+        """Add the next readings. Faulty readings, which are NaN, are skipped and do not end a contact."""
         known = np.isfinite(estimates.db_uT).all(axis=1)
         for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
             if contact:
@@ -177,9 +197,10 @@ class Presses:
 
 
 class GuidedPresses(Presses):
-    """Presses at grid places, which the page shows in random order.
+    """The presses that are collected at places of a grid. The page shows these places one by one in random order.
 
-    Every second press is held out, that is, not used for calibration, to measure the error of the calibrated model.
+    Every second press is held out: it is not used for the calibration, but to measure the error of the calibrated
+    model.
     """
 
     def __init__(self, board: BoardLayout | None = None) -> None:
@@ -203,22 +224,26 @@ class GuidedPresses(Presses):
         return np.arange(self.presses_n) % 2 == 1
 
 
-ADAPTING = ("adapt", "places")  # names of the buttons that request presses
-PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0  # limits of labels that the user enters, to detect wrong units
+ADAPTING = ("adapt", "places")  # names of the buttons that start the collection of presses
+# Limits of the labels that the user enters. They are so large that only labels in a wrong unit exceed them.
+PLACE_MAX_MM, FORCE_MAX_N = 1000.0, 1000.0
 
 
 class Session:
-    """One board on the page, with its traces, current recording and calibration, and the thread that polls the board.
+    """One board on the page.
+
+    A session has a thread that polls the board (reads the new data and estimates contacts). It stores the traces, the
+    current recording and the current calibration of the board.
 
     Parameters
     ----------
     port : the board's port
-    models : the model that makes the estimates
-    source : description of the board that the page shows
+    models : the model that estimates contacts
+    source : description of the board, which is displayed on the page
     fault_policy : decides which faulty readings get no estimate
-    alone : whether this is the only board of the page
+    alone : whether this is the only board on the page
     skins : folder of saved calibrations
-    model_name : name of the model's file; empty for the shipped model
+    model_name : name of the model's file; empty for the model that is shipped with the package
     emulated : the emulated board at the port; None for a real board, whose true contacts are unknown
     """
 
@@ -241,12 +266,12 @@ class Session:
         self._error = ""
         self._presses: Presses | None = None
         self._labelled_press: LabelledPress | None = None
-        self._guided_press: LabelledPress | None = None  # the current guided press, whose label is recorded
-        self._adapted = self._labelled = ""  # texts about the last calibration and the last labelled press
+        self._guided_press: LabelledPress | None = None  # the guided press in progress, whose label will be recorded
+        self._adapted = self._labelled = ""  # texts for the user about the last calibration and the last labelled press
         self._recording: PageRecording | None = None
         self._recorded = ""
-        # Requested changes of the model. The polling thread makes these changes, because it also estimates with the
-        # model.
+        # Changes of the model that the page has requested. They are made by the thread that polls the board, because
+        # this thread also uses the model for estimates.
         self._changes: deque[Callable[[UniversalEstimator], str]] = deque()
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
@@ -265,7 +290,10 @@ class Session:
         self.skin.reader.stop()
 
     def _run(self) -> None:
-        """Poll the board and estimate until `stop` is called; an error ends the thread and is shown as an alarm."""
+        """Poll the board until `stop` is called.
+
+        An error ends the thread. Its text is then displayed as an alarm.
+        """
         try:
             while not self._stop.is_set():
                 estimates = self.skin.poll(POLL_S)
@@ -281,11 +309,11 @@ class Session:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
             self._error = str(error)
-        except Exception as error:  # an unexpected error, such as one in a model
+        except Exception as error:  # an unexpected error, for example in the code of a model
             self._error = f"estimation stopped: {error!r}"
 
     def _change_model(self) -> None:
-        """Make the requested changes of the model, such as loading a saved skin."""
+        """Make the changes of the model that the page has requested, such as loading a saved skin."""
         while self._changes:
             change, estimator = self._changes.popleft(), self.skin.estimator
             try:
@@ -298,9 +326,10 @@ class Session:
                 self._adapted = str(error)
 
     def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if a button requested this; calibrate the universal model when there are enough presses.
+        """Collect presses if the user has requested this with a button.
 
-        Bytes that arrive during the calibration stay in the reader's buffer.
+        When there are enough presses, the universal model is calibrated. Bytes that arrive during the calibration are
+        not lost, because they stay in the reader's buffer.
         """
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
@@ -311,14 +340,17 @@ class Session:
                         self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
                     else:
                         self._adapted = estimator.adapt(presses.db_uT)
-                except SchemaError as error:  # no press changed the field
+                except SchemaError as error:  # raised if no press changed the field
                     self._adapted = str(error)
-                with self._button_lock:  # a button may have replaced the presses during the calibration
+                with self._button_lock:  # the user may have started another collection during the calibration
                     if self._presses is presses:
                         self._presses = None
 
     def _collect(self, presses: Presses, estimates: Estimates) -> None:
-        """Add readings to the presses; write the labels of guided presses to the current recording, if any."""
+        """Add readings to the presses that are being collected.
+
+        If there is a recording, the labels of guided presses are also written to the recording.
+        """
         before_n, next_mm = len(presses), presses.next_mm
         if next_mm is not None and self._guided_press is None:
             self._guided_press = LabelledPress(Label(True, x_mm=next_mm[0], y_mm=next_mm[1]), learn=False)
@@ -327,7 +359,7 @@ class Session:
         presses.add(estimates)
         if len(presses) == before_n:
             return
-        done, self._guided_press = self._guided_press, None  # the next press is at another place
+        done, self._guided_press = self._guided_press, None  # the next press has another label, as its place is another
         with self._button_lock:
             if done is not None and self._recording is not None:
                 try:
@@ -341,7 +373,11 @@ class Session:
                     )
 
     def _label(self, estimates: Estimates) -> None:
-        """Wait for the press that the user has labelled; then record its label and calibrate the model to the press."""
+        """Wait for the press for which the user has entered a label.
+
+        After this press, its label is written to the recording, if there is one, and the model is calibrated to the
+        press, if the user has requested this.
+        """
         press = self._labelled_press
         if press is None:
             return
@@ -366,7 +402,10 @@ class Session:
         self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'neither recorded nor used'}"
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Return the next binary message, with the bins from `after_bin` on, and the number of the newest bin."""
+        """Return the next binary message, and the number of the newest bin.
+
+        The message contains the bins from `after_bin` on. It is empty if no data have arrived yet.
+        """
         with self._lock:
             if self.traces is None:
                 return b"", 0
@@ -380,7 +419,10 @@ class Session:
             return data, self.traces.newest_bin
 
     def state(self) -> dict[str, Any]:
-        """Return the JSON message for `page/live.js`, with texts, alarms and the board's layout."""
+        """Return the state of the board as the JSON message that `page/live.js` displays.
+
+        The message contains the texts on the page, the alarms, and the layout of the board.
+        """
         skin, detected, presses = self.skin, self.skin.detected, self._presses
         recording, press, traces = self._recording, self._labelled_press, self.traces
         state: dict[str, Any] = {
@@ -418,16 +460,23 @@ class Session:
         return state
 
     def confirm(self, message_i: object) -> None:
-        """Record the latency of message number `message_i`, which a page has drawn; ignore non-integers."""
+        """Store the latency of the message with the number `message_i`, which a page has drawn.
+
+        The number comes from the page. If it is not an integer, it is ignored.
+        """
         if isinstance(message_i, int) and self.traces is not None:
             with self._lock:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
 
     def request(self, message: Mapping[str, Any]) -> None:
-        """Handle a message from a page.
+        """Handle a message from a page, which is a dict with one or more of the following keys.
 
-        Its keys are `press` (name of a button), `seen` (number of the last drawn message), `save` and `load` (name of a
-        skin), or `label` (place and force of the next press; null to cancel). Unknown keys are ignored.
+        - `press`: the name of a button that the user has pressed
+        - `seen`: the number of the message that the page has drawn last
+        - `save`, `load`: the name of a skin whose calibration is saved or loaded
+        - `label`: the place and the force of the next press, or None to cancel a label
+
+        Other keys are ignored.
         """
         self.press(message.get("press"))
         self.confirm(message.get("seen"))
@@ -443,7 +492,7 @@ class Session:
                     self._labelled = str(error)
 
     def press(self, button: object) -> None:
-        """Perform the action of a button of the page; ignore unknown buttons."""
+        """Perform the action of a button on the page. Names of buttons that do not exist are ignored."""
         with self._button_lock:
             if button == "zero":
                 self.skin.zero()
@@ -465,9 +514,10 @@ class Session:
         return estimator.load(self._skins.file(name))
 
     def _request_label(self, label: object) -> None:
-        """Wait for a press with a label (`x_mm`, `y_mm`, `force_N`, `learn`), or stop waiting if the label is None.
+        """Use a label for the next press, or cancel the label for the next press if `label` is None.
 
-        A `force_N` of None is unknown. `learn` states whether to calibrate the model to the press.
+        A label is a dict with the keys `x_mm` and `y_mm` (the place), `force_N` (the force, or None if it is unknown)
+        and `learn` (whether the model is calibrated to the press).
 
         Raises
         ------
@@ -483,7 +533,7 @@ class Session:
         estimator, learn = self.skin.estimator, False
         limits_mm = np.array([[-PLACE_MAX_MM] * 2, [PLACE_MAX_MM] * 2])
         if label.get("learn") is True and isinstance(estimator, UniversalEstimator):
-            learn, limits_mm = True, estimator.model.reach_mm  # the place must be on the skin
+            learn, limits_mm = True, estimator.model.reach_mm  # the model can learn only places on the skin
         least_mm, most_mm = limits_mm
         x_mm = _number(label.get("x_mm"), "x", least_mm[0], most_mm[0], "mm")
         y_mm = _number(label.get("y_mm"), "y", least_mm[1], most_mm[1], "mm")
@@ -491,14 +541,17 @@ class Session:
         force_N = math.nan if force_N is None else _number(force_N, "the force", 0.0, FORCE_MAX_N, "N")
         if not learn and self._recording is None:
             raise ParamsError(
-                "label: it would be neither recorded nor used. Start a recording, or let the model learn it."
+                "label: the label would be neither recorded nor used for calibration. Start a recording (key r), or "
+                "tick the box to let the model learn the press."
             )
         if self._presses is not None:
-            raise ParamsError("label: other presses are being collected. Finish them first.")
+            raise ParamsError(
+                "label: presses for Adapt or Places are being collected. Finish or cancel them, then enter the label."
+            )
         self._labelled_press = LabelledPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)
 
     def _begin_recording(self) -> None:
-        """Start writing the byte stream to a new capture."""
+        """Start to write the byte stream to a new capture."""
         try:
             source = "recorded" if self._emulated is None else self._emulated.source
             self._recording = PageRecording(
@@ -527,7 +580,13 @@ def _place(label: Label) -> str:
 
 
 def _number(value: object, name: str, least: float, most: float, unit: str) -> float:
-    """Return a number that the page sent; raise `ParamsError` if it is not a number above `least` and below `most`."""
+    """Check a number that the page has sent, and return it as a float.
+
+    Raises
+    ------
+    ParamsError
+        If the value is not a number above `least` and below `most`.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < most:  # False for NaN
         got = "nothing" if value is None else repr(value)[:40]
         raise ParamsError(f"label: {name} must be a number above {least:g} and below {most:g} {unit}; got {got}.")
@@ -544,9 +603,10 @@ def open_sessions(
     model_name: str = "",
     emulated: EmulatedBoard | None = None,
 ) -> list[Session]:
-    """Create one session per port. Sessions share the weights of the models and the folder of saved skins.
+    """Create one session per port. See `Session` for the arguments.
 
-    Each session has its own calibration. See `Session` for the arguments.
+    All sessions use the same weights of the models and the same folder of saved skins, but each session has its own
+    calibration.
     """
     check_ports(ports, models, "--port")
     skins, alone = skins or SkinFolder(), len(ports) == 1

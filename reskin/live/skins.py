@@ -1,4 +1,4 @@
-"""The folder in which `reskin live` saves calibrations, in one file per skin."""
+"""The folder in which `reskin live` saves calibrations. There is one file per skin."""
 
 import re
 import threading
@@ -11,11 +11,14 @@ from reskin.recordings.header import NAME
 from reskin.universal.model import Universal
 
 SKINS = Path("skins")  # default folder, in the working directory
-LISTED_S = 1.0  # the folder is listed again after this time
+LISTED_S = 1.0  # the list of the files in the folder is read again if it is older than this time
 
 
 class SkinFolder:
-    """A folder of saved calibrations. All boards of a page share one `SkinFolder`, so that no name is used twice."""
+    """A folder of saved calibrations.
+
+    All boards on a page use the same `SkinFolder`, so that two boards cannot save calibrations under the same name.
+    """
 
     def __init__(self, folder: Path = SKINS) -> None:
         if folder.exists() and not folder.is_dir():
@@ -35,12 +38,13 @@ class SkinFolder:
             return self._names
 
     def file(self, name: object) -> Path:
-        """Return the file of a name.
+        """Return the file of the skin with this name.
 
         Raises
         ------
         ParamsError
-            If the name contains other characters than letters, digits, - and _.
+            If the name is not allowed. A name has 1 to 64 letters, digits, - and _, and begins with a letter or a
+            digit.
         """
         if not isinstance(name, str) or not re.fullmatch(NAME, name):
             got = repr(name)[:40] if name else "nothing"
@@ -55,9 +59,9 @@ class SkinFolder:
         Raises
         ------
         ParamsError
-            If the name is invalid, or a skin of this name exists.
+            If the name is not allowed, or if there is already a saved skin with this name.
         SchemaError
-            If the model has no presses to save, or the file cannot be written.
+            If the model has not been calibrated to any press, or if the file cannot be written.
         """
         file = self.file(name)
         if not model.presses_n:

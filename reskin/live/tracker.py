@@ -1,8 +1,11 @@
-"""Estimate contacts on a running board: convert bytes to frames, frames to field changes, and these to place and force.
+"""Estimate contacts on a running board.
 
-`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that no bytes
-are lost if the program that uses the contacts (the controller) is slow. The controller's own thread decodes the bytes
-and estimates the contacts.
+The bytes from the board's port are decoded to frames, a no-load reading is subtracted from the frames to obtain field
+changes, and a model estimates the place and the force of the contact from each field change.
+
+The function `reskin.open` returns a `LiveSkin` for one port, and a `LiveSkins` for several ports. One thread per port
+does nothing but read bytes, so that no bytes are lost if the program that uses the contacts (the controller) is slow.
+For a `LiveSkin`, the bytes are decoded and the contacts are estimated in the controller's own thread.
 """
 
 import threading
@@ -45,40 +48,46 @@ from reskin.universal.layout import BoardLayout
 from reskin.universal.map import Estimate
 from reskin.universal.model import MISFIT_MAX, Universal
 
-NOLOAD_S = 1.0  # the no-load reading is the mean over this time without contact
-NOLOAD_FRAMES_MAX_N = 10_000
-# The wire format is detected when data for `HEAD_S` seconds, or `HEAD_BYTES_MAX_N` bytes, have arrived.
+NOLOAD_S = 1.0  # the no-load reading is the mean of the readings in this time, during which nothing touches the skin
+NOLOAD_FRAMES_MAX_N = 10_000  # the no-load reading ends earlier if this number of frames has arrived
+# The wire format is detected as soon as data for `HEAD_S` seconds, or `HEAD_BYTES_MAX_N` bytes, have arrived.
 HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18
-SILENT_S = 0.3  # after this time without data, a controller receives a contact whose values are NaN
-OPENING_S = 10.0  # maximum time for format detection and the no-load reading after a port was opened
-# number of latest chunks whose end and arrival time are stored, because a frame may end in an earlier chunk
+SILENT_S = 0.3  # if no data arrive for this time, a controller receives a contact whose values are NaN
+OPENING_S = 10.0  # longest time after opening a port for the detection of the wire format and the no-load reading
+# Number of latest chunks whose end and arrival time are stored. Earlier chunks are needed because a frame may have
+# ended in an earlier chunk than the latest one.
 ENDS_KEPT_N = 256
-FRAME_BYTES_MIN_N = 16  # minimum number of bytes per chip in a frame, over all wire formats
-SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
-# Assumed limit of a network's inputs, in standard deviations of the network's training data. For models that were
-# trained in the same scene, the largest observed input is 6 in scene `quick` and 7 in scene `lab`.
+FRAME_BYTES_MIN_N = 16  # smallest number of bytes per chip in a frame, among all wire formats
+SPACING_MM = 5.0  # distance between chips on the page if their positions are unknown
+# A reading is outside a network's training distribution if one of the network's inputs is larger than this number of
+# standard deviations of the training data. The value is assumed. For models that were trained in the same scene, the
+# largest observed input is 6 in scene `quick` and 7 in scene `lab`.
 UNKNOWN_SDS = 10.0
-UNDO_MAX_N = 100  # maximum number of calibration steps that can be undone
-ZEROINGS_KEPT_N = 16  # number of latest no-load readings whose times are stored
+UNDO_MAX_N = 100  # largest number of calibration steps that can be undone
+ZEROINGS_KEPT_N = 16  # number of latest no-load readings whose times are stored, to mark them on the page
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
 UNKNOWN_SKIN = "unknown skin: the model was not trained on such field changes"
 
-Models = Sequence[Network] | Universal  # with an empty sequence, no place or force is estimated
+# The model that estimates contacts. If it is an empty sequence of networks, no place and no force is estimated.
+Models = Sequence[Network] | Universal
 
 
 class Prediction(NamedTuple):
-    """Predictions for f readings in contact."""
+    """The predictions of a model for f readings that were taken during contact."""
 
-    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
+    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm and F_N
     sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
     sd_F_N: Float64[np.ndarray, " f"]  # standard deviation of the force; NaN if unknown
     unknown: Bool[np.ndarray, " f"]  # whether a reading is outside the model's training distribution
 
 
 class NetworkEstimator:
-    """Predicts the mean of several trained networks, with the standard deviations between the networks."""
+    """An estimator that uses one or more trained networks.
+
+    The prediction is the mean of the networks. Its uncertainty is the standard deviation between the networks.
+    """
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.channels_n: int = networks[0].card["input"]["channels_n"]
@@ -87,7 +96,7 @@ class NetworkEstimator:
         self._inputs = [
             (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
         ]
-        # predict once, so that torch is imported and the network is built before the first contact
+        # Each network predicts once here, so that torch is imported and the network is built before the first contact.
         for network in networks:
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
@@ -103,10 +112,10 @@ class NetworkEstimator:
 
 
 class Labels(NamedTuple):
-    """Field changes of m presses at known places; a force is NaN if it is unknown."""
+    """The labels and the field changes of m presses at known places."""
 
     place_mm: Float64[np.ndarray, "m 2"]
-    force_N: Float64[np.ndarray, " m"]
+    force_N: Float64[np.ndarray, " m"]  # NaN if the force is unknown
     db_uT: Float64[np.ndarray, "m ch"]
 
     def followed_by(self, other: "Labels") -> "Labels":
@@ -114,19 +123,14 @@ class Labels(NamedTuple):
 
 
 class LearningState(NamedTuple):
-    """The calibration data of a `UniversalEstimator`, except for the no-load reading.
+    """The calibration data of a `UniversalEstimator` after one calibration step, except for the no-load reading."""
 
-    `origin` is the model that was passed or loaded. `origin_name` is the name of the loaded skin, if any. `presses_uT`
-    are field changes of presses at unknown places. `guided` are presses at places that the page showed. `typed` are
-    presses whose places the user entered.
-    """
-
-    origin: Universal
-    origin_name: str
-    presses_uT: Float64[np.ndarray, "n ch"]
-    guided: Labels
-    typed: Labels
-    step: str  # the last calibration step, such as "the 12 presses"
+    origin: Universal  # the model before the calibration, which was passed to the estimator or loaded from a file
+    origin_name: str  # the name of the saved skin that was loaded; empty if none was loaded
+    presses_uT: Float64[np.ndarray, "n ch"]  # field changes of presses at unknown places
+    guided: Labels  # presses at places that the page showed
+    typed: Labels  # presses whose places the user entered
+    step: str  # description of the calibration step, such as "the 12 presses"
 
     @property
     def labels(self) -> Labels:
@@ -134,26 +138,29 @@ class LearningState(NamedTuple):
 
     @classmethod
     def start(cls, origin: Universal, origin_name: str = "", step: str = "") -> "LearningState":
-        """Return the state before any calibration to presses on the page."""
+        """Return the state of a model that has not yet been calibrated to presses on the page."""
         none_uT = np.zeros((0, origin.channels_n))
         none = Labels(np.zeros((0, 2)), np.zeros(0), none_uT)
         return cls(origin, origin_name, none_uT, none, none, step)
 
 
 class UniversalEstimator:
-    """Predicts with a copy of a universal model, which is further calibrated to no-load readings and to presses.
+    """An estimator that uses a universal model, and calibrates it to the skin while the board is running.
 
-    The model that was passed is not changed. A call of `adapt` or `label` replaces the presses of an earlier call of
-    the same method, so that the user can repeat bad presses. `undo` reverts the last calibration step.
+    The estimator calibrates a copy of the model. The model that was passed is not changed. The calibration uses the
+    no-load reading, presses at unknown places (`adapt`) and presses at known places (`label` and `add_label`). If
+    `adapt` or `label` is called again, the new presses replace those of the earlier call, so that the user can repeat
+    bad presses. `undo` reverts the last calibration step.
     """
 
     name = "universal model"
 
     def __init__(self, model: Universal) -> None:
         self.channels_n, self.board = model.channels_n, model.layout
-        # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
+        # Until `set_noload` is called, the no-load field is that of the model, or zero if the model has none.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(self.channels_n)
-        self._states = [LearningState.start(model)]  # the last state is in use; the earlier states are for `undo`
+        # The last state is the current one. The earlier states are stored so that `undo` can return to them.
+        self._states = [LearningState.start(model)]
         self._use(self._states[0])
 
     @property
@@ -173,17 +180,18 @@ class UniversalEstimator:
 
     @property
     def external_uT(self) -> float:
-        """Expected size of external fields; 0 if none are expected."""
+        """Expected size of external fields, such as that of a magnet; 0 if no external fields are expected."""
         return self._model.external_uT
 
     def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
-        """Return the matrix of `Universal.suppressor`."""
+        """Return the matrix that removes external fields from readings (see `Universal.suppressor`)."""
         return self._model.suppressor(noise_uT)
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Set the no-load field to the mean of f readings without contact, and recalibrate.
+        """Set the no-load field to the mean of f readings without contact, and repeat the calibration.
 
-        The no-load field also shows whether the skin is turned by 90 degrees (`Universal.mounting`).
+        The calibration depends on the no-load field, which also shows whether the skin is turned by 90 degrees (see
+        `Universal.mounting`).
         """
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._use(self.learnt)
@@ -214,9 +222,9 @@ class UniversalEstimator:
     def label(
         self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
     ) -> str:
-        """Calibrate to presses at known places, except for those that are held out.
+        """Calibrate to presses at known places, except for presses that are held out to measure the error.
 
-        The forces were not measured, so the model's estimates are used as force labels.
+        The forces of the presses were not measured. The model's own estimates are used in place of measured forces.
 
         Returns
         -------
@@ -242,11 +250,13 @@ class UniversalEstimator:
         )
 
     def add_label(self, place_mm: tuple[float, float], force_N: float, db_uT: Float[np.ndarray, " ch"]) -> str:
-        """Calibrate to one more press, at a place in mm and with a force in N (NaN if it is unknown).
+        """Calibrate to one more press, whose place and, if it was measured, force are known.
+
+        A force of NaN means that the force is unknown.
 
         Returns
         -------
-        A text for the user: the error of the place and the force at this press before the calibration.
+        A text for the user: the errors of the place and the force of this press before the calibration.
 
         Raises
         ------
@@ -268,10 +278,10 @@ class UniversalEstimator:
         Raises
         ------
         SchemaError
-            If the file is missing or damaged, is not a calibration, or is one for another board. The calibration is
-            then unchanged.
+            If the file does not exist, is damaged, is not a saved calibration, or is for another kind of board. The
+            calibration is then unchanged.
         """
-        if not file.is_file():  # for example because it was deleted since the page listed it
+        if not file.is_file():  # for example, because another program deleted the file after the page had listed it
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
         origin = copy(self.learnt.origin).remember(file)
         self._learn(LearningState.start(origin, file.stem, f"the loading of {file.stem}"))
@@ -295,7 +305,10 @@ class UniversalEstimator:
         return self._model.estimate(db_uT + self._noload_uT)
 
     def _learn(self, state: LearningState) -> None:
-        """Calibrate with a new state, and keep the previous state for `undo`; if this fails, nothing changes."""
+        """Calibrate the model with the data of a new state, and keep the previous state for `undo`.
+
+        If the calibration fails, the previous state stays in use.
+        """
         self._use(state)
         self._states = [*self._states, state][-UNDO_MAX_N - 1 :]
 
@@ -307,16 +320,25 @@ class UniversalEstimator:
         known = np.isfinite(force_N)
         if known.any():
             model.label(place_mm[known], force_N[known], db_uT[known] + self._noload_uT, keep=True)
-        if not known.all():  # after the presses with known forces, because these help to estimate the unknown forces
+        # Presses with unknown forces are added last, because the presses with known forces help to estimate their
+        # forces.
+        if not known.all():
             model.label(place_mm[~known], None, db_uT[~known] + self._noload_uT, keep=True)
-        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so make it before the first contact
+        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so it is made before the first contact
         self._model, self.warnings = model, model.warnings
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
-    """Raise ParamsError for an invalid or repeated port, or for several ports and a model calibrated to one skin."""
+    """Check the names of ports, and whether the model can be used for the boards at these ports.
+
+    Raises
+    ------
+    ParamsError
+        If the name of a port is invalid or occurs twice, or if there are several ports but the model is calibrated to
+        one skin.
+    """
     find.check_named_once(ports, where)
-    for port in ports:  # the port need not exist: an unplugged board may be plugged in later
+    for port in ports:  # only the name is checked; the port need not exist yet, because a board may be plugged in later
         check_name(port)
     if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
         raise ParamsError(
@@ -327,9 +349,9 @@ def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of a board's chips and of the skin, in the coordinate system of the labels x_mm and y_mm."""
+    """The positions of a board's k chips and of its skin, in the coordinate system of the labels x_mm and y_mm."""
 
-    known: bool  # whether the positions are known; if not, `chips_mm` is a row of chips for the display
+    known: bool  # whether the positions are known; otherwise, the chips are displayed in a row
     chips_mm: Float64[np.ndarray, "k 2"]
     turn: Float64[np.ndarray, "k 3 3"]  # rotation from each chip's axes to the board's axes
     corner_mm: tuple[float, float]  # lower left corner of the skin
@@ -337,10 +359,11 @@ class Layout:
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Return the layout of the nominal board with this number of chips; if there is none, put all chips in one row.
+    """Return the layout of a board with this number of chips.
 
-    The byte stream does not identify the board. A board with five chips is assumed to be the paper's board, and a board
-    with forty chips the paper's sleeve.
+    The byte stream does not state which board it comes from. A board with five chips is therefore assumed to be the
+    paper's board, and a board with forty chips is assumed to be the paper's sleeve. If no nominal board has this number
+    of chips, the layout is unknown, and the result has all chips in one row.
     """
     for name, settings in nominal("boards").items():
         design = parse(BoardDesign, settings["design"], f"nominal board {name}")
@@ -359,7 +382,7 @@ def layout_of(chips_n: int) -> Layout:
 
 
 def layout_of_board(board: BoardLayout) -> Layout:
-    """Return the layout of the board that a universal model was made for."""
+    """Return the layout of the board for which a universal model was made."""
     centre_mm, size_mm = np.array(board.centre_mm), np.array(board.skin.size_mm)
     turn = Rotation.from_euler("z", np.array(board.turns_deg)[:, None], degrees=True).as_matrix()
     x_mm, y_mm = (centre_mm - size_mm / 2).tolist()
@@ -367,31 +390,33 @@ def layout_of_board(board: BoardLayout) -> Layout:
 
 
 class Contact(NamedTuple):
-    """One reading of a board, with its estimate.
+    """One reading of a board, and the place and the force that a model estimated from the reading.
 
-    Without contact, the place is NaN and the force is 0. If the reading is not usable, place and force are NaN, and
-    `alarms` contains the reason, for example that a read failed or that the board is silent or unplugged.
+    If nothing touches the skin, the place is NaN and the force is 0. If the reading is not usable, the place and the
+    force are NaN, and `alarms` contains the reason. For example, the read of a chip failed, or the board is unplugged.
     """
 
     t_s: float  # unix time at which the last byte of the reading arrived
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # standard deviations of x and y (between networks; NaN for a single network)
+    # Standard deviations of x and y. For trained networks, these are the standard deviations between the networks, and
+    # NaN for a single network.
+    sd_mm: tuple[float, float]
     b_uT: Float32[np.ndarray, " ch"]
-    alarms: tuple[str, ...]  # current problems of the board
-    sd_F_N: float = np.nan  # standard deviation of the force (between networks; NaN for a single network)
-    usable: bool = True  # False if a chip is faulty, if the board is silent, or if there is no no-load reading yet
+    alarms: tuple[str, ...]  # texts of the current alarms of the board
+    sd_F_N: float = np.nan  # standard deviation of the force, defined as for `sd_mm`
+    usable: bool = True  # False if a chip is faulty, if no data arrive, or if there is no no-load reading yet
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Frames from one call of `LiveSkin.poll`, in the order of arrival, with their estimates."""
+    """The f frames from one call of `LiveSkin.poll`, in the order of their arrival, with the estimates for them."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading, and for faulty frames
-    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N, as in `Contact`; NaN without a model
+    db_uT: Float32[np.ndarray, "f ch"]  # NaN for faulty frames, and as long as there is no no-load reading
+    target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm and F_N, as in `Contact`; NaN if there is no model
     sd_mm: Float64[np.ndarray, "f 2"]
     sd_F_N: Float64[np.ndarray, " f"]
     contact: Bool[np.ndarray, " f"]
@@ -401,10 +426,11 @@ class Estimates:
 
 
 class LiveSkin:
-    """Contacts of the skin on one port, returned by `reskin.open`.
+    """The skin at one port, whose contacts are estimated while the board is running. `reskin.open` returns it.
 
     Use a `LiveSkin` in a `with` statement, which opens the port and takes the no-load reading. Iteration over a
-    `LiveSkin` yields the latest contact; iteration over `every()` yields the contact of every reading.
+    `LiveSkin` yields the latest contact and skips older ones. Iteration over `every()` yields the contact of every
+    reading.
     """
 
     def __init__(
@@ -412,8 +438,8 @@ class LiveSkin:
     ) -> None:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.DetectedBoard(port, WAITING)
-        self.description = port  # once detected: port, wire format and scale
-        self.account: Counter[str] = Counter()  # sum of the counts of all `FrameStream`s since the start
+        self.description = port  # the port; after the wire format was detected, also the format and the scale
+        self.account: Counter[str] = Counter()  # sums of the counts of all `FrameStream` objects since the start
         self.reader = Reader(port, baud)
         self.estimator: NetworkEstimator | UniversalEstimator | None = None
         if isinstance(models, Universal):
@@ -422,14 +448,18 @@ class LiveSkin:
             self.estimator = NetworkEstimator(models)
         self._model_problem = ""
         self._head: list[Chunk] = []
-        self._partial_first_bytes_n = 0  # number of bytes of frames that were cut by opening the port
+        # number of bytes that belong to incomplete frames, because the port was opened in the middle of these frames
+        self._partial_first_bytes_n = 0
         self.dropped_frames_n = 0  # number of frames that have no estimate because of a fault
         self.zeroings_n = 0
         self.zeroings_s: deque[float] = deque(maxlen=ZEROINGS_KEPT_N)  # times of the latest no-load readings
         self._restart_noload()
 
     def __enter__(self) -> "LiveSkin":
-        """Open the port, detect the wire format, and take the no-load reading. Nothing may touch the skin meanwhile."""
+        """Open the port, detect the wire format, and take the no-load reading.
+
+        Nothing may touch the skin during this time.
+        """
         self.reader.start(must_exist=True)
         try:
             end_s = self.reader.unix_s() + OPENING_S
@@ -449,9 +479,10 @@ class LiveSkin:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Yield the contact of the latest reading; skip older readings, and never yield a reading twice.
+        """Yield the contact of the latest reading.
 
-        Yields a contact whose values are NaN if no data arrives for `SILENT_S` or if the board is unplugged.
+        Older readings that have not been yielded are skipped, and no reading is yielded twice. If no data arrive for
+        `SILENT_S`, or if the board is unplugged, a contact whose values are NaN is yielded.
         """
         while True:
             yield self._contact(self.poll(SILENT_S, latest=True), -1)
@@ -459,7 +490,8 @@ class LiveSkin:
     def every(self) -> Iterator[Contact]:
         """Yield the contact of every reading.
 
-        If the caller falls two minutes behind, the oldest bytes are discarded and counted in `reader.missed_bytes_n`.
+        The bytes of readings that the caller has not yet processed are stored. If the caller is more than two minutes
+        late, the oldest bytes are discarded and counted in `reader.missed_bytes_n`.
         """
         while True:
             estimates = self.poll(SILENT_S)
@@ -467,25 +499,28 @@ class LiveSkin:
                 yield self._contact(estimates, i)
 
     def zero(self) -> None:
-        """Request a new no-load reading, taken in the next second without contact. May be called from any thread."""
-        # the polling thread takes the no-load reading, because this thread collects the frames
+        """Request a new no-load reading, which is taken in the next second without contact.
+
+        This method may be called from any thread.
+        """
+        # The thread that calls `poll` takes the no-load reading, because this thread collects the frames.
         self._noload_requested = True
 
     @property
     def zeroed(self) -> bool:
-        """Whether there is a no-load reading and no new one is requested."""
+        """Whether there is a no-load reading, and no new no-load reading has been requested."""
         return self.noload_uT is not None and not self._noload_requested
 
     @property
     def silent(self) -> bool:
-        """Whether no data has arrived for `SILENT_S`, so that the last reading is outdated."""
+        """Whether no data have arrived for `SILENT_S`, so that the last reading is outdated."""
         return not self.detected.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
 
     @property
     def lost_bytes_n(self) -> int:
-        """Number of bytes that were discarded or were not in a complete frame.
+        """Number of bytes that were discarded or that do not belong to a complete frame.
 
-        If the board was sending a frame when the port was opened, the rest of this frame is not counted.
+        If the board was in the middle of a frame when the port was opened, the rest of this frame is not counted.
         """
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
         return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
@@ -507,16 +542,16 @@ class LiveSkin:
         return tuple(alarms)
 
     def poll(self, wait_s: float, *, latest: bool = False) -> Estimates | None:
-        """Decode all bytes that have arrived, and estimate place and force for the frames.
+        """Decode all bytes that have arrived, and estimate the place and the force for each frame.
 
         Parameters
         ----------
         wait_s : longest time to wait for data
-        latest : whether to return estimates for the last frame only
+        latest : whether to return an estimate only for the last frame
 
         Returns
         -------
-        Estimates, or None if no frame arrived.
+        The estimates, or None if no complete frame has arrived.
         """
         chunks = self.reader.take(wait_s)
         if not chunks:
@@ -540,7 +575,11 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks and return [] until the wire format can be detected; then return all collected chunks."""
+        """Detect the wire format of the board.
+
+        The method collects chunks and returns an empty list until the wire format can be detected. It then returns all
+        collected chunks.
+        """
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
@@ -557,15 +596,16 @@ class LiveSkin:
         if isinstance(self.estimator, UniversalEstimator):
             self.layout = layout_of_board(self.estimator.board)
         self._start_stream(detected)
-        # this attribute is set last, because other threads use the attributes above as soon as it is set
+        # This attribute is set last, because other threads use the attributes above as soon as this attribute is set.
         self.detected = detected
         return chunks
 
     def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
-        """Handle a model that does not fit the board's number of chips.
+        """Handle a model that is not for the board's number of chips.
 
-        For networks, raise `SchemaError`, because the user chose them. A universal model may be the default, so it is
-        only disabled, and an alarm is raised.
+        If the model consists of networks, `SchemaError` is raised, because the user chose the wrong networks. A
+        universal model, however, may be used only because it is the default. It is therefore disabled without an error,
+        and an alarm is raised.
         """
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
@@ -583,7 +623,10 @@ class LiveSkin:
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Return the frames in the chunks and their arrival times; start a new stream where a board was plugged in."""
+        """Return the frames in the chunks, and the arrival time of each frame.
+
+        Wherever the chunks show that the board was plugged in again, a new stream is started.
+        """
         starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
         for first, last in pairwise([0, *starts, len(chunks)]):
@@ -596,7 +639,10 @@ class LiveSkin:
         return frames, np.concatenate([t_s for _, t_s in parts])
 
     def _decode_stream(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Decode chunks of one stream. A frame's arrival time is that of the chunk that contains its last byte."""
+        """Decode chunks of one stream; return the frames, and the arrival time of each frame.
+
+        The arrival time of a frame is the arrival time of the chunk that contains the frame's last byte.
+        """
         for chunk, arrival_s in chunks:
             self._ends.append((self._ends[-1][0] + len(chunk), arrival_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
@@ -606,15 +652,16 @@ class LiveSkin:
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count_bytes(self, now_s: float) -> None:
-        """Add the stream's counts since the last call to `account`, and raise alarms for lost bytes."""
+        """Update `account` with the stream's counts since the last call, and raise alarms for lost bytes."""
         frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
         new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += new
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
-        # If the port was opened in the middle of a frame, the rest of this frame is not counted as lost. One more byte
-        # is allowed: if only one byte of the cut frame arrives, the next frame cannot be recognised and is skipped too.
+        # If the port was opened in the middle of a frame, the rest of this frame is not counted as lost. The limit is
+        # one byte more than a frame: if only one byte of the first frame arrives, the decoder cannot recognise the
+        # start of the next frame, and skips this frame too.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n
@@ -626,15 +673,22 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        # readings are in contact if their |dB|, after external fields were removed, is larger than this value
+        # A reading is in contact if its |dB| is larger than this value. External fields are removed from dB before, if
+        # they are expected.
         self._contact_uT = np.inf
-        self._suppressor: Float64[np.ndarray, "ch ch"] | None = None  # removes external fields, if they are expected
+        self._suppressor: Float64[np.ndarray, "ch ch"] | None = None  # the matrix that removes external fields
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._noload_requested = False  # set last, so that a request that arrives during this call is fulfilled by it
+        # This attribute is set last. If another thread requests a no-load reading during this call, the no-load reading
+        # that starts now also fulfils this request.
+        self._noload_requested = False
 
     def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
-        """Collect frames for one second. If the field did not change, their mean becomes the no-load reading."""
+        """Collect the frames of one second, and take the no-load reading.
+
+        If the field did not change in this second, the mean of the frames becomes the no-load reading. Otherwise,
+        something may have touched the skin, and the frames of the next second are collected.
+        """
         if self._noload_requested:
             self._restart_noload()
         self._quiet.append(frames)
@@ -644,9 +698,9 @@ class LiveSkin:
         if len(b_uT) < 2 or (duration_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # raised by `quiet_start` if the field changed; then the next second is tried
-            # Use evenly spaced times instead of arrival times, because all frames of a chunk have the same arrival
-            # time.
+        with suppress(CaptureError):  # `quiet_start` raises this error if the field changed
+            # The times of the frames are assumed to be evenly spaced. Their arrival times cannot be used, because all
+            # frames of a chunk have the same arrival time.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
@@ -690,7 +744,10 @@ class LiveSkin:
 
 
 class LiveSkins:
-    """Contacts of the skins on several ports. Iteration yields tuples of the latest contacts, in the order of ports."""
+    """The skins at several ports, whose contacts are estimated while the boards are running.
+
+    Iteration yields tuples of the latest contacts of all skins, in the order of the ports.
+    """
 
     def __init__(self, skins: Sequence[LiveSkin]) -> None:
         self.skins = skins
@@ -704,7 +761,10 @@ class LiveSkins:
         ]
 
     def __enter__(self) -> "LiveSkins":
-        """Open all ports and take all no-load readings simultaneously; if one port fails, close all ports."""
+        """Open all ports at the same time, and take the no-load readings of all skins.
+
+        If one of the ports cannot be opened, all ports are closed.
+        """
         with self._open_ports as ports, ThreadPoolExecutor(len(self.skins)) as pool:
             for opening in [pool.submit(ports.enter_context, skin) for skin in self.skins]:
                 opening.result()
@@ -720,9 +780,9 @@ class LiveSkins:
         self._open_ports.close()
 
     def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Yield the latest contacts of all boards whenever one board has a new contact.
+        """Yield the latest contacts of all boards whenever there is a new contact of one board.
 
-        The contacts of a silent board have the value NaN.
+        If a board sends no data, the values of its contact are NaN.
         """
         while True:
             with self._changed:
@@ -741,7 +801,7 @@ class LiveSkins:
                     self._changed.notify()
                 if self._stop.is_set():
                     return
-        except Exception as error:  # raised in `__iter__`, on the caller's thread
+        except Exception as error:  # this error is raised again in `__iter__`, in the thread of the caller
             with self._changed:
                 self._error = error
                 self._changed.notify()

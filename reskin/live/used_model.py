@@ -1,8 +1,10 @@
-"""Texts of the page about the model in use: its name, calibration data, expected accuracy and smallest detected force.
+"""Texts of the page about the model in use: its name, calibration data, expected accuracy and lightest tested force.
 
-Expected accuracies are results of the pipeline. Those of networks are in their cards. Those of the shipped universal
-model are in `reskin/universal/measured.json`, and not in its card, because the results depend on the card. The accuracy
-of other universal models was not measured.
+The expected accuracies are results of the pipeline. Each model has a card, which is a JSON file with information about
+the model. The accuracy of a trained network is in the network's card. The accuracy of the universal model that is
+shipped with the package is in `reskin/universal/measured.json`. It is not in the card of this model, because the
+accuracy is measured after the card has been written and depends on it. The accuracy of other universal models was not
+measured.
 """
 
 from collections.abc import Sequence
@@ -24,29 +26,29 @@ ByBoard = Annotated[tuple[float, ...], Field(min_length=1)]  # one value per rec
 
 
 class MeasuredAccuracy(Strict):
-    """Scores on held-out recorded boards, after a calibration with `presses_n` presses and `labels_n` labels."""
+    """The measured accuracy of a model on recorded boards that were not used for training, after a calibration."""
 
-    presses_n: int
-    labels_n: int
-    accuracy_pct: ByBoard  # readings within 1 mm along x and along y
+    presses_n: int  # number of presses at unknown places in the calibration
+    labels_n: int  # number of labelled presses in the calibration
+    accuracy_pct: ByBoard  # percentage of readings whose error is at most 1 mm along x and along y
     median_mm: ByBoard  # median error of the place
     mse_xy_mm2: ByBoard
 
 
 class MeasuredDetection(Strict):
-    """The lightest recorded force, the percentage of detected presses, and the percentage of false alarms."""
+    """The measured detection of light touches on recorded boards."""
 
-    lightest_N: ByBoard
-    detected_pct: ByBoard
-    false_alarm_pct: ByBoard
+    lightest_N: ByBoard  # force of the lightest recorded presses
+    detected_pct: ByBoard  # percentage of these presses that were detected
+    false_alarm_pct: ByBoard  # percentage of readings without contact that were reported as a contact
 
 
 class Measured(Strict):
-    """Results of the shipped universal model on a recorded scene."""
+    """The results of the shipped universal model on the recorded boards of a scene."""
 
     scene: str
     source: Literal["recorded"]
-    places: tuple[MeasuredAccuracy, ...]  # in the order of presses_n, then of labels_n
+    places: tuple[MeasuredAccuracy, ...]  # sorted by presses_n, and then by labels_n
     detection: MeasuredDetection
 
 
@@ -55,8 +57,8 @@ def describe(
 ) -> dict[str, str | bool]:
     """Return the texts `model`, `learnt`, `expected` and `least_force` of the page, and whether `undo` is possible.
 
-    `models` are the models that the user chose. `model_name` contains the names of their files, or is empty for the
-    shipped universal model.
+    `models` are the models that the user has chosen. `model_name` contains the names of their files. It is empty for
+    the universal model that is shipped with the package.
     """
     if isinstance(estimator, UniversalEstimator):
         state, model = estimator.learnt, estimator.model
@@ -132,7 +134,7 @@ def _join(values: Sequence[float], digits: str) -> str:
 
 
 def _measured_of(model: Universal) -> Measured | None:
-    """Return the results of the shipped universal model; None for any other model."""
+    """Return the results of a model if it is the shipped universal model; return None for any other model."""
     return _shipped()[1] if model.card == _shipped()[0] else None
 
 

@@ -1,11 +1,11 @@
-// Displays the messages of reskin/live/session.py: binary messages (Traces.message) as numbers, a picture of the board, and traces;
-// JSON messages (Session.state) as texts. Each board has its own socket, state and canvases, so that an unplugged board does not
-// affect the other boards.
+// Displays the messages that reskin/live/session.py sends. Binary messages (Traces.message) are displayed as numbers, as a picture
+// of the board, and as curves over time (traces). JSON messages (Session.state) are displayed as texts. Each board has its own
+// socket, state and canvases, so that an unplugged board does not affect the other boards.
 "use strict";
 const NUMBERS_N = 16, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
 const FONT = "13px system-ui, sans-serif";
-const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // the colour of the force trace, then those of the chips
-const style = getComputedStyle(document.documentElement); // a live object, which follows changes of the colour scheme
+const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // the first colour is that of the force, and the others are those of the chips
+const style = getComputedStyle(document.documentElement); // this object is updated by the browser when the colour scheme changes
 const colour = (name) => style.getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
 const number = (value, digits, unit) => value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`;
@@ -35,7 +35,7 @@ class Board {
 
   send(message) { if (this.socket.readyState === 1) this.socket.send(JSON.stringify(message)); }
 
-  choose(px, py) { // enters the place of a click in the form
+  choose(px, py) { // enters the place at which the user has clicked in the form "Label a press"
     if (!this.state.places_known || this.state.waiting) return;
     const {mm, x0, y0, wide, high} = this.frame, [x, y] = mm(px, py);
     if (x < x0 || x > x0 + wide || y < y0 || y > y0 + high) return;
@@ -66,18 +66,18 @@ class Board {
     const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99, dropped, trueX, trueY, trueForce] = values;
     this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
       screen99, dropped, trueX, trueY, trueForce, change: values.slice(NUMBERS_N, first)};
-    if (bins) { // the newest bin of the previous message may have changed, so it is sent again
+    if (bins) { // the newest bin of the previous message is replaced, because readings may have been added to it since then
       const low = first + bins, high = low + bins * width, t = view.getFloat64(8, true), bin = (i) => Math.round((t + values[first + i]) / BIN_S);
       while (this.rows.length && this.rows[this.rows.length - 1].n >= bin(0)) this.rows.pop();
       for (let i = 0; i < bins; i++) this.rows.push({n: bin(i), low: values.slice(low + i * width, low + (i + 1) * width),
         high: values.slice(high + i * width, high + (i + 1) * width)});
-      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // oldest bin from which a line can reach into the window
+      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // the oldest bin that is still needed: a line from it can reach into the displayed time
       this.rows = this.rows.slice(Math.max(this.rows.findIndex(({n}) => n >= oldest), 0));
       this.changed = Math.min(this.changed, bin(0));
     }
     const now_ms = performance.now();
     this.trail = this.trail.filter(({at_ms}) => now_ms - at_ms < TRAIL_MS);
-    const lifted = this.rows.slice(this.rows.length - bins).some(({high}) => high[0] === 0); // the skin was not touched for a moment
+    const lifted = this.rows.slice(this.rows.length - bins).some(({high}) => high[0] === 0); // whether the skin was not touched for a moment
     if (contact && !Number.isNaN(x)) this.trail.push({x, y, force, at_ms: now_ms, begins: lifted});
     this.dirty = true;
   }
@@ -104,7 +104,7 @@ class Board {
       this.parts[name].disabled = state.waiting || !state.adaptable || Boolean(state.adapting) && name !== this.chosen(state);
       this.parts[name].classList.toggle("on", Boolean(state.adapting) && name === this.chosen(state));
     }
-    this.say("adapting", state.adapting || state.adapted || "–"); this.say("skin_said", state.adapted || ""); // near the buttons, too
+    this.say("adapting", state.adapting || state.adapted || "–"); this.say("skin_said", state.adapted || ""); // the text is displayed twice, because it should also be near the buttons Save, Load and Undo
     this.parts.record.classList.toggle("on", Boolean(state.recording));
     this.parts.record.firstChild.textContent = state.recording ? "Stop " : "Record ";
     this.say("recording", state.recording ? `${state.recording}; labelled presses: ${state.recording_n}` : state.recorded || "–");
@@ -115,7 +115,7 @@ class Board {
   chosen(state) { return state.next_mm ? "places" : "adapt"; }
 
   drawBoard() {
-    const {state, last} = this, fresh = last && !state.silent; // if the board is silent, the last reading is outdated and is not drawn
+    const {state, last} = this, fresh = last && !state.silent; // if no data arrive, the last reading is outdated and is not drawn
     const frame = this.frame = frameOf(this.parts.board, state), {at, scale} = frame;
     const [pen, wide, ratio] = penOn(this.parts.board, frame.height), now_ms = performance.now();
     const kind = [wide, ratio, scale, colour("--ink"), state.waiting, state.places_known, state.chips_mm].join();
@@ -136,9 +136,9 @@ class Board {
     if (fresh && this.truthShown() && !Number.isNaN(last.trueX)) drawTruth(pen, ...at(last.trueX, last.trueY), "true place");
   }
 
-  truthShown() { return Boolean(this.state.true_places) && this.parts.truth.checked; } // only for emulated boards, and on demand
+  truthShown() { return Boolean(this.state.true_places) && this.parts.truth.checked; } // the true place is known only for emulated boards, and is shown only if the user has ticked the box
 
-  truthText() { // compares the estimate with the true contact
+  truthText() { // returns a text that compares the estimate with the true contact
     const {last} = this, off = Math.hypot(last.x - last.trueX, last.y - last.trueY);
     if (Number.isNaN(last.trueX)) return "true: no contact";
     const error = Number.isNaN(off) ? "" : `; the estimate is off by ${off.toFixed(1)} mm and ${last.force < last.trueForce ? "−" : "+"}${Math.abs(last.force - last.trueForce).toFixed(2)} N`;
@@ -165,11 +165,11 @@ class Board {
     this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
     if (document.hidden || last === this.drawn) return;
     this.drawn = last;
-    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // the next animation frame starts after the reading has been drawn
+    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // the message is sent in the next animation frame, because then the reading has been drawn on the screen
   }
 }
 
-function penOn(canvas, high, wide = canvas.clientWidth) { // resizes a canvas to the screen's resolution and clears it; returns [context with CSS pixels as units, width, device pixels per CSS pixel]
+function penOn(canvas, high, wide = canvas.clientWidth) { // clears a canvas and adapts its resolution to the screen; returns [drawing context whose unit is the CSS pixel, width, device pixels per CSS pixel]
   const ratio = devicePixelRatio || 1, size = [Math.floor(wide * ratio), Math.floor(high * ratio)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) { [canvas.width, canvas.height] = size; canvas.style.height = `${high}px`; }
   const pen = canvas.getContext("2d");
@@ -180,14 +180,14 @@ function penOn(canvas, high, wide = canvas.clientWidth) { // resizes a canvas to
 function draw() {
   while (boards.length < Math.max(boards[0].state.boards_n || 0, 1)) boards.push(new Board(boards.length));
   document.getElementById("boards").classList.toggle("single", boards.length === 1);
-  const end_ms = performance.now() + DRAWING_MS; // if this time is too short for all boards, the next frame continues with the remaining boards
+  const end_ms = performance.now() + DRAWING_MS; // if this time is too short to draw all boards, the remaining boards are drawn in the next animation frame
   for (let i = 0; i < boards.length && performance.now() < end_ms; i++) boards[next++ % boards.length].draw();
   requestAnimationFrame(draw);
 }
 
 addEventListener("keydown", (event) => {
   const name = {z: "zero", a: "adapt", p: "places", r: "record"}[event.key];
-  if (event.target instanceof Element && event.target.matches("input:not([type=checkbox]), select")) return; // typed text is no command
+  if (event.target instanceof Element && event.target.matches("input:not([type=checkbox]), select")) return; // keys that are typed into a field of a form are not commands
   if (name && !event.ctrlKey && !event.metaKey && !event.altKey && !event.repeat) boards.forEach((board) => board.press(name));
 });
 addEventListener("resize", () => boards.forEach((board) => { board.dirty = true; }));
