@@ -2,16 +2,16 @@
 
 =====================================  ==========================================================
 `open`                                 read contacts from a board as they happen
-`record`, `lifted`, `touch`            record a board, with labels from a robot's program
+`record`, `lifted`, `touch`            record a board, while the program of a robot labels the contacts
 `load_universal`                       the universal model, which can be calibrated to any skin
 `load_model`, `Model`                  a trained network
 `load_recording`                       a recording of any kind, as a pandas DataFrame with units
 `load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
-`simulate_recording`                   record a simulated board, as `record` records a real one
-`ContactRegressor`                     the paper's network, with scikit-learn's fit and predict
-`UniversalRegressor`                   the universal model with the same methods; `fit` calibrates it to a skin
+`simulate_recording`                   the recording of a simulated board, with the same files that `record` writes
+`ContactRegressor`                     the paper's network as an estimator of scikit-learn
+`UniversalRegressor`                   the universal model as an estimator of scikit-learn
 `SCORERS`                              the paper's metrics, for scikit-learn's `cross_val_score`
 =====================================  ==========================================================
 
@@ -78,8 +78,8 @@ def __getattr__(name: str) -> Any:
     if name in _ESTIMATORS:
         if find_spec("sklearn") is None:
             raise missing_package("scikit-learn", f"reskin.{name}", extra="learn")
-        # The module is named in a string, so that `reskin.code` does not count the training code as an import of every
-        # stage.
+        # The module is imported by its name in a string, so that `reskin.code` does not find this import. Otherwise,
+        # the training code would count as imported by every stage.
         return getattr(import_module("reskin.estimators"), name)
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

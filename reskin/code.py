@@ -1,4 +1,8 @@
-"""Digests that detect changes of code: of one module (ignoring comments and docstrings) or of whole packages."""
+"""Compute digests of code, to detect that code has changed.
+
+A digest is computed either from one module, ignoring comments and docstrings (`digest`), or from all files of packages
+(`package_digest`). `imported` finds the modules on which a module depends.
+"""
 
 import ast
 import hashlib
@@ -16,10 +20,10 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 @cache
 def digest(name: str, *, data: bool = True) -> str:
-    """Return a digest of a module's syntax without docstrings and, if `data`, of its data files.
+    """Return a digest of the syntax of a module. If `data` is True, the data files of the module are included.
 
-    Formatting, comments and the version of Python do not affect the digest. The data files of a module have the same
-    name and are in the same folder: `page.yaml` belongs to `page.py`.
+    Formatting, comments, docstrings and the version of Python do not affect the digest. The data files of a module have
+    the same name and are in the same folder: `page.yaml` belongs to `page.py`.
     """
     hasher = hashlib.sha256()
     for file in files_of(name) if data else [file_of(name)]:
@@ -34,7 +38,10 @@ def files_of(name: str) -> list[Path]:
 
 
 def normalised(file: str, content: bytes) -> bytes:
-    """Return the syntax of a Python file without comments and docstrings; return other files unchanged."""
+    """Return the content of a file in the form from which digests are computed.
+
+    For a Python file, this is its syntax without comments and docstrings. The content of other files is unchanged.
+    """
     return json.dumps(_syntax(ast.parse(content))).encode() if file.endswith(".py") else content
 
 
@@ -50,7 +57,7 @@ def package_digest(*packages: Path, suffixes: Sequence[str] = (".py",)) -> str:
 def imported(*names: str) -> list[str]:
     """Return the modules of `PACKAGES` that the named modules import, directly or indirectly.
 
-    The result includes the named modules, and all packages that contain any of the modules. Imports under
+    The result includes the named modules themselves, and the packages in which the modules are. Imports under
     `if TYPE_CHECKING:` are ignored.
     """
     modules = set(names).union(*map(_graph().find_upstream_modules, names))
@@ -59,7 +66,7 @@ def imported(*names: str) -> list[str]:
 
 @cache
 def _graph() -> Any:
-    import grimp  # imported late, because few commands trace imports
+    import grimp  # imported here, because only few commands need to know which modules import others
 
     return grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
 
@@ -72,9 +79,9 @@ def file_of(name: str) -> Path:
 
 
 def _syntax(node: ast.AST) -> list[Any]:
-    """Convert a syntax tree to nested lists, without docstrings.
+    """Convert a syntax tree to nested lists, and remove docstrings.
 
-    Empty fields are dropped, because the empty fields of a node depend on the version of Python.
+    Empty fields of a node are left out, because the version of Python determines which empty fields a node has.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})

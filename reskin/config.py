@@ -1,6 +1,7 @@
-"""Settings: YAML files, and strict pydantic models that validate them.
+"""Read settings from YAML files, and validate them with pydantic models.
 
-A settings model is frozen, rejects unknown keys and has few default values. It is defined in the module that uses it.
+A settings model is a class that declares the keys of a section of settings and the types of their values. It is defined
+in the module that uses the settings. All settings models are subclasses of `Strict`.
 """
 
 import json
@@ -17,7 +18,10 @@ from reskin.errors import ParamsError, did_you_mean
 
 
 class Strict(BaseModel):
-    """Base class of all settings models: missing keys and unknown keys are errors."""
+    """Base class of all settings models. Unknown keys are errors, and so are missing keys that have no default value.
+
+    The settings cannot be changed after they were read.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -26,7 +30,7 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a file as YAML 1.2, as DVC does; in YAML 1.1, `1e-3` would be text."""
+    """Read a file as YAML 1.2, which is the version that DVC reads too. In YAML 1.1, `1e-3` would be text."""
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -37,10 +41,15 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
-    """Create a settings model from plain values; raise a `ParamsError` that names the wrong key and its rule."""
+    """Create a settings model from plain values, such as those of a YAML file.
+
+    If a value is invalid, a `ParamsError` is raised. Its message names `where`, the key, the rule for the value, and
+    what the user can do.
+    """
     try:
-        # If values are validated as Python values, pydantic's strict mode rejects a list where a tuple is expected. If
-        # they are validated as JSON, it accepts such a list, but still rejects the text "3" where a number is expected.
+        # The values are converted to JSON before they are validated. If Python values were validated, pydantic's strict
+        # mode would reject a list where a tuple is expected. In JSON, it accepts such a list, but still rejects the
+        # text "3" where a number is expected.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         # A misspelt key causes two errors, one for an unknown key and one for a missing key. Report the unknown key.
@@ -58,7 +67,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
                 f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there."
             ) from None
         rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        # the error of a validator, whose message names the parameters and their values
+        # This is the error of a validator that the model defines. Its message already names the keys and their values.
         if first["type"] == "value_error":
             place = f"{where}: {name}" if first["loc"] else where
             end = "" if rule.endswith("?") else "."
@@ -69,7 +78,10 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:
-    """Return the keys and indices that locate an error, without the names of types that pydantic adds to `loc`."""
+    """Return the keys and list indices at which the wrong value is in the file.
+
+    `loc` is the location that pydantic reports. It also contains the names of types, which are not in the file.
+    """
     kept = []
     for i, part in enumerate(loc):
         if isinstance(value, list | tuple):

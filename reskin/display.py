@@ -1,4 +1,4 @@
-"""One-line representations of dataclasses that hold arrays, for notebooks and error messages."""
+"""Represent dataclasses that contain arrays in one line, for notebooks and error messages."""
 
 from dataclasses import fields
 from typing import Any
@@ -7,9 +7,10 @@ import numpy as np
 
 
 def one_line(instance: Any) -> str:
-    """Return the name and fields of a dataclass, with shapes for arrays and types for other objects.
+    """Return a text with the class name and the fields of a dataclass.
 
-    Use this function as `__repr__`, because the default `__repr__` prints every number of an array.
+    An array is represented by its shape, a number or a text by its value, and another object by its type. A class can
+    use this function as its `__repr__`. The default `__repr__` would print the numbers of its arrays.
     """
     parts = (f"{field.name}={_show(getattr(instance, field.name))}" for field in fields(instance))
     return f"{type(instance).__name__}({', '.join(parts)})"

@@ -9,16 +9,18 @@ from importlib.util import find_spec
 
 
 class ReskinError(ValueError):
-    """Base class of the errors below. Commands print the message without a traceback and exit with `exit_code`.
+    """Base class of the errors that a user can fix, such as a wrong setting or a damaged file.
+
+    If such an error is raised, commands print its message without a traceback, and exit with status `exit_code`.
 
     Parameters
     ----------
     where : object
-        The complete message, if it is the only argument. Otherwise, the location of the error: a file with the line or
-        byte, an option, or a setting.
+        If this is the only argument, it is the complete message. Otherwise, it is the location of the error: a file
+        with the line or byte, an option, or a setting.
     what, rule, got, remedy
-        The other parts of the message: the name of the wrong value, what the value must be, what it is, and what the
-        user can try.
+        The other parts of the message: the name of the wrong value, what the value must be, what the value is, and what
+        the user can try.
 
     Examples
     --------
@@ -58,7 +60,9 @@ class MachineError(ReskinError):
     """The machine failed, for example for lack of disk space or memory. Work that was finished before is kept."""
 
 
-EXTRAS = {  # package -> extra of pyproject.toml that installs the package; `pipeline` installs all packages not listed
+# For each optional package, the extra in pyproject.toml with which pip installs it. Packages that are not listed here
+# are installed by the extra `pipeline`.
+EXTRAS = {
     "torch": "train",
     "onnx": "onnx",
     "onnxruntime": "onnx",
@@ -66,7 +70,7 @@ EXTRAS = {  # package -> extra of pyproject.toml that installs the package; `pip
     "distributed": "dask",
     "psycopg2": "team",
 }
-DISK_REMEDIES = {  # errno of a disk error -> what the user can do
+DISK_REMEDIES = {  # what the user can do about an error of the disk, by the error's errno
     getattr(errno, name): remedy
     for names, remedy in (
         ("ENOSPC EDQUOT EFBIG", "Free some disk space."),
@@ -81,11 +85,10 @@ RETRY = "Run it again: finished work is kept."
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`.
+    """Convert exceptions that are raised in a `with` block to errors whose messages tell the user what to do.
 
-    The message of the new error begins with `where`.
-
-    Other exceptions pass through unchanged.
+    Failures of the machine (no memory, no disk space, a worker process that died) become a `MachineError`. A missing
+    package becomes a `ParamsError`. The message of the new error begins with `where`. Other exceptions are not changed.
 
     >>> with explaining("split"):
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")
@@ -114,7 +117,9 @@ Run it again: finished work is kept.
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return " Did you mean ...?" with the known name that is most similar to `name`, or "" if none is similar.
+    """Return the text " Did you mean NAME?" with the known name that is most similar to a wrong name.
+
+    If no known name is similar, the result is an empty text.
 
     >>> did_you_mean("stuk", ["zeros", "stuck"])
     ' Did you mean stuck?'
@@ -124,16 +129,19 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def require(package: str, where: object) -> None:
-    """Raise `ParamsError` if an optional package is not installed. Call it before a long computation."""
+    """Raise `ParamsError` if an optional package is not installed.
+
+    Call this function before a long computation that needs the package at its end.
+    """
     if find_spec(package) is None:
         raise missing_package(package, where)
 
 
 def missing_package(package: str, where: object, *, extra: str | None = None) -> ParamsError:
-    """Create the error for a missing package, with the command that installs the package.
+    """Create the error that reports a missing package, with the command that installs the package.
 
-    extra: the smallest extra that installs all packages that `where` needs; by default, the package's extra in
-    `EXTRAS`.
+    extra: the smallest extra of pyproject.toml that installs all packages which `where` needs. By default, it is the
+        extra of the package in `EXTRAS`.
     """
     extra = extra or EXTRAS.get(package, "pipeline")
     return ParamsError(

@@ -1,11 +1,12 @@
-"""Estimators with the interface of scikit-learn, and the paper's metrics as scorers. Requires `pip install '.[learn]'`.
+"""Estimators with the interface of scikit-learn, and the paper's metrics as scorers.
 
-`ContactRegressor` is the paper's network; `UniversalRegressor` is the universal model, calibrated to one skin. Both
-have the same inputs X and outputs y, so that `cross_val_score` can compare them:
+This module requires scikit-learn (`pip install '.[learn]'`). `ContactRegressor` is the paper's network, which is
+trained on many contacts. `UniversalRegressor` is the universal model, which is calibrated to one skin. Both have the
+same inputs X and the same outputs y, so that `cross_val_score` can compare them:
 
-- X [n ch]: changes of the field since the no-load reading in uT; the channels are Bx, By, Bz of chip 0, then of chip 1,
-  and so on. These are the columns `dbx0_uT`, ... of `reskin.load_recording`.
-- y [n 3]: x_mm, y_mm and the normal force in N. Unknown values are NaN.
+- X [n ch] contains changes of the field since the no-load reading (the field without contact), in uT. The channels are
+  Bx, By, Bz of chip 0, then of chip 1, and so on. These are the columns `dbx0_uT`, ... of `reskin.load_recording`.
+- y [n 3] contains x_mm, y_mm and the normal force in N. Unknown values are NaN.
 """
 
 import warnings
@@ -29,34 +30,38 @@ from reskin.models.recipe import Recipe
 from reskin.models.runner import MAX_ATTEMPTS_N
 from reskin.models.trained import FORMAT, SUFFIX, Network
 
-# Arguments of scikit-learn's validation of y, which has one or several targets; a target may be unknown (NaN).
+# Arguments of scikit-learn's function that validates y. They allow one or several targets, and unknown targets (NaN).
 TARGET_CHECKS = {"dtype": np.float32, "ensure_2d": False, "ensure_all_finite": "allow-nan"}
 
 
 class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The paper's network. With equal data and settings, training gives the same weights as the pipeline.
+    """The paper's network, which estimates the place and the force of a contact.
+
+    With equal data and settings, `fit` gives the same weights as a training run of the pipeline.
 
     Parameters
     ----------
     architecture, inputs, scaling, triplet_weight, batch_n, rate_max, gradient_norm_max, weight_decay
-        The recipe (see `reskin.models.recipe.Recipe`). The defaults are recipe `paper` of `params.yaml`.
+        The settings of the training, which are described in `reskin.models.recipe.Recipe`. The defaults are those of
+        recipe `paper` in `params.yaml`.
     steps_n : int
-        Number of training steps. The default is that of scene `lab`.
+        Number of training steps. The default is the number that scene `lab` uses.
     random_state : int
-        Seed of initial weights and batches.
+        Seed of the random initial weights and of the random batches.
 
     Attributes
     ----------
     network_ : Network
-        The trained network, with its scaler.
+        The trained network, including the scaling of its inputs and outputs.
     loss_curve_ : list of float
-        Mean squared error of the scaled targets at 50 evenly spaced steps, or at every step if there are fewer than 50.
+        Mean squared error of the scaled targets during training. The curve has 50 points, each of which is the mean
+        over an equal number of steps. If there are fewer than 50 steps, it has one point for each step.
     n_features_in_, feature_names_in_
-        Number of channels, and their names if X was a DataFrame.
+        Number of channels of X, and their names if X was a DataFrame.
 
     Examples
     --------
-    Accuracy on boards that are not in the training data, here on simulated boards:
+    Measure the accuracy on boards that are not in the training data. Here, the boards are simulated:
 
     >>> import numpy as np
     >>> from sklearn.model_selection import GroupKFold, cross_val_score
@@ -109,22 +114,23 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         X : array [n ch]
             Changes of the field in uT.
         y : array [n 3]
-            x_mm, y_mm and the normal force in N; NaN if unknown. Other numbers of targets are accepted as well.
+            x_mm, y_mm and the normal force in N. Unknown values are NaN. There may also be more or fewer targets.
         skin : array [n], optional
-            Name of each row's skin. It is needed for the triplet loss (`triplet_weight` above 0), which compares places
-            on the same skin. Default: all rows are from one skin.
+            Name of each row's skin. It is used only by the triplet loss (`triplet_weight` above 0), which compares
+            places on the same skin. Default: all rows are from one skin.
 
         Raises
         ------
         ParamsError
             If a setting is invalid.
         TrainingError
-            If training diverges, or a target is unknown in all rows.
+            If training diverges, or if a target is unknown in all rows.
 
         Warns
         -----
         ConvergenceWarning
-            If `MAX_ATTEMPTS_N` training runs in a row give a network that predicts nearly the same values for all rows.
+            If the trained network predicts nearly the same values for all rows (it has collapsed). A collapsed training
+            run is repeated with other random numbers; the warning is issued if all `MAX_ATTEMPTS_N` runs collapse.
         """
         require("torch", "ContactRegressor")
         recipe, seed = self._recipe(), _as_seed(self.random_state)
@@ -152,14 +158,17 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         return self.network_(db_uT).reshape(-1, *self._targets_shape).astype(np.float64)
 
     def save(self, file: Path | str) -> None:
-        """Write the network (.safetensors) and its card (.json), for `reskin.load_model` and `reskin live --model`.
+        """Write the network (.safetensors) and its JSON card, which describes the network.
+
+        The file can be loaded with `reskin.load_model(FILE)` and `reskin live --model FILE`.
 
         Raises
         ------
         ParamsError
-            If the file's name does not end in .safetensors.
+            If the name of the file does not end in .safetensors.
         SchemaError
-            If the network was not trained on Bx, By, Bz of each chip and the three targets x_mm, y_mm and force.
+            If the network does not have three inputs (Bx, By, Bz) for each chip, or not three targets (x_mm, y_mm and
+            force).
         """
         check_is_fitted(self)
         path = Path(file)
@@ -191,8 +200,12 @@ def _as_seed(random_state: Any) -> int:
 
 
 def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
-    """Train as `reskin.models.runner.run_jobs` does; return the result, and how many earlier runs collapsed."""
-    from reskin.models.train import train_stack  # imported late, because it imports torch
+    """Train a network, and repeat the training with other random numbers if the network collapses.
+
+    The same is done by `reskin.models.runner.run_jobs`. Returns the result, and the number of earlier runs that
+    collapsed.
+    """
+    from reskin.models.train import train_stack  # imported here, because it imports torch
 
     for attempt_i in range(MAX_ATTEMPTS_N):
         (result,) = train_stack([replace(job, attempt_i=attempt_i)], data)
@@ -213,7 +226,7 @@ def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
 def _card(
     recipe: Recipe, seed: int, channels_n: int, result: TrainingResult, collapsed_before_n: int
 ) -> dict[str, Any]:
-    """Return the entries of a trained network's card on which predictions depend."""
+    """Return the card of a trained network: the entries that predictions need, and some details of the training."""
     return {
         "format": FORMAT,
         "recipe": recipe.model_dump(mode="json"),
@@ -227,27 +240,32 @@ def _card(
 
 
 class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
-    """The universal model, calibrated to one skin by a few labelled presses and any number of unlabelled ones.
+    """The universal model, which `fit` calibrates to one skin.
+
+    The model was trained on simulated skins. It needs only a few labelled presses (presses with a known place), and it
+    can use any number of presses without a label.
 
     Parameters
     ----------
     noload_uT : array [f ch] or [ch]
-        Fields of the untouched skin; needed by `fit`.
+        One or several readings of the field while nothing touches the skin. The method `fit` needs them.
     spread : {"anywhere", "even", "area"}
-        How the unlabelled presses are distributed: at any places ("anywhere"), evenly over the skin as on a grid
-        ("even"), or at random places all over the area of presses ("area"). See `reskin.universal.model.Universal.see`.
+        How the unlabelled presses are distributed over the skin. "anywhere": at any places. "even": evenly over the
+        skin, as on a grid. "area": at random places all over the area of presses. See
+        `reskin.universal.model.Universal.see`.
     external_uT : float
-        Size in uT of the external fields on a moving board (see `reskin.load_universal`).
+        Size in uT of the external fields, for a board that moves (see `reskin.load_universal`). Default: 0, for a board
+        at rest.
     file : path, optional
-        A model for another board. Default: the model for the paper's board.
+        File of a universal model for another board. Default: the model for the paper's board.
 
     Attributes
     ----------
     model_ : Universal
-        The calibrated model. `model_.save(FILE)` writes the calibration, for `reskin.load_universal(FILE)` and `reskin
-        live --model FILE`.
+        The calibrated model. `model_.save(FILE)` writes the calibration to a file, which can be loaded with
+        `reskin.load_universal(FILE)` and `reskin live --model FILE`.
     n_features_in_, feature_names_in_
-        Number of channels, and their names if X was a DataFrame.
+        Number of channels of X, and their names if X was a DataFrame.
 
     Examples
     --------
@@ -279,31 +297,32 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         self.file = file
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> "UniversalRegressor":
-        """Calibrate the model; an earlier calibration is discarded.
+        """Calibrate the model to the presses on a skin. An earlier calibration is discarded.
 
         Parameters
         ----------
         X : array [n ch]
-            Changes of the field in uT, one row per press.
+            Changes of the field in uT, one row for each press.
         y : array [n 3]
-            x_mm, y_mm and the normal force in N. The force may be NaN (unknown). If the place is NaN, the press is
-            unlabelled, and its force is not used. All rows may be unlabelled.
+            x_mm, y_mm and the normal force in N. In rows with a known place, the force may be unknown (NaN). If the
+            place is unknown (NaN), the press is unlabelled, and its force is not used. All rows may be unlabelled.
 
         Raises
         ------
         ParamsError
-            If `noload_uT` is missing, or `spread` is none of the three values.
+            If `noload_uT` is missing, or if `spread` is none of the three values.
         SchemaError
-            If the number of channels is not that of the board, if X contains raw fields instead of field changes, if
-            only one of x_mm and y_mm is known, or if a label or a field is out of range (see
+            If X does not have as many channels as the model's board, if X contains fields instead of field changes, if
+            only one of x_mm and y_mm is known in a row, or if a label or a field is out of range (see
             `reskin.universal.model.Universal.label`).
 
         Warns
         -----
         UserWarning
-            If the orientation of the skin or of the labels' axes is uncertain or wrong (`model_.warnings`).
+            If the orientation of the skin, or the directions of the labels' axes, are uncertain or wrong. The texts of
+            the warnings are in `model_.warnings`.
         """
-        from reskin.universal.calibration import check_is_change  # imported late, because it imports Numba
+        from reskin.universal.calibration import check_is_change  # imported here, because it imports Numba
         from reskin.universal.model import FILE, load_universal
 
         if self.noload_uT is None:
@@ -340,9 +359,9 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
     def predict(self, X: ArrayLike, *, return_std: bool = False) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
         """Predict x_mm, y_mm and the normal force in N [n 3] from changes of the field [n ch] in uT.
 
-        With `return_std`, also return the standard deviations [n 3]. The standard deviation of the force is the
-        predicted force times the standard deviation of its logarithm. It is NaN unless the model was calibrated with a
-        known force.
+        If `return_std` is True, the standard deviations [n 3] of the predictions are returned too. The standard
+        deviation of a force is computed as the predicted force times the standard deviation of its logarithm. It is NaN
+        if no force was known when the model was calibrated.
         """
         check_is_fitted(self)
         db_uT = validate_data(self, X, dtype=np.float64, reset=False)
@@ -354,15 +373,18 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 
 def _metric(y: ArrayLike, predicted: ArrayLike, *, name: str) -> float:
-    """Return a metric of the rows whose place is known; NaN if no row has the true values that the metric needs."""
+    """Compute one of the metrics of `reskin.metrics.score` for the rows whose place is known.
+
+    The result is NaN if no row has the true values that are needed to compute the metric.
+    """
     true, estimated = np.asarray(y, float), np.asarray(predicted, float)
     placed = ~np.isnan(true[:, :2]).any(axis=1)
     return metrics.score(true[placed], estimated[placed]).get(name, np.nan) if placed.any() else np.nan
 
 
-# The metrics of the paper (see `reskin.metrics.score`) as scorers, for argument `scoring` of `cross_validate` and of
-# `GridSearchCV`. scikit-learn expects that larger scores are better, so errors are negated. Rows with an unknown place
-# are not scored.
+# Scorers for the metrics of the paper (see `reskin.metrics.score`). They can be passed to functions and classes of
+# scikit-learn, such as `cross_validate` and `GridSearchCV`, as the argument `scoring`. scikit-learn expects that larger
+# scores are better, so errors are negated (names with `neg_`). Rows with an unknown place are not scored.
 SCORERS = {
     "accuracy_pct": make_scorer(_metric, name="accuracy_pct"),  # percentage of rows within 1 mm in x and in y
     "neg_mse_xy_mm2": make_scorer(_metric, greater_is_better=False, name="mse_xy_mm2"),

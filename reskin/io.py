@@ -1,6 +1,7 @@
 """Read and write Parquet, safetensors, JSON and text files, and cache computed arrays.
 
-Files are written under a temporary name and then renamed, so that an interrupted write leaves no partial file.
+A file is first written under a temporary name, and then renamed. If writing is interrupted, there is no partial file
+under the final name.
 """
 
 import errno
@@ -28,9 +29,9 @@ from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
 
 PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file
-COUNTS_KEY = b"reskin.account"
-DIGEST = "digest"  # key in the metadata of a safetensors file
-HEADER_AT = 8  # byte at which the header of a safetensors file starts; the bytes before are its length
+COUNTS_KEY = b"reskin.account"  # key of the ingestion counts in the metadata of a Parquet file of readings
+DIGEST = "digest"  # key of the digest in the metadata of a safetensors file
+HEADER_AT = 8  # position of the header in a safetensors file; the bytes before it contain the length of the header
 REMEDY = (
     "It was cut or changed. If `dvc repro` wrote it, delete it, then run `reskin check-cache` and `dvc repro`. "
     "Otherwise copy it again."
@@ -41,12 +42,17 @@ MACHINE_ERRNOS = {
     errno.EMFILE,
     errno.ENFILE,
     errno.ESTALE,
-}  # errors after which the file itself may be intact
+}  # numbers of errors that are due to the machine; after such an error, the file itself may be intact
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` for a new file or folder; rename it to `path` if the block succeeds."""
+    """Replace a file or folder in one step, at the end of a `with` block.
+
+    The context manager yields a temporary path beside `path`, at which the block creates the new file or folder. If the
+    block succeeds, the temporary path is renamed to `path`. If it fails, the temporary file or folder is deleted, and
+    `path` is unchanged.
+    """
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -66,18 +72,19 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:
-    """Return whether an error is about the file being written, and not about a file that the same block reads."""
-    # the error is about an open stream; errno EIO may mean an error of reading or of writing
+    """Return whether an error is about the file that is written, and not about another file that the block reads."""
+    # The error is about an open stream, whose name is unknown. Most of these errors can only be caused by writing. EIO
+    # is an exception: it may be an error of reading or of writing.
     if error.filename is None:
         return error.errno != errno.EIO
-    # An error of `shutil.copyfile` contains both file names.
+    # An error of `shutil.copyfile` contains the names of both files, the one that is read and the one that is written.
     names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)
     return any(str(temporary) in str(name) for name in names)
 
 
 @contextmanager
 def restoring(*files: Path) -> Iterator[None]:
-    """If the `with` block fails or is interrupted, restore the content that the files had before it."""
+    """If the `with` block fails or is interrupted, restore the content that the files had before the block."""
     contents = {file: file.read_bytes() for file in files}
     try:
         yield
@@ -127,7 +134,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Replace the content of a folder by text files, given as a mapping from file names to texts."""
+    """Replace the content of a folder by text files. `texts` contains the text of each file by the name of the file."""
     with replacing(folder) as temporary:
         temporary.mkdir()
         for name, text in texts.items():
@@ -135,7 +142,11 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def append(file: FileIO, data: bytes) -> None:
-    """Append data to an unbuffered file; if writing fails, restore the file's earlier length and raise the error."""
+    """Append data to an unbuffered file.
+
+    If writing fails, the file is cut to its earlier length, so that no part of the data remains, and the error is
+    raised.
+    """
     start = file.tell()
     try:
         while data:
@@ -160,11 +171,15 @@ def read_json(path: Path) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Write named arrays and metadata as a safetensors file; add a digest of the whole content to the metadata."""
+    """Write named arrays and metadata as a safetensors file.
+
+    A digest of the arrays and of the metadata is added to the metadata, so that `read_tensors` can detect damage.
+    """
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     metadata = {**metadata, DIGEST: _digest(dense, metadata)}
     content = safetensors.numpy.save(dense, metadata)
-    # The file is not written by safetensors' save_file, because this function would hide disk errors.
+    # The file is not written with the function save_file of safetensors, because that function would hide errors of the
+    # disk.
     with replacing(path) as temporary, temporary.open("wb") as stream:
         stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
@@ -173,10 +188,11 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
 def read_tensors(
     path: Path, names: Sequence[str] = (), *, digest_needed: bool = False
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read arrays and metadata that `write_tensors` wrote: the arrays `names`, or all arrays if `names` is empty.
+    """Read arrays and metadata from a file that `write_tensors` wrote.
 
-    If all arrays are read, the content is compared with the file's digest. Files that older code wrote have no digest;
-    they are accepted unless `digest_needed` is True. If only some arrays are read, the digest is not checked.
+    `names` contains the names of the arrays to read. If it is empty, all arrays are read, and the content of the file
+    is compared with its digest. If only some arrays are read, the digest is not checked. Files that older code wrote
+    have no digest. They are accepted, unless `digest_needed` is True.
     """
     _check_is_file(path)
     try:
@@ -202,8 +218,8 @@ def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> s
 
 
 def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
-    # The safetensors library writes the metadata in an order that differs from process to process. Sorting makes the
-    # file's bytes reproducible.
+    # The safetensors library writes the entries of the metadata in an order that differs from process to process. They
+    # are sorted here, so that equal contents give equal bytes.
     length = int.from_bytes(content[:HEADER_AT], "little")
     header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(metadata.items()))}
     return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
@@ -215,7 +231,7 @@ def write_table(path: Path, table: pa.Table) -> None:
 
 
 def is_parquet(path: Path) -> bool:
-    """Return whether a file begins as a Parquet file does."""
+    """Return whether a file begins with the bytes with which every Parquet file begins."""
     with path.open("rb") as stream:
         return stream.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
 
@@ -226,14 +242,17 @@ def read_table(path: Path) -> pa.Table:
 
 
 def read_column_names(path: Path) -> list[str]:
-    """Read the names of a table's columns, without its rows."""
+    """Read the names of the columns of a table, without reading its rows."""
     with _parquet(path) as file:
         names: list[str] = file.schema_arrow.names
     return names
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block, then `counts`. Iterating over `blocks` may update `counts`."""
+    """Write the readings of one capture block by block, and then the counts of its ingestion.
+
+    `counts` is written last, because the iterator `blocks` may change it while the readings are written.
+    """
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:
@@ -252,7 +271,11 @@ def read_readings(path: Path) -> Readings:
 
 
 def read_ingest_counts(path: Path) -> dict[str, int]:
-    """Read the counts of one capture's ingestion: bytes, frames and rows, and how many were dropped for each reason."""
+    """Read the counts that were written when a capture was ingested.
+
+    They are the numbers of bytes, frames and rows that were read and, for each reason, the number of those that were
+    dropped.
+    """
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
@@ -267,7 +290,10 @@ def _check_is_file(path: Path) -> None:
 
 
 def _raise_machine_error(error: Exception) -> None:
-    """Raise the error again if the machine caused it (disk, permissions, limits), and not the file's content."""
+    """Raise the error again if it was caused by the machine, and not by the content of the file.
+
+    Errors of the machine concern the disk, permissions, and limits such as the number of open files.
+    """
     if isinstance(error, OSError) and error.errno in MACHINE_ERRNOS:
         raise error
 
@@ -283,13 +309,17 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         raise SchemaError(f"{path}: the file is not readable as Parquet: {reason}. {REMEDY}") from None
 
 
-# --- Cache of computed arrays, in the folder __pycache__ of a package ---
+# --- Cache of computed arrays. It is in the folder __pycache__ of the package that computes them. ---
 
 LIBRARIES = ("numpy", "scipy", "numba")
 
 
 def load_cached_array(package: Path, name: str) -> np.ndarray | None:
-    """Read a cached array; return None unless it was computed by the same code with the same library versions."""
+    """Read an array from the cache.
+
+    The result is None if there is no array of this name that was computed by the same code of the package, with the
+    same versions of libraries.
+    """
     try:
         return np.load(_cache_file(package, name), allow_pickle=False)
     except (OSError, ValueError, EOFError):
@@ -297,7 +327,7 @@ def load_cached_array(package: Path, name: str) -> np.ndarray | None:
 
 
 def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
-    """Write an array to the cache; delete cached arrays of other versions of the code or of the libraries."""
+    """Write an array to the cache, and delete arrays that another version of the code or of the libraries computed."""
     file = _cache_file(package, name)
     try:
         with replacing(file) as temporary, temporary.open("wb") as stream:
@@ -306,7 +336,7 @@ def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
         for old in set(file.parent.glob("kept-*.npy")) - current:
             remove(old)
     except (OSError, SchemaError):
-        return  # if the disk is full or read-only, the array is not cached and will be computed again
+        return  # The disk is full or read-only. The array is not cached, and will be computed again when it is needed.
 
 
 def _cache_file(package: Path, name: str) -> Path:

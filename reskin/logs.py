@@ -1,7 +1,8 @@
 """Estimate contacts, places and forces in a log, and score the estimates against labels.
 
 A log is a recording of the field over time. Section 6 of the paper shows logs of a dog's shoe and of a glove. A log
-must begin with some time without contact, the quiet start. The mean field of the quiet start is the no-load reading.
+must begin with some time without contact, which is called the quiet start here. The mean field of the quiet start is
+the no-load reading, which is subtracted from all readings of the log.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,25 +16,32 @@ from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.errors import CaptureError
 from reskin.metrics import score
 
-WINDOW_S = 0.1  # assumed: length of the windows whose mean fields are compared with the mean field of the start
-QUIET_MIN_S = 0.5  # assumed: shortest quiet start whose mean field is a reliable no-load reading
-# A window is quiet if, in every channel, its mean differs from the mean of the start by at most this many standard
+# To find the end of the quiet start, the log is divided into windows of this length, which is an assumed value. The
+# mean field of each window is compared with the mean field at the start of the log.
+WINDOW_S = 0.1
+QUIET_MIN_S = 0.5  # shortest quiet start whose mean field is assumed to be a reliable no-load reading
+# A window is quiet if, in every channel, its mean differs from the mean at the start by at most this number of standard
 # errors. With 15 channels, noise alone causes a larger difference in 1 of 1,000 windows.
 WANDER_SDS = 4.0
-START_WINDOWS_N = 2  # number of windows at the start of the log from which mean and noise are estimated
-POINTS_MAX_N = 1500  # largest number of points per series in a figure
+START_WINDOWS_N = 2  # number of windows that are the start of the log, from which mean and noise are estimated
+POINTS_MAX_N = 1500  # largest number of points that a curve in a figure has
 
+# A model: a function that estimates x_mm, y_mm and F_N from field changes in uT.
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
-# A function of the noise in uT. It returns a matrix that removes external fields from readings, or None.
+# A function that is called with the noise of the readings in uT. It returns a matrix that removes external fields from
+# readings, or None if they are not to be removed.
 FindSuppressor = Callable[[float], Float64[np.ndarray, "ch ch"] | None]
 
 
 @dataclass(frozen=True)
 class LogEstimates:
-    """Estimates for each of f readings of a log; places and forces are meaningful only in contact.
+    """The estimates for all f readings of a log.
 
-    contact: whether a reading is in contact. quiet_n: number of readings in the quiet start. noise_uT: rms of the field
-    change over all readings and channels of the quiet start.
+    t_s: the time of each reading.
+    targets: the estimated places and forces. They are meaningful only for readings in contact.
+    contact: whether each reading is in contact.
+    quiet_n: the number of readings in the quiet start.
+    noise_uT: the rms of the field change over all readings and channels of the quiet start.
     """
 
     t_s: Float64[np.ndarray, " f"]
@@ -47,10 +55,12 @@ def estimate(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str,
     find_suppressor: FindSuppressor | None = None,
 ) -> LogEstimates:  # fmt: skip
-    """Find the quiet start of a log, subtract its mean field from all readings, and estimate their places and forces.
+    """Estimate the contacts in a log, and the place and the force of each reading.
 
-    `find_suppressor` is used for the detection of contact. Raises CaptureError, with `where` in its message, if the log
-    begins with a contact.
+    First, the quiet start of the log is found, and its mean field is subtracted from all readings. `find_suppressor`
+    gives the matrix that removes external fields when contacts are detected.
+
+    Raises CaptureError, with `where` in its message, if the quiet start is too short for a no-load reading.
     """
     return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models, find_suppressor)
 
@@ -59,7 +69,7 @@ def estimate_after(
     quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator],
     find_suppressor: FindSuppressor | None = None,
 ) -> LogEstimates:  # fmt: skip
-    """Subtract the mean field of the first `quiet_n` readings, detect contact, and estimate place and force."""
+    """Estimate as `estimate` does, but with a given quiet start, which consists of the first `quiet_n` readings."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     quiet_noise_uT = noise_uT(db_uT[:quiet_n])
@@ -70,11 +80,12 @@ def estimate_after(
 
 
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
-    """Return the number of readings before the first contact.
+    """Return the number of readings in the quiet start of a log.
 
-    The log is divided into windows of 0.1 s. The quiet start ends with the first window in which the mean of a channel
-    differs by more than 4 standard errors from the channel's mean over the first two windows. Raises CaptureError if
-    the quiet start is shorter than 0.5 s.
+    The log is divided into windows of 0.1 s. The quiet start ends before the first window in which the mean of any
+    channel differs by more than 4 standard errors from the channel's mean over the first two windows.
+
+    Raises CaptureError if the quiet start is shorter than 0.5 s.
     """
     window_n = max(round(WINDOW_S / step_s(t_s)), 2)
     windows_n = len(b_uT) // window_n
@@ -82,8 +93,8 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # The noise is estimated from differences of consecutive readings, because a contact in the first two windows
-        # would increase the standard deviation of the readings themselves.
+        # The noise is estimated from the differences between consecutive readings. It could also be estimated from the
+        # readings themselves, but a contact in the first two windows would then increase the estimate.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
         moved = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
@@ -109,7 +120,11 @@ def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count the runs of two or more consecutive readings in contact. A gap of one reading does not end a run."""
+    """Count the contacts in a log.
+
+    A contact is a run of at least two consecutive readings in contact. A single reading without contact does not end a
+    run.
+    """
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
@@ -117,7 +132,10 @@ def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
 
 
 def describe(log: LogEstimates) -> dict[str, Any]:
-    """Summarise a log: duration, rate, noise, contacts, and the largest force in contact (averaged over models)."""
+    """Summarise a log: duration, rate, noise, number of contacts, and the largest estimated force in contact.
+
+    With several models, the largest force is averaged over the models.
+    """
     return {
         "rate_hz": 1 / step_s(log.t_s),
         "duration_s": float(log.t_s[-1] - log.t_s[0] + step_s(log.t_s)),
@@ -130,10 +148,14 @@ def describe(log: LogEstimates) -> dict[str, Any]:
 
 
 def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score estimates of place and force, and count the readings in which a contact was missed or falsely detected.
+    """Score the estimates of a log against true values.
 
-    `true` contains x_mm, y_mm and F_N, and NaN for readings without contact. Each model is scored separately. The
-    result contains the means of the scores over the models and, under `spread`, their standard deviations.
+    `true` contains the true x_mm, y_mm and F_N of each reading. Readings without contact have NaN. Places and forces
+    are scored for the readings that are in contact and in which a contact was detected. The result also contains the
+    numbers of readings in which a contact was missed or falsely detected.
+
+    Each model is scored separately. The result contains the means of the scores over the models. With several models,
+    its entry `spread` contains their standard deviations.
     """
     truly_touched = np.isfinite(true[:, 2])
     both_touched = log.contact & truly_touched
@@ -163,10 +185,10 @@ def truth_at(
     end_s: Float64[np.ndarray, " d"],
     true: Float[np.ndarray, "d 3"],
 ) -> Float64[np.ndarray, "f 3"]:
-    """Return the true values [x_mm, y_mm, F_N] for each reading.
+    """Return the true x_mm, y_mm and F_N of each reading of a recording that a robot made.
 
-    A dwell is a stop of the robot at one place. The true values of a reading are those of the dwell during which it was
-    taken. Readings between dwells have NaN.
+    A dwell is a stop of the robot at one place; it lasts from `start_s` to `end_s`. The true values of a reading are
+    those of the dwell during which the reading was taken. Readings between dwells have NaN.
     """
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
@@ -174,10 +196,10 @@ def truth_at(
 
 
 def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return the data of a figure: at most 1,500 evenly spaced readings, whose estimates are None without contact.
+    """Reduce a log to the data of a figure: the estimates of at most 1,500 evenly spaced readings.
 
-    `estimated` is the estimate of the first model. With several models, `low` and `high` are the smallest and the
-    largest of their estimates.
+    The entry `estimated` contains the estimates of the first model. With several models, the entries `low` and `high`
+    contain the smallest and the largest estimates of all models. For readings without contact, the estimates are None.
     """
     kept = np.unique(np.linspace(0, len(log.t_s) - 1, POINTS_MAX_N).astype(int))
     targets = np.where(log.contact[:, None], log.targets, np.nan)[:, kept]

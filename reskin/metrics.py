@@ -1,6 +1,6 @@
-"""Metrics of predictions: the three metrics of the paper, and R^2 of the force. Unknown true forces are NaN.
+"""Metrics of predictions: the three metrics of the paper, the R^2 of the force, and scores of intervals.
 
-For rows with an unknown true force, only the place is scored.
+A true force may be unknown (NaN). For such rows, only the place is scored.
 """
 
 from typing import Any
@@ -8,19 +8,30 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-ACCURACY_LIMIT_MM = 1.0  # section 4 of the paper: a place counts as accurate if |dx| and |dy| are at most 1 mm
+# A predicted place is accurate if its errors in x and in y are at most this large (section 4 of the paper).
+ACCURACY_LIMIT_MM = 1.0
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
-# Mean and variance of the true forces of the scored rows. They are needed to compute the R^2 of several groups
-# together.
+# Names of two further results of `score`: the mean and the variance of the true forces. They are needed to compute the
+# R^2 of several groups of rows together from the scores of the groups.
 TRUTH = ("force_mean_N", "force_var_N2")
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, F_N); return the scores by the names in `METRICS` and `TRUTH`.
+    """Score predictions of x_mm, y_mm and F_N.
 
-    `mse_xy_mm2` is averaged over x and y; the paper does not say whether its MSE is the sum or the mean. `r2_f` is
-    1 - `mse_f_N2` / (variance of the true forces), which is 0 for a constant prediction of the mean force. The scores
-    of the force are missing if no true force is known; `r2_f` is also missing if all true forces are equal.
+    Returns
+    -------
+    A dictionary with these keys:
+
+    - `accuracy_pct`: percentage of rows whose errors in x and in y are at most 1 mm
+    - `mse_xy_mm2`: mean squared error of the place, averaged over x and y. The paper does not say whether its MSE is
+      the sum over x and y, or the mean.
+    - `mse_f_N2`: mean squared error of the force
+    - `r2_f`: R^2 of the force, 1 - `mse_f_N2` / (variance of the true forces). It is 0 if the prediction is always the
+      mean of the true forces.
+    - `force_mean_N`, `force_var_N2`: mean and variance of the true forces
+
+    If no true force is known, the last four are missing. If all true forces are equal, `r2_f` is missing.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -33,8 +44,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # Both conditions are needed: because of rounding, the computed variance can be nonzero for equal forces, and
-        # zero for nearly equal forces.
+        # Both conditions are needed because of rounding. The computed variance of equal forces can differ from zero,
+        # and the computed variance of nearly equal forces can be zero.
         if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
@@ -48,29 +59,29 @@ def median_error_mm(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.nd
 def coverage_pct(
     true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
 ) -> float:
-    """Return the percentage of true values that are inside their intervals."""
+    """Return the percentage of true values that are inside their intervals, which extend from `low` to `high`."""
     return 100 * float(((low <= true) & (true <= high)).mean())
 
 
 def interval_score(
     true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
 ) -> float:
-    """Return the mean interval score of 90 % intervals.
+    """Return the mean interval score of 90 % intervals; a smaller score is better.
 
-    The score of an interval is its width, plus 20 times the distance of the true value from the interval if it is
-    outside.
-
-    The expected score is smallest if the limits are the true 5 % and 95 % quantiles (Gneiting & Raftery, JASA 2007).
+    The score of an interval is its width. If the true value is outside the interval, 20 times its distance from the
+    interval is added. The expected score is smallest if the limits of the interval are the true 5 % and 95 % quantiles
+    (Gneiting & Raftery, JASA 2007).
     """
     outside = np.maximum(low - true, 0) + np.maximum(true - high, 0)
     return float((high - low + 2 / 0.1 * outside).mean())
 
 
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Shift all predicted places by the constant offset for which the mean errors of x and of y are zero.
+    """Shift all predicted places by the same offset, so that the mean error of x and the mean error of y become zero.
 
-    The origin of each rig's coordinates was set manually. Scores after this shift show how much of the error is due to
-    this origin. Because the offset is computed from the true places, these scores are a diagnostic and not a result.
+    The origin of the coordinates of each rig was set by hand, so it may differ between boards. Scores after this shift
+    show how much of the error is due to such differences. They are a diagnostic and not a result, because the offset is
+    computed from the true places.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)
@@ -80,10 +91,15 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
 def score_groups(
     true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
 ) -> dict[str, Any]:
-    """Score all test rows together, the rows of each test skin, and all rows after `register` on each test board.
+    """Score test rows in several groups.
 
-    `board` and `skin` are the names of each row's board and skin. The scores after `register` (key `registered`) are a
-    diagnostic.
+    `board` and `skin` contain the names of each row's board and skin. The result has these keys:
+
+    - `all`: the scores over all rows
+    - `registered`: the scores over all rows after the places on each board were shifted by `register`; a diagnostic
+    - `by_skin`: the scores over the rows of each skin, by the name of the skin
+    - `board_of`: the name of each skin's board
+    - `rows_n`: the number of rows
     """
     registered = predicted.copy()
     for name in np.unique(board):

@@ -1,6 +1,7 @@
-"""Estimate contacts, places and forces in a log with a trained model, and write them as CSV.
+"""Estimate the contacts in a log with a trained model, and write their places and forces as CSV.
 
-The user has to choose a model that fits the board of the log, because only the number of channels is checked.
+A log is a recording of the field over time (`reskin.logs`). The user has to choose a model that was made for the board
+of the log, because only the number of channels is checked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +21,8 @@ from reskin.recordings.loading import read_any_log
 from reskin.universal.calibration import is_calibration
 from reskin.universal.model import FILE, MISFIT_MAX, Universal, is_model, load_universal
 
-# an estimated force is "at a limit" if it is within this factor of an end of the model's force range
+# The model can estimate only forces in a certain range. An estimated force is said to be at a limit of this range if it
+# differs from the smallest or the largest force of the range by at most this factor.
 FORCE_LIMIT = 1.05
 
 
@@ -33,22 +35,34 @@ def predict(
     external_uT: float = 0.0,
     new_day: bool = False,
 ) -> dict[str, Any]:
-    """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
+    """Estimate the contacts in a log, and write them to a CSV file.
+
+    The file has one row for each frame of the log without a fault, with the columns t_s, x_mm, y_mm, F_N and contact.
+    In rows without contact, x_mm, y_mm and F_N are empty.
 
     Parameters
     ----------
-    log : a capture's folder, a table that `reskin decode` wrote, or the log of an SD card
-    model : a network; a universal model, a calibration, or both; None for the shipped universal model
-    out : the CSV file to write; the fields for place and force are empty without contact
-    rate_hz : frames per second, for a table without a clock
-    external_uT : size of external fields on a moving board (see `load_universal`); only for the universal model
-    new_day : whether the calibration was saved on an earlier day (see `load_universal`)
+    log
+        The folder of a capture, a table that `reskin decode` wrote, or a log that a board wrote to an SD card.
+    model
+        The file of a network, of a universal model, or of a calibration; or a list of the files of a universal model
+        and of its calibration. With None, it is the universal model that comes with the library.
+    out
+        The CSV file to write.
+    rate_hz
+        Number of frames per second. It is used only for a table without times.
+    external_uT
+        Size of the external fields on a board that moves (see `load_universal`). Only for the universal model.
+    new_day
+        Whether the calibration was saved on an earlier day (see `load_universal`).
 
     Returns
     -------
-    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, the summary
-    also contains the number of readings in contact with a misfit above `MISFIT_MAX`, the number of those with a force
-    at a limit of the model's range, whether the skin is turned by 90 degrees, and the model's warnings.
+    dict
+        A summary of the log (see `reskin.logs.describe`), and counts of dropped frames. For the universal model, there
+        are further entries. Two of them count doubtful readings in contact: those whose misfit is above `MISFIT_MAX`,
+        and those whose force is at a limit of the model's range. The others state whether the skin is turned by 90
+        degrees, and the warnings of the model.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT, new_day=new_day)
@@ -76,7 +90,7 @@ def predict(
 
 
 class _UniversalOfLog:
-    """Gives the universal model the interface of `Estimator`, and stores the misfit of each reading."""
+    """Adapter with which the universal model can be used as an `Estimator`. It stores the misfit of each reading."""
 
     def __init__(self, model: Universal) -> None:
         self._model = model
@@ -88,9 +102,11 @@ class _UniversalOfLog:
         return np.column_stack([result.place_mm, result.force_N]).astype(np.float32)
 
     def count_suspects(self, estimates: LogEstimates) -> dict[str, Any]:
-        """Count readings in contact with a large misfit, and those at a limit of the model's force range.
+        """Count the readings in contact whose estimates are doubtful.
 
-        The result also states whether the skin is turned by 90 degrees, and contains the model's warnings.
+        These are the readings whose misfit is above `MISFIT_MAX`, and the readings whose estimated force is at a limit
+        of the model's range. The result also states whether the skin is turned by 90 degrees, and contains the warnings
+        of the model.
         """
         force_N = estimates.targets[0, estimates.contact, 2]
         lowest_N, highest_N = self._model.tables.force_N[[0, -1]]
@@ -104,7 +120,7 @@ class _UniversalOfLog:
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
-    """Return warnings for the user about the counts of `predict` that cast doubt on its estimates."""
+    """Return warnings for the user if the counts that `predict` returned show that some estimates are doubtful."""
     sentences, contact_n = list(counts.get("model_warnings", [])), counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
@@ -122,11 +138,14 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
 def read_models(
     files: Sequence[Path], external_uT: float = 0.0, *, new_day: bool = False
 ) -> Sequence[Network] | Universal:
-    """Read the model in `files`: trained networks, or a universal model, a calibration of it, or both of these.
+    """Read the models in the given files.
 
-    A calibration without a universal model belongs to the shipped universal model. If `files` is empty, the shipped
-    universal model is returned. `external_uT` is an option of universal models (see `load_universal`); for networks, it
-    must be 0. `new_day` is an option of calibrations.
+    `files` may contain one or several trained networks, a universal model, a calibration, or a universal model and a
+    calibration of it. A calibration without a universal model is one of the universal model that comes with the
+    library. If `files` is empty, this universal model is returned without a calibration.
+
+    `external_uT` and `new_day` are explained in `load_universal`. `external_uT` must be 0 for networks. `new_day` can
+    be True only with a calibration.
     """
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
@@ -152,11 +171,14 @@ def _is_calibration(file: Path) -> bool:
     except SchemaError:
         if file.suffix == SUFFIX:
             raise
-        return False  # `read_network` reports the error
+        return False  # The error is reported later, by `read_network`.
 
 
 def render(estimates: LogEstimates) -> str:
-    """Return one model's estimates as CSV: mm and N with three decimals; fields are empty without contact."""
+    """Return the estimates of a single model as the text of a CSV file.
+
+    Places and forces have three decimals. They are empty in rows without contact.
+    """
     (target,) = estimates.targets
     target = np.where(estimates.contact[:, None], np.round(target, 3), np.nan)
     fields = dict(zip(("x_mm", "y_mm", "F_N"), target.T, strict=True))

@@ -1,8 +1,17 @@
-"""Columns, types, units and Arrow schema of the tables of readings in `data/indentations`.
+"""The tables of readings in `data/indentations`: their columns, types, units and Arrow schema.
 
-Array annotations use these letters for axes: n indentations, f readings (frames), ch = 3 k channels (Bx, By, Bz of
-chip 0, then of chip 1, ...), k chips, s sources of a field, o points at which a field is computed, b rows of a batch,
-d dwells of a robot, c chunks of a stream, g steps of a time grid.
+The annotations of arrays in this library use letters for the axes of an array. Usually, they have these meanings:
+
+- n: indentations
+- f: readings (frames)
+- k: chips
+- ch: channels. There are 3 k of them: Bx, By, Bz of chip 0, then of chip 1, and so on.
+- s: sources of a field
+- o: points at which a field is computed
+- b: rows of a batch
+- d: dwells (stops of a robot at one place)
+- c: chunks of a stream
+- g: steps of a time grid
 """
 
 from dataclasses import dataclass, fields
@@ -13,7 +22,8 @@ from jaxtyping import Float32, Float64, Int32
 
 from reskin.errors import SchemaError
 
-SCHEMA_VERSION = "2"  # in version 1, Fx_N and Fy_N of layout lab were forces on the gauge
+# In version 1, Fx_N and Fy_N of recordings in layout `lab` were the forces on the force gauge, and not on the skin.
+SCHEMA_VERSION = "2"
 FORCE_SIGNS = (
     "Force on the skin, in newtons: Fx_N and Fy_N positive along the axes of the labels x_mm and y_mm, "
     "Fz_N positive in compression."
@@ -23,11 +33,18 @@ AXES_PER_CHIP_N = 3
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of one capture, one row per reading; unknown values are NaN.
+    """The readings of one capture (a recording of one skin on one board), one row for each reading.
 
-    Forces have the signs of `FORCE_SIGNS`. `b_uT` is the measured field. `noload_uT` is the mean field without contact
-    before the row's indentation. `x_mm` and `y_mm` are NaN in rows without contact. `n_contacts` is the number of
-    earlier contacts of the skin.
+    Unknown values are NaN. The signs of forces are explained in `FORCE_SIGNS`.
+
+    indentation: the number of the indentation to which the reading belongs.
+    pass_i: the number of the pass. A robot visits all places once in each pass.
+    reading_i: the number of the reading in its indentation.
+    x_mm, y_mm: the place of the contact. It is NaN in rows without contact.
+    b_uT: the measured field.
+    noload_uT: the mean field without contact before the indentation.
+    temperature_degC: the temperature of each chip.
+    n_contacts: the number of earlier contacts of the skin.
     """
 
     capture: str
@@ -61,7 +78,11 @@ LABELS = ("capture", "board", "skin", "source")
 
 
 def unit_of(column: str) -> str:
-    """Return the unit of a numeric column: the suffix of its name, or "1" (no unit) if the suffix is not a unit."""
+    """Return the unit of a numeric column.
+
+    The unit is the suffix of the column's name. If the suffix is not a unit, the column has no unit, and the result is
+    "1".
+    """
     suffix = column.rpartition("_")[2]
     return suffix if suffix in ("mm", "N", "uT", "degC", "s") else "1"
 
@@ -72,7 +93,7 @@ _PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperatu
 
 
 def arrow_schema(chips_n: int) -> pa.Schema:
-    """Return the Arrow schema of a table of readings; each field's metadata holds its unit."""
+    """Return the Arrow schema of a table of readings. The unit of each column is in the metadata of the column."""
     columns = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
     for name, unit in UNITS.items():
         columns.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))
@@ -88,7 +109,7 @@ def _arrow_type(name: str, chips_n: int) -> pa.DataType:
 
 
 def to_table(readings: Readings) -> pa.Table:
-    """Convert readings to an Arrow table with units."""
+    """Convert readings to an Arrow table, with units in the metadata of the columns."""
     schema = arrow_schema(readings.chips_n)
     columns = []
     for field in schema:
@@ -103,7 +124,10 @@ def to_table(readings: Readings) -> pa.Table:
 
 
 def from_table(table: pa.Table, where: str) -> Readings:
-    """Convert a table of one capture to readings; raise `SchemaError` if its schema is not `arrow_schema`."""
+    """Convert the Arrow table of one capture to readings.
+
+    Raises `SchemaError` if the columns, types or units of the table differ from `arrow_schema`.
+    """
     chips_n = check_schema(table.schema, where)
     values: dict[str, object] = {}
     for name in LABELS:
@@ -121,7 +145,7 @@ def from_table(table: pa.Table, where: str) -> Readings:
 
 
 def check_schema(schema: pa.Schema, where: str) -> int:
-    """Check that a table has the columns, types and units of `arrow_schema`; return its number of chips."""
+    """Check that a table has the columns, types and units of `arrow_schema`, and return the number of its chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
         raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest the capture again.")
