@@ -304,7 +304,7 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_interval_of_the_difference_from_single_skin_networks_includes_the_spread_of_training_skins():
+def test_interval_of_the_difference_includes_the_spread_over_training_skins():
     boards = [f"b{i}" for i in range(4)]
     equal_gains = transfer_scores(
         {fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")}
