@@ -1,5 +1,6 @@
 """Tests of the release: files in the wheel, version, licences, required packages."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -115,10 +116,10 @@ def test_missing_package_names_its_extra():
 
 def test_imported_packages_are_declared():
     sources = [*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "reskin").rglob("*.py")]
-    texts = [file.read_text(encoding="utf-8") for file in sources]
-    names = {
-        name for text in texts for name in re.findall(r"^ *(?:import|from) (\w+)[\w.]* *(?:import|as|$|#)", text, re.M)
-    }
+    nodes = [node for file in sources for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))]
+    modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    modules += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level]
+    names = {module.partition(".")[0] for module in modules}
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
