@@ -142,9 +142,10 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Return the row of `params.yaml` that a key of a scene's section names, and remove the key from the section.
+        """Return a row of `params.yaml` to which a section of a scene refers.
 
-        The value of the key is the name of the row, and `shared` is the section of `params.yaml` that contains it.
+        The section refers to the row by a key whose value is the name of the row. This key is removed from the section.
+        `shared` is the section of `params.yaml` that contains the row.
         If the key or the row is missing, raises `ParamsError`, whose message names `where` and the key.
         """
         name, rows = take(section, key, where), self.shared[shared]

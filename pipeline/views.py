@@ -9,7 +9,8 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-# The metrics of each training run. The run of a stage has their means over the training runs of the stage.
+# The metrics of each training run. In MLflow, each stage also has a run of its own. Its metrics are the means over the
+# training runs of the stage.
 SCORES = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
 TRAIN_S = "train_s"
 TAG, NOTE = "mlflow.sharedViewState.", "mlflow.note.content"

@@ -384,7 +384,10 @@ def measure(file: str, svg: str, id: str) -> Drawing:
 
 
 def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dict[str, Drawing]:
-    """Add to each drawing the sentence that tells readers what to see in it, if `by_name` has one for its name."""
+    """Add to each drawing the sentence that tells readers what they can see in it.
+
+    `by_name` contains these sentences by name of the drawing. Drawings without a sentence are not changed.
+    """
     return {name: replace(drawing, sentence=by_name.get(name, "")) for name, drawing in drawings.items()}
 
 

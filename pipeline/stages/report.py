@@ -252,7 +252,7 @@ def write_scene(results: Results, experiment: str, root: Path, *, register: bool
 def read_curves(scene: Scene, results: Path) -> Curves:
     """Read the results that MLflow shows as curves: the points of every sweep, and the numbers of every analysis.
 
-    The curves are returned by the name of the stage that computed them.
+    The keys of the result are the names of the stages that computed the curves.
     """
     points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]

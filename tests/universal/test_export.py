@@ -39,8 +39,8 @@ def whole() -> Universal:
 def coarse(kind: str) -> Universal:
     """Return a calibrated model whose lattice has only every third place, so that its C code compiles quickly.
 
-    The field changes of the calibration presses are the mean of the model's prior, each multiplied by a different
-    factor, so that the misfit of the model is not zero.
+    To calibrate the model, presses are made up: the field change of each press is the one that the prior expects,
+    multiplied by a random factor. The factors differ, so that the misfit of the model is not zero.
     """
     tables = whole().tables
     tables = replace(
