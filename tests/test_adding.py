@@ -35,7 +35,7 @@ from tests.recordings.readers.test_lab import PRESSES, row, write
 from tests.recordings.readers.test_leaphand import numbers
 from tests.recordings.readers.test_leaphand import write as write_leaphand
 from tests.scenes import recorded_scene
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import copy_checkout, copy_without_code, run
 from tests.universal.skins import fields_uT
 
 
@@ -51,9 +51,7 @@ def empty(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def root(empty, tmp_path) -> Path:
-    """Return a copy without code, for tests that run no programs."""
-    ignore = shutil.ignore_patterns("*.py", "__pycache__", "tests", "docs", "page")
-    return shutil.copytree(empty, tmp_path / "checkout", symlinks=True, ignore=ignore)
+    return copy_without_code(empty, tmp_path / "checkout")
 
 
 @pytest.fixture
