@@ -35,7 +35,7 @@ from tests.recordings.readers.test_lab import PRESSES, row, write
 from tests.recordings.readers.test_leaphand import numbers
 from tests.recordings.readers.test_leaphand import write as write_leaphand
 from tests.scenes import recorded_scene
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import copy_checkout, copy_without_code, run
 from tests.universal.skins import fields_uT
 
 
@@ -51,6 +51,11 @@ def empty(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def root(empty, tmp_path) -> Path:
+    return copy_without_code(empty, tmp_path / "checkout")
+
+
+@pytest.fixture
+def root_with_code(empty, tmp_path) -> Path:
     return shutil.copytree(empty, tmp_path / "checkout", symlinks=True)
 
 
@@ -379,10 +384,10 @@ def test_capture_with_many_lost_bytes_is_an_error(root, tmp_path):
     )
 
 
-def test_command_prints_a_one_line_error(root, tmp_path):
+def test_command_prints_a_one_line_error(root_with_code, tmp_path):
     (tmp_path / "broken.csv").write_bytes(b"")
     arguments = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    done = run(root, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
+    done = run(root_with_code, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert len(done.stderr.strip().splitlines()) == 1
@@ -407,10 +412,10 @@ def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_command_prints_that_the_scene_was_added_to_the_plan(root, lab_file, monkeypatch):
-    monkeypatch.chdir(root)
+def test_command_prints_that_the_scene_was_added_to_the_plan(root_with_code, lab_file, monkeypatch):
+    monkeypatch.chdir(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    done = run(root, "reskin", *arguments)
+    done = run(root_with_code, "reskin", *arguments)
     assert "next: dvc repro report@small" in done.stdout
     assert "added scene small to pipeline/plan.yaml" in done.stdout
     assert "dvc config" not in done.stdout + done.stderr
@@ -423,22 +428,22 @@ def test_command_prints_that_the_scene_was_added_to_the_plan(root, lab_file, mon
     assert "switched" not in again
 
 
-def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root, lab_file, monkeypatch):
-    monkeypatch.chdir(root)
-    before = contents(root)
+def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root_with_code, lab_file, monkeypatch):
+    monkeypatch.chdir(root_with_code)
+    before = contents(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
     invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
     assert "--scene: a name must be 1 to 64 of" in invalid
     assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
-    assert contents(root) == before
-    run(root, "reskin", *arguments, "small")
-    text = (root / SCENES / "mine.yaml").read_text()
+    assert contents(root_with_code) == before
+    run(root_with_code, "reskin", *arguments, "small")
+    text = (root_with_code / SCENES / "mine.yaml").read_text()
     assert YAML(typ="safe").load(text) == recorded_scene()
-    assert read_registry(root).captures.keys() == {"mine"}
+    assert read_registry(root_with_code).captures.keys() == {"mine"}
     again = output_of([*arguments, "small", "--name", "again"])
     assert "scene mine exists already" in again
-    assert (root / SCENES / "mine.yaml").read_text() == text
+    assert (root_with_code / SCENES / "mine.yaml").read_text() == text
 
 
 def test_recording_without_contact_needs_an_experiment_that_reads_it(root, tmp_path):
@@ -448,9 +453,9 @@ def test_recording_without_contact_needs_an_experiment_that_reads_it(root, tmp_p
     assert_refused(root, lambda: add.add(root, "small", prepared, allow_copy=False), message)
 
 
-def test_scene_with_too_little_data_is_an_error(root, lab_file):
-    add_lab(root, lab_file)
-    done = run(root, "dvc", "repro", "split@small", check=False)
+def test_scene_with_too_little_data_is_an_error(root_with_code, lab_file):
+    add_lab(root_with_code, lab_file)
+    done = run(root_with_code, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0
     assert "experiment lobo: boards must be two or more; got 1 (board1)" in done.stderr + done.stdout
     assert "Traceback" not in done.stderr + done.stdout

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline import FLOW, PLAN, SCENES
+from pipeline import FLOW, PLAN, SCENES, plan
 from reskin import code
 from reskin.models.job import CODE_MODULES, JobKeys
 from tests.models.example_jobs import example_data, pooled
@@ -58,7 +58,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 def root(tmp_path_factory) -> Path:
     """Return a copy of the checkout whose plan has scene ci."""
     folder = copy_checkout(tmp_path_factory.mktemp("edited"))
-    run(folder, "reskin", "scenes", "use", "ci")
+    plan.use(folder, ["ci"])
     return folder
 
 

@@ -26,7 +26,7 @@ from tests import repositories
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded_scene
-from tests.stages.checkout import copy_checkout
+from tests.stages.checkout import copy_checkout, copy_without_code
 from tests.test_adding import contents
 from tests.test_pickled import archive_of_csv
 
@@ -72,7 +72,7 @@ def example(tmp_path_factory) -> SimpleNamespace:
 @pytest.fixture
 def root(example, tmp_path) -> Path:
     """Return a checkout whose only source of recordings is the repository of `example`."""
-    root = shutil.copytree(example.root, tmp_path / "checkout", symlinks=True)
+    root = copy_without_code(example.root, tmp_path / "checkout")
     write_source(root, source_of(example.files, example.url, example.commit))
     return root
 

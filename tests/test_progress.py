@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import progress
+from pipeline import plan, progress
 from reskin.config import read_yaml
-from tests.stages.checkout import copy_checkout, run
+from tests.stages.checkout import copy_checkout
 
 ORDER = ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"]
 
@@ -53,7 +53,7 @@ def test_stage_outside_dvc_prints_nothing(monkeypatch):
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
 def test_table_2_precedes_other_protocols(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
-    run(root, "reskin", "scenes", "use", "ci")
+    plan.use(root, ["ci"])
     monkeypatch.chdir(root)
     order = progress.stages_in_order()
     needed = {"code", "simulate@ci", "ingest_simulated@ci", "split@ci", "train_single@ci", "train_multi@ci",

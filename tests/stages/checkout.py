@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"} | {
+NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", "mlruns", ".ci"} | {
     ".mypy_cache", ".ruff_cache", ".import_linter_cache", ".pytest_cache", ".hypothesis",
 }  # fmt: skip
 TEST_BYTECODE = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # bytecode of the tests, which stages do not read
@@ -51,6 +51,12 @@ def copy_checkout(folder: Path) -> Path:
     config = folder / ".dvc/config"
     config.write_text(config.read_text().replace("[core]", "[core]\n    no_scm = true"))
     return folder
+
+
+def copy_without_code(checkout: Path, folder: Path) -> Path:
+    """Copy a checkout of `copy_checkout`, for tests that run no programs in it: most of its files are code."""
+    ignore = shutil.ignore_patterns("*.py", "__pycache__", "tests", "docs", "page")
+    return shutil.copytree(checkout, folder, symlinks=True, ignore=ignore)
 
 
 def variables(folder: Path, **environment: str) -> dict[str, str]:
