@@ -252,7 +252,8 @@ def publish() -> None:
         written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
         missing = [path for path in (*models.values(), *written) if not path.exists()]
         if missing:
-            typer.echo(f"{name}: {missing[0].relative_to(ROOT)} not found; run dvc repro first")
+            path = missing[0].relative_to(ROOT)
+            typer.echo(f"scene {name}: {path} is missing, so nothing is uploaded. To compute all results: dvc repro")
             continue
         folders = (ROOT / "data/indentations" / name, ROOT / "data/models" / name, results, ROOT / "reports" / name)
         typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))

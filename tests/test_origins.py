@@ -108,7 +108,7 @@ def test_shallow_clone_without_the_commit_is_an_error(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     repositories.git(tmp_path, "clone", "--quiet", "--depth=1", home.as_uri(), "shallow")
-    assert_error("a clone made with --depth", str(tmp_path / "shallow"), first, scratch)
+    assert_error("a clone that was made with --depth", str(tmp_path / "shallow"), first, scratch)
 
 
 @pytest.mark.parametrize("filters", [True, False])

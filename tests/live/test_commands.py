@@ -77,7 +77,7 @@ def test_options_for_wire_format_and_chips_need_a_port(tmp_path):
 def test_help_lists_all_faults():
     assert all(f" {name}" in commands.FAULT for name in FAULTS)
     default = parse_fault("stuck")
-    assert f"begins after {default.start_s:g} s, lasts {default.duration_s:g} s" in commands.FAULT
+    assert f"begins after {default.start_s:g} s and lasts {default.duration_s:g} s" in commands.FAULT
 
 
 def test_live_without_options_shows_all_boards(monkeypatch):
