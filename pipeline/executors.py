@@ -69,7 +69,11 @@ def _context(imports: str) -> ForkServerContext:
 
 
 def end_workers() -> None:
-    """Stop the fork server, so that the CPU time of workers is included in the CPU time of this process's children."""
+    """Stop the fork server, which is the parent process of the workers.
+
+    The operating system adds the CPU time of a process to that of its parent when the process has ended. The CPU time
+    of the workers is therefore included in the CPU time of this process's children only after the server has ended.
+    """
     forkserver._forkserver._stop()  # type: ignore[attr-defined]  # otherwise, the server would outlive this process
 
 

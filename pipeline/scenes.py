@@ -116,7 +116,7 @@ class Scene(Strict, extra="allow"):
         return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
 
     def named_file(self, experiment: str) -> str:
-        """Return the file that an experiment's section names, as a path in the checkout."""
+        """Return the path of the file that is given in the settings of an experiment, relative to the checkout."""
         entry = EXPERIMENTS[experiment]
         return str((self.model_extra or {})[entry.stage].get(entry.file, ""))
 
@@ -125,7 +125,9 @@ class Scene(Strict, extra="allow"):
         """The settings that no experiment of the scene reads, by their place in the scene's file, such as `drift`.
 
         Unused settings change nothing, so an experiment can be removed from a scene without removing its settings.
-        `split.pool_passes_n` is never listed, because it also keeps passes out of the test rows of other experiments.
+        One setting is never listed: `split.pool_passes_n`, the number of passes from which pokes for adaptation are
+        drawn. It has an effect even without adaptation, because these passes are not in the test rows of other
+        experiments.
         """
         unread = {place: sorted(have - want - KEPT) for place, (have, want) in self._settings_by_place.items()}
         return [name if place == WHOLE else f"{place}.{name}" for place, names in unread.items() for name in names]

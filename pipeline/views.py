@@ -70,7 +70,11 @@ VIEWS = (TRAININGS, STAGES)
 
 
 def experiment_tags(experiment_id: str, created_ms: int) -> Iterator[tuple[str, str]]:
-    """Yield the tags of an experiment that define its views, and its description with links to them."""
+    """Yield name and value of the tags of an MLflow experiment.
+
+    There is one tag for each view, and one tag with the description of the experiment, which contains links to all
+    views.
+    """
     for i, view in enumerate(reversed(VIEWS)):  # the latest view is listed first
         made_ms = created_ms + i
         saved = {"name": view.title, "createdAt": made_ms, "updatedAt": made_ms, "state": view.state()}

@@ -403,7 +403,7 @@ def load_model(file: Path | str) -> Model:
     Raises
     ------
     ReskinError
-        If one of the two files is missing, or if the card does not fit the weights.
+        If one of the two files is missing, or if the model that the JSON card describes does not fit the weights.
 
     Examples
     --------

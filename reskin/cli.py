@@ -20,7 +20,9 @@ from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
 
-CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; outside a checkout, the help and the error messages name them
+# Commands of `pipeline.cli`, which can be run only in a checkout of the project. Outside a checkout, the list is needed
+# for the help, and for the error message if a user runs one of these commands.
+CHECKOUT_COMMANDS = (
     "add", "check-cache", "compare", "fetch", "merge", "model", "new", "publish", "readme", "remove", "scenes", "score",
     "summary", "verify-reports",
 )  # fmt: skip

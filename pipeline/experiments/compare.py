@@ -341,8 +341,8 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 
 # For each chip, a cosine tells how well the directions of the recorded and the simulated fields agree. An orientation
 # that differs from the scene's is reported only if it raises the sum of the chips' cosines by this much. The value is
-# assumed. It lies between two effects: wrong axes lower the cosine of a chip by 0.5 or more, while a skin that is
-# displaced by 0.5 mm changes every cosine by less than 0.1.
+# assumed. Wrong axes lower the cosine of a chip by 0.5 or more, which is enough to be reported. A skin that is
+# displaced by 0.5 mm changes each cosine by less than 0.1.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin are oriented as {} states."
@@ -463,10 +463,11 @@ def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dic
 
 
 def describe_outside(place_mm: Float[np.ndarray, "n 2"], section: Compare) -> str | None:
-    """Describe the presses that are outside the skin, if its size and position are as the scene states.
+    """Describe the presses whose stated places are outside the skin.
 
-    Returns None if all presses are on the skin. `place_mm` are places relative to the board's centre. If presses seem
-    to be outside the skin, their places are wrong, so the orientations that agree best with them mean nothing.
+    The size and the position of the skin are taken from the settings of the scene. Returns None if all presses are on
+    the skin. `place_mm` are places relative to the board's centre. If presses seem to be outside the skin, their places
+    are wrong, so the orientations that agree best with them mean nothing.
     """
     outside_n = int((np.abs(place_mm) > np.array(section.skin_mm) / 2).any(axis=1).sum())
     if not outside_n:

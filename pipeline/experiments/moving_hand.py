@@ -269,10 +269,11 @@ def contact_rows(group: str, pairs: Sequence[Pair], touches_uT: Changes, section
 
 
 def compensate(learner: str, trained_on: str, pair: Pair, boosting_iterations_n: int) -> Pair:
-    """Subtract the field changes that a regression predicts from the positions of the moving joints.
+    """Predict field changes with a regression, and subtract them from the readings.
 
-    The regression is trained either on the pad's other recording, or on the first half of the tested recording. In both
-    cases, thresholds are set on the first half of the tested recording, and tested on the second half.
+    The inputs of the regression are the positions of the moving joints. The regression is trained either on the pad's
+    other recording, or on the first half of the tested recording. In both cases, thresholds are set on the first half
+    of the tested recording, and tested on the second half.
     """
     from sklearn.ensemble import HistGradientBoostingRegressor
     from sklearn.linear_model import RidgeCV

@@ -333,10 +333,11 @@ def estimate(
 ) -> list[dict[str, Estimate]]:
     """Calibrate a model to a skin, and estimate the test presses of the skin.
 
-    The press by the known weight is estimated as well; it is the last element of each estimate. A way is one of map,
-    universal and network. Each element of `powers` contains the likelihood power for each way. (A likelihood power is
-    an exponent of the likelihood, which sets how wide the stated uncertainty is.) For each element of `powers`, the
-    result contains the estimate of each way.
+    The press by the known weight is estimated as well; it is the last element of each estimate. There are three ways
+    of estimation: with the map alone (`map`), with the networks alone (`network`), and with both (`universal`). Each
+    element of `powers` contains the likelihood power for each way. (A likelihood power is an exponent of the
+    likelihood, which sets how wide the stated uncertainty is.) For each element of `powers`, the result contains the
+    estimate of each way.
     """
     labels = skin.pool[: size.labels_n]
     labels = replace(labels, force_N=np.maximum(labels.force_N, model.skin.tables.force_N[0]))

@@ -146,7 +146,7 @@ def fetch(
         say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {source.commits}")
         if where is not None:
             say(f"taken from: {where}")
-        if source.licence is None and not agree("These files have no licence. Fetch them, for use here only?"):
+        if source.licence is None and not agree("These files have no licence. Fetch them for your own use only?"):
             remedy = "Nothing was fetched. Answer y on a terminal, or add --yes."
             raise ParamsError(f"reskin fetch {name}: the use of files without a licence was not confirmed. {remedy}")
         download(source, where or source.home, folder)

@@ -52,7 +52,10 @@ def with_capture(
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Return the registry with one more entry, which may be from another clone; errors are as in `with_capture`."""
+    """Return the registry with one more entry.
+
+    The entry may be from the registry of another clone of the repository. The errors are the same as in `with_capture`.
+    """
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None
@@ -65,7 +68,8 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
         if other.skin == entry.skin and other.board != entry.board:
             what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
             remedy = (
-                "Give a skin that moves to another board a new name: folds must not train and test on the same skin."
+                "If the skin was moved to another board, choose a new name for the skin. Otherwise, networks could be "
+                "trained and tested on the same skin."
             )
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:

@@ -283,7 +283,10 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
         for row in rows
         for board, board_scores in row.get("by_board", {}).items()
     ]
-    return tabulate(lines, spread="Positions are as labelled. The networks and draws of a board are averaged.")
+    return tabulate(
+        lines,
+        spread="Positions are as labelled. The networks and draws of a board are averaged.",
+    )
 
 
 def audit_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -297,7 +300,11 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List candidate settings of each stage; the chosen ones were best in leave-one-board-out on separate boards."""
+    """List the candidate settings of each stage, and mark the chosen settings.
+
+    The chosen settings had the best scores in a cross-validation that leaves one board out. The boards of this
+    cross-validation are not used for other results.
+    """
     lines = [
         {
             "stage": stage,

@@ -45,7 +45,7 @@ class Rows:
     pass_i : number of the pass, counted over all captures of a skin
     indentation : number of the indentation, counted over all captures of the scene. All readings of an indentation have
         the same number.
-    dropped : for each reason why readings are not in contact, the number of readings that were left out for it
+    dropped : number of readings that were left out because they are not in contact, by reason
     """
 
     capture: np.ndarray

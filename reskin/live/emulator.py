@@ -411,8 +411,8 @@ class Terminal(EmulatedPort):
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # A reader that opens the pseudo-terminal discards the data in its buffer. In packet mode, this process is
-        # informed of this, and so notices that a reader has opened the port.
+        # When a reader opens the pseudo-terminal, the reader discards all data in the buffer of the pseudo-terminal. In
+        # packet mode, this process is informed when data are discarded, and so notices that the port was opened.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)

@@ -73,7 +73,8 @@ class Health:
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._repeats = RepeatCounter(chips_n)
-        # whether whole frames were repeated since the last check for repeated readings of single chips
+        # Readings of single chips are checked for repetitions from time to time. This flag says whether any whole frame
+        # was repeated since the last of these checks.
         self._frames_repeat = False
         # Whether a chip was stuck at the end of the last batch. If so, all frames are dropped until the next batch.
         self._stuck = False
@@ -83,7 +84,7 @@ class Health:
     def note(self, name: str, count_n: int, now_s: float, fault: str | None = None) -> None:
         """Add `count_n` affected frames or bytes to the alarm with this name. Create the alarm if it does not exist.
 
-        The policy determines the action for `fault`, which is displayed with the alarm. If no fault is given, the
+        The alarm also displays an action, which is the action of the policy for `fault`. If no fault is given, the
         action is `flag`.
         """
         if count_n:

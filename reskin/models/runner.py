@@ -52,7 +52,7 @@ def run_jobs(
     data
         The rows to which the row numbers of the jobs refer.
     executor
-        Runs the training of each stack in a worker process.
+        Runs the training of each stack (jobs that are trained together) in a worker process.
     cache
         Folder with the results of completed training runs.
     log

@@ -237,18 +237,21 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
     """Return the best offset in s (probe time minus stream time); raise if another offset fits almost as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
-    samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
+    # In steps without a frame, the signal is 0. It is scaled to a mean magnitude of 1, so that the scale of the match
+    # does not depend on the number of these steps.
+    samples = signal / np.abs(signal).mean()
     weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
     overlap = _correlate(unsigned, np.abs(samples))
-    # The score is the match, minus the match that would be barely acceptable with the same overlap. Without the second
-    # term, a wrong offset with a larger overlap could have a higher score than the right offset.
+    # The match says how well the signal agrees with the pattern at an offset. The overlap is the largest possible match
+    # at this offset. The score is the match minus the smallest match that would be accepted for this overlap. Without
+    # the second term, a wrong offset with a larger overlap could have a higher score than the right offset.
     score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
     score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[elsewhere].max(initial=0.0)
-    # The overlap minus the match, in indentations. If the signal has the wrong sign in a dwell, the dwell adds to the
-    # overlap and is subtracted from the match, so it counts twice.
+    # `unexplained` is the overlap minus the match. Its unit is one indentation. If the signal has the wrong sign in a
+    # dwell, the dwell adds to the overlap and is subtracted from the match, so it counts twice.
     unexplained = (1 - EXPLAINED_MIN) * overlap[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(

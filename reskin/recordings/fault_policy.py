@@ -225,9 +225,9 @@ class FaultLog:
     ) -> None:
         """Record fault `chip_reset` for a block of frames, if the LSB of any chip in this block is wrong.
 
-        `wrong` marks the chips with a wrong LSB, and `lsb_uT` is the LSB of each chip. `rule` says which LSB would be
-        right, for the error if there is no expected LSB. `position` is the time or row of each frame of the block.
-        Raises `CaptureError` if the policy refuses recordings with this fault.
+        `wrong` marks the chips with a wrong LSB, and `lsb_uT` is the LSB of each chip. `rule` describes the right LSB
+        in words; the error message quotes it if `expected_lsb_uT` is None. `position` is the time or row of each frame
+        of the block. Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         if wrong.any() and self._policy.chip_reset == "refuse":
             chips = np.flatnonzero(wrong)

@@ -35,7 +35,8 @@ class Rig(Strict):
     noload_frames_n: FrameCount  # frames in the dwell above the skin, before each indentation
     # frames while the tip moves down, and the same number of frames while it moves up
     moving_frames_n: Annotated[int, Field(ge=0, le=1000)]
-    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames for which the tip already rests before a dwell
+    # frames between the end of a movement and the start of a dwell, while the tip rests but readings are not yet used
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]
     readings_n: FrameCount  # frames in the dwell at each stop
     rate_hz: Rate_hz
     robot_place_sd_mm: Spread  # standard deviation of the robot's error along x and along y, for each indentation

@@ -67,11 +67,13 @@ class SkinPrior:
     Parameters
     ----------
     name : name of the distribution
-    centre : central law. The parameters of simulated skins are drawn around those of this law.
+    centre : central law. A law is the set of parameters of a physical model of a skin (`reskin.universal.law`). The
+        parameters of simulated skins are drawn around those of this law.
     spreads : standard deviation of each parameter that is drawn
     setup : what is the same for all skins, such as the positions of the chips
     recorded : presses on recorded boards of the same rig, if there are such boards
-    residual : predicts the errors of the law on a new skin from its errors on recorded boards; None without such boards
+    residual : model that predicts the errors of the law on a new skin. It is fitted to the errors of the law on
+        recorded boards. None if there are no recorded boards.
     follows_law : True if skins follow the law exactly, as in a simulated scene. No errors of the law are then added.
     forces : distribution of the forces of presses
     """

@@ -151,7 +151,9 @@ Relative = Float[np.ndarray, "n ch"]  # errors of the law divided by |dB|
 # Distances in place and in log force over which the errors of the law are similar (length scales of `kernel`). The
 # errors at places that are 2 mm apart have a correlation of 0.8. For places that are 6 mm apart, it is 0.14.
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2
-NOISE = 0.1  # fraction of the variance of the law's error that differs from press to press at the same place
+# The error of the law has a part that differs between two presses, even if both presses are at the same place. This is
+# the fraction of the variance of the error that belongs to this part.
+NOISE = 0.1
 SHARED = 0.55  # fraction of the variance of the law's error that is the same on all boards
 # A few known boards are not enough to determine the covariance of the errors between channels. Therefore, a weighted
 # mean of two matrices is used: the covariance of the errors on the known boards, and an isotropic matrix (equal

@@ -34,7 +34,10 @@ FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled
 
 
 class Layers(NamedTuple):
-    """The regressor of a network that is conditioned on one skin: weights and biases of its layers."""
+    """The layers that estimate place and force, after the network was conditioned on one skin.
+
+    `weight` and `bias` contain the weights and the biases of each layer.
+    """
 
     weight: tuple[Float32[np.ndarray, "_ _"], ...]
     bias: tuple[Float32[np.ndarray, " _"], ...]

@@ -37,8 +37,9 @@ FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
 # Standard deviations over chips of: the relative gain of an axis, the cross-talk between axes, the rotation of the chip
 # about each axis, and the offset of an axis.
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
-# Smallest values of drawn parameters. They prevent that chips are inside the skin, that the skin slides away from its
-# centre, and that the slide of the skin vanishes at a very small force.
+# Smallest values of drawn parameters. With the smallest gap, no chip is inside the skin. With the smallest value of
+# `away_um_mm`, a press never displaces the skin away from its centre. With the smallest value of `lets_go_N`, this
+# displacement does not vanish already at a very small force.
 LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}
 
 

@@ -1,6 +1,7 @@
 """Tests of the reference methods, with which the universal model is compared.
 
-Tested are pairs of presses on two boards, readings of foreign boards, controls (against closed forms), and tables.
+The tests check the pairs of presses on two boards, the alarm for readings of foreign boards, the controls (which are
+compared with exact solutions), and the tables.
 """
 
 from typing import Any

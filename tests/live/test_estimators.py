@@ -131,7 +131,7 @@ class PressedWhileAdapting(UniversalEstimator):
 
 
 @pytest.mark.parametrize(("times_n", "instruction"), [(0, ""), (1, ""), (2, f"press 1 of {PRESSES_N}, anywhere")])
-def test_button_adapt_pressed_during_an_adaptation_keeps_the_presses(random_pokes, times_n, instruction):
+def test_presses_are_kept_if_button_adapt_is_pressed_during_an_adaptation(random_pokes, times_n, instruction):
     session = Session("played", load_universal(), "a board")
     session.skin.reader = reader = ScriptReader(make_poke_script(random_pokes))
     session.skin.estimator = estimator = PressedWhileAdapting(load_universal())

@@ -207,7 +207,7 @@ def test_different_jobs_with_the_same_name_are_both_trained(tmp_path):
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
-def test_cache_contains_no_rows(tmp_path):
+def test_cache_has_no_files_in_subfolders(tmp_path):
     run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 

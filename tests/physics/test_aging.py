@@ -62,14 +62,14 @@ def test_splitting_a_ramp_into_two_parts_changes_nothing(first_s, second_s, rate
 
 
 @given(times_s, changes, st.floats(-3, 3))
-def test_force_is_linear_in_the_elastic_force(dt_s, change, factor):
+def test_relaxing_force_is_proportional_to_the_change_of_the_elastic_force(dt_s, change, factor):
     once = advance(np.zeros(5), change, dt_s, SKIN_RELAXATION)
     np.testing.assert_allclose(
         advance(np.zeros(5), factor * change, dt_s, SKIN_RELAXATION), factor * once, atol=ROUNDING * 30
     )
 
 
-def test_force_at_constant_depth_relaxes_to_the_share_that_does_not_relax():
+def test_force_at_constant_depth_decreases_to_its_permanent_part():
     relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
     assert (np.diff(relaxed) <= ROUNDING).all()
     assert relaxed[0] == pytest.approx(1, abs=ROUNDING)

@@ -120,7 +120,7 @@ def test_answer_is_about_the_universal_model_if_table_2_is_incomplete(dropped, l
     assert ("Universal model" in found.place.second) == (dropped == "")
 
 
-def test_boards_and_skins_are_counted_without_the_recorded_protocol():
+def test_boards_and_skins_are_counted_if_the_protocol_is_missing():
     numbers = scene(over(86.0, 78.0, 91.5), over(0.8, 0.7, 0.9))
     numbers["described"] = {"grid": {"over_skins": {"rest_changes_in_1_uT": {"mean": 5.0, "n": 18}}}}
     del numbers["protocol"]

@@ -67,7 +67,7 @@ def test_accuracy_after_drift_has_one_decimal():
     assert "94.5\u00a0% with one before each contact" in sentences(numbers)["drift.svg"]
 
 
-def test_sentence_about_pokes_does_not_call_bars_intervals_of_the_difference():
+def test_sentence_about_pokes_states_that_bars_are_not_intervals_of_the_difference():
     numbers = numbers_of("quick")
     sentence = sentences(numbers)["sweep_pokes.svg"]
     assert sentence.endswith("not of the difference: that is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")

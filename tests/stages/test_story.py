@@ -152,7 +152,8 @@ def test_experiments_on_many_skins_share_test_rows(story, numbers):
     }
     assert {(row["of"], row["over"]) for row in numbers["paired"]} >= {("triplet", "multi"), ("adapted", "triplet")}
     boards_n = {(row["of"], row["over"]): row["accuracy_pct"]["n"] for row in numbers["paired"]}
-    # single networks train on one skin of each of two boards and are tested on the third board
+    # The networks of experiment `single` are trained on one skin. The skin is from the first or from the second board,
+    # and the test skins are on the third board.
     assert boards_n.pop(("multi", "single")) == 1
     assert set(boards_n.values()) == {3}
     assert all(len(row["by_board"]) == row["accuracy_pct"]["n"] for row in numbers["paired"])

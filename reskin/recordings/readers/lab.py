@@ -63,7 +63,7 @@ class _Table:
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of a recording: the CSV file itself, which contains the presses of one skin at one depth."""
+    """Find the file of a recording. A recording is one CSV file with the presses of one skin at one depth."""
     if not recording.is_file():
         raise CaptureError(
             f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file separately."
