@@ -21,8 +21,9 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from reskin.models.job import Weights
 from reskin.models.losses import squared_error
 from reskin.models.network import FEATURES_N, Layer, Stack, draw_weights, paper_layers
+from reskin.models.optimiser import AdamW, one_cycle
 from reskin.models.recipe import Schedule
-from reskin.models.train import AdamW, clip_gradients, one_cycle
+from reskin.models.train import clip_gradients
 
 DISCRIMINATOR_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import nn
 from torch.nn.functional import huber_loss
 
+from reskin.models.optimiser import AdamW, one_cycle
 from reskin.models.reproducible import affine, exp
 from reskin.seeds import rng_for
 from reskin.universal.batches import Batch, Batches, SkinPrior, TrainingSettings
@@ -107,16 +108,14 @@ def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Gene
     # With several threads, the order in which numbers are added would vary, and thus the result.
     torch.set_num_threads(1)
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
-    optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
+    optimizer = AdamW(network.parameters(), WEIGHT_DECAY)
     batches = Batches(skins, prior)
-    for _ in range(steps_n):
+    for step_i in range(steps_n):
         loss = loss_of(network, batches.draw(rng))
-        optimizer.zero_grad()
+        network.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_NORM_MAX)
-        optimizer.step()
-        rate.step()
+        optimizer.step(*one_cycle(step_i, steps_n, RATE_MAX, WARM_UP))
     return {name: value.detach().numpy().copy() for name, value in network.weights.items()}
 
 

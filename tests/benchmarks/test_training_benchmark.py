@@ -27,9 +27,10 @@ from reskin.models import train as train_module
 from reskin.models.batches import BatchSampler
 from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.network import FEATURE_LAYERS_N, Stack, paper_layers
+from reskin.models.optimiser import AdamW
 from reskin.models.recipe import Recipe
 from reskin.models.runner import STACK_N, run_jobs
-from reskin.models.train import AdamW, Monitor, train_stack
+from reskin.models.train import Monitor, train_stack
 from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
 

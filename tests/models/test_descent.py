@@ -4,7 +4,7 @@ import sys
 import pytest
 import torch
 
-from reskin.models.train import AdamW, one_cycle
+from reskin.models.optimiser import AdamW, one_cycle
 
 
 def weights() -> list[torch.Tensor]:
@@ -15,28 +15,41 @@ def weights() -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("steps_n", [1, 2, 3, 10, 150])
 @pytest.mark.parametrize("weight_decay", [0.0, 0.1])
-def test_optimiser_steps_equal_those_of_pytorch_bit_for_bit(steps_n, weight_decay):
+@pytest.mark.parametrize("warm_up", [0.15, 0.3])
+def test_optimiser_steps_equal_those_of_pytorch_bit_for_bit(steps_n, weight_decay, warm_up):
     ours, theirs = weights(), weights()
     optimizer = torch.optim.AdamW(theirs, 1.2e-2, weight_decay=weight_decay, fused=True)
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.2e-2, total_steps=max(steps_n, 2))
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.2e-2, total_steps=max(steps_n, 2), pct_start=warm_up)
     adam = AdamW(ours, weight_decay)
     for step_i in range(steps_n):
         for net in (ours, theirs):
             for values in net:
                 values.grad = torch.sin(7 * values.detach()) * 10.0 ** (-step_i % 5)
-        adam.step(*one_cycle(step_i, steps_n, 1.2e-2))
+        adam.step(*one_cycle(step_i, steps_n, 1.2e-2, warm_up))
         optimizer.step()
         rate.step()
         for one, other in zip(ours, theirs, strict=True):
             assert torch.equal(one, other)
 
 
-def test_training_does_not_import_the_compiler_of_pytorch():
+NETWORK_OF_THE_PAPER = """
+from reskin.models.job import LossWeights
+from reskin.models.train import train
+from tests.models.example_jobs import recipe, some_job
+
+train([some_job(0)], "paper", recipe(steps_n=2), LossWeights(0.0), "cpu")
+"""
+NETWORK_OF_THE_UNIVERSAL_MODEL = """
+from reskin.seeds import rng_for
+from reskin.universal.training import train
+from tests.universal.test_training import PRIOR, SKINS
+
+train(SKINS, PRIOR, 2, rng_for(0, "training"))
+"""
+
+
+@pytest.mark.parametrize("code", [NETWORK_OF_THE_PAPER, NETWORK_OF_THE_UNIVERSAL_MODEL])
+def test_training_does_not_import_the_compiler_of_pytorch(code):
     """This project compiles no network, and importing PyTorch's compiler would cost two seconds in each process."""
-    code = (
-        "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
-        "from tests.models.example_jobs import some_job\nfrom tests.models.example_jobs import recipe\n"
-        "train([some_job(0)], 'paper', recipe(steps_n=2), LossWeights(0.0), 'cpu')\n"
-        "sys.exit('torch._dynamo' in sys.modules)"
-    )
+    code = f"import sys\n{code}\nsys.exit('torch._dynamo' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
