@@ -94,14 +94,14 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(recorded):
 
 def test_exchanged_chips_are_named(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
-    assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
+    assert sentence(swapped) == "Contrary to the scene, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_axis_along_which_all_chips_are_mirrored_is_named(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
-        f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
+        f"Contrary to the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
@@ -109,7 +109,7 @@ def test_rotated_chip_is_named(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
-        "Against the scene, chip 3 is turned by 90 degrees more than the scene says."
+        "Contrary to the scene, chip 3 is turned by 90 degrees more than the scene says."
     )
 
 
@@ -118,13 +118,13 @@ def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
-        f"Against the scene, the labels are mirrored along {'xy'[axis]}."
+        f"Contrary to the scene, the labels are mirrored along {'xy'[axis]}."
     )
 
 
 def test_skin_with_exchanged_poles_is_named(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
-    assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
+    assert sentence(flipped) == "Contrary to the scene, the skin is flipped: every field has the opposite sign."
 
 
 def test_sixteen_orientations_of_a_skin_are_distinct():
