@@ -624,12 +624,13 @@ MEANING = (
     "would need a deeper indentation; they are simulated at this depth, and count like all other pokes."
 )
 ABOUT_PARAMETERS = (
-    "Seat: position of the middle of the skin relative to the middle of the board. Rotation: of the skin on the board. "
-    "Gap: distance between chips and skin. Amplitude: factor of all fields. Label offset: from the labelled place to "
-    "the place of the tip. Slide to the middle: a pressed skin slides towards its middle. The parameter is the "
-    "displacement of the material under the tip in the limit of a very small force, divided by the distance of the tip "
-    "from the middle. Give: compliance of the rig's arm. A larger gap has nearly the same effect as a smaller "
-    "amplitude, so neither parameter is a measurement."
+    "Seat: position of the middle of the skin relative to the middle of the board. Rotation: angle by which the skin "
+    "is turned on the board. Gap: distance between chips and skin. Amplitude: magnetisation relative to the nominal "
+    "skin. A larger gap has nearly the same effect as a smaller amplitude, so the fit determines only a combination of "
+    "both, and neither is a measurement. Label offset: place of the tip minus labelled place. Slide to the middle: a "
+    "press displaces the material under the tip towards the middle of the skin. The parameter is this displacement at "
+    "small forces, divided by the distance of the tip from the middle. Give: displacement of the skin that is the same "
+    "at all places, because the arm of the rig gives way."
 )
 ABOUT_GRIP = (
     "The friction under the tip limits how far a tip can slide the skin: k |u| <= mu F, with spring constant k, slide "
