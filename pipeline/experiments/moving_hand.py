@@ -548,10 +548,10 @@ OF_THRESHOLD = (
 )
 OF_PLACES = (
     "Superposed: a field change that was recorded on the moving hand (in the tested recordings) is added to each "
-    "tested press of {boards_n} recorded boards. The model is calibrated without such field changes, to {presses_n} "
-    "presses at random places. The places are coloured like the squares of a checkerboard: labels are at places of one "
-    "colour, and tests are at places of the other colour. Means over {draws_n} random draws, then over boards; (a; b) "
-    "are the values of the boards."
+    "tested press of {boards_n} recorded boards. With external field `none`, nothing is added. The model is calibrated "
+    "without such field changes, to {presses_n} presses at random places. The places are coloured like the squares of "
+    "a checkerboard: labels are at places of one colour, and tests are at places of the other colour. Means over "
+    "{draws_n} random draws, then over boards; (a; b) are the values of the boards."
 )
 OF_SIMULATED_PLACES = (
     "The model is calibrated without external fields, to {presses_n} presses at random places. The labels are the "

@@ -169,11 +169,11 @@ def numbers() -> dict[str, Any]:
     controls = unlabelled_controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
     stat = {"mean": 0.9, "n": 2, "ci95": [0.8, 1.0]}
     row = {"alarm_pct": stat, "auc": stat, "left_median": stat}
-    strangers = [{"stranger": "north for south", "law": OF_RIGHT} | row]
+    strangers = [{"stranger": "all magnetic poles swapped", "law": OF_RIGHT} | row]
     return {
         "methods": summarise(inversion_points + others, controls), "unpaired_n": 2,
         "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
-        "flagged": [{"method": name, "by": "left over", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
+        "flagged": [{"method": name, "by": "misfit", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
     }  # fmt: skip
 
 
@@ -189,10 +189,10 @@ def test_difference_from_the_control_is_paired_by_board():
 def test_tables_list_gains_omitted_methods_and_sources():
     tables_by_name = tables(numbers(), "recorded")
     assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
-    assert tables_by_name["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
+    assert tables_by_name["rivals"]["what it can and cannot correct"].tolist() == ["–", WHY["CORAL"]]
     assert tables_by_name["rivals"]["paired, accuracy, points"][1].startswith("+25")
     assert tables_by_name["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
-    assert tables_by_name["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
+    assert tables_by_name["rivals_alarm"]["physical model"].tolist() == [OF_RIGHT] * 2
     # No reading was flagged, so there is no error of flagged readings.
     assert tables_by_name["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]
     assert tables_by_name["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
