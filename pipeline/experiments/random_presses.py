@@ -130,7 +130,7 @@ def random_presses(
         presses = board_presses(known, board)
         for draw_i in range(section.draws_n):
             rows += score_draw(presses, variants, powers, section, settings.seed, draw_i)
-        say(f"{settings.scene} random_presses: board {board} done")
+        say(f"{settings.scene} random_presses: scored board {board}")
     write_results(results, {"rows": summarise_rows(rows), "draws_n": section.draws_n}, {})
 
 
@@ -164,7 +164,7 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
     if not len(middle):
         raise SchemaError(
             f"random_presses: board {board.board} has no press within {MIDDLE_MM:g} mm of the middle. "
-            "Remove the experiment from the scene."
+            "Remove random_presses from the scene."
         )
     unlabelled, weight = rng.permutation(n)[:presses_n], rng.choice(middle, 1)
     part = board.part(split, draw_i)
@@ -172,7 +172,7 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
     if not tested.any() or not (part == 1).any():
         raise SchemaError(
             f"random_presses: board {board.board} has too few presses ({n}): none is left for labels or for tests. "
-            "Remove the experiment from the scene."
+            "Remove random_presses from the scene."
         )
     return Draw(unlabelled, rng.permutation(np.flatnonzero(part == 1)), weight, np.flatnonzero(tested[board.press_i]))
 

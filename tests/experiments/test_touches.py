@@ -119,17 +119,20 @@ def test_unusable_recordings_are_omitted_with_a_reason():
     result = sort_recordings([*single[1:], again, short, *double])
     assert [one.name for one in result.single] == [one.name for one in single[1:]]
     assert result.problem is None
-    assert result.left_out["short"] == "19 touched rows, fewer than 20"
-    assert result.left_out["second of place 2"] == "place 2 already recorded alone, by (2,)"
+    assert result.left_out["short"] == "19 rows with enough force, but 20 are needed"
+    assert result.left_out["second of place 2"] == "recording (2,) of place 2 alone is used instead"
     without_1 = [one for one in double if 1 not in one.places]
     assert [one.name for one in result.double] == [one.name for one in without_1]
-    assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
+    assert result.left_out["(1, 2)"] == "no recording of place 1 alone"
 
 
 def test_if_all_recordings_are_of_pairs_the_reason_is_reported():
     _, double = pad()
     result = sort_recordings(double)
-    assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
+    assert (
+        result.problem
+        == "places recorded alone: 0; at least 2 are needed. Add recordings of single places to the scene."
+    )
     numbers = {
         "force_min_N": 0.5, "single": {"recordings_n": 0, "rows_n": 0}, "double": {"recordings_n": 0, "rows_n": 0},
         "left_out": result.left_out, "not_computed": result.problem,
@@ -157,5 +160,5 @@ def test_table_of_pairs_shows_only_touched_pairs(split_pad):
         }  # fmt: skip
         shown = tables(numbers, "recorded")
         assert ("touches_superposition" in shown) == bool(pairs)
-        assert ("two touches called two, %" in shown["touches_detection"]) == bool(pairs)
+        assert ("two touches reported as two, %" in shown["touches_detection"]) == bool(pairs)
         assert all((table["source"] == "recorded").all() for table in shown.values())
