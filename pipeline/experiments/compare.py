@@ -4,7 +4,8 @@ A poke is a press at one place to one depth. A law is a physical model of a skin
 the place and the force of a poke. Each board is simulated in three ways:
 - with the nominal skin, without any fit,
 - with a law that is fitted to the pokes of this board,
-- with the law of another board, of which only those parameters are fitted again that may differ between boards.
+- with the law of another board, after the parameters that may differ between boards are fitted to the pokes of this
+  board.
 
 The experiment also examines:
 - the friction under the tip,

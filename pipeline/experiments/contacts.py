@@ -56,7 +56,7 @@ KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detect
 SINGLES_N = 1000
 DRAWN_N = 60  # number of pairs in the figure, for each board and separation
 # Separation in mm of pairs of pokes at the same place. Such pairs differ from a single poke only in the strength of the
-# signal and in noise, so they show the effect of these two alone.
+# signal and in noise, so they show the effect of signal strength and noise alone.
 SAME_PLACE = 0.0
 TOLERANCE_MM = 0.5  # places are on a grid, so the separation of a pair may differ by this much (assumed)
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
@@ -303,9 +303,9 @@ def residual(
     """Return how badly the predicted single contact explains each reading.
 
     A network predicts one contact (x_mm, y_mm, F_N) from a reading. The dB that such a contact would cause is
-    interpolated from `known` contacts, which are given as (x_mm, y_mm, F_N) and dB in uT. The contacts that are nearest
-    to the prediction in place and, if forces are known, in force are used. The result is the norm of the difference
-    between this dB and the reading, divided by the reading's |dB| plus noise.
+    interpolated from `known` contacts, which are given as (x_mm, y_mm, F_N) and dB in uT. The interpolation uses the
+    known contacts with the most similar place and, if forces are known, the most similar force. The result is the norm
+    of the difference between the interpolated dB and the reading, divided by the reading's |dB| plus noise.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 

@@ -180,7 +180,11 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
 def score_draw(
     board: BoardPresses, variants: Variants, powers: LikelihoodPowers, section: RandomPresses, seed: int, draw_i: int
 ) -> list[dict[str, Any]]:
-    """Score both variants and the reference methods on one draw of each split and number of presses."""
+    """Score two variants of the universal model, and the reference method, for each split and number of presses.
+
+    One variant is trained on simulated skins alone, and the other is also trained on the other boards of the rig. For
+    each split and each number of unlabelled presses, one random selection of presses is used.
+    """
     rows = []
     most_n = max(section.presses_n)
     for split in (CHECKERBOARD, HALVES):

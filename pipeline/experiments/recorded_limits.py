@@ -1,8 +1,8 @@
 """Three limits of the recorded boards: rigid registration, shear force, and the smallest detected force.
 
-- *Registration*: a model that was trained on another board estimates places on this board. A few presses at known
-  places determine a rotation and a shift that correct these estimates, as in the procedure published for skins that are
-  mounted again. The corrected estimates are scored on other presses of the same board.
+- *Registration*: a model that was trained on one board estimates places on another board. A few presses at known
+  places on this other board determine a rotation and a shift that correct the estimates. This is the procedure that was
+  published for skins that are mounted again. The corrected estimates are scored on other presses of the same board.
 - *Shear*: how much of the recorded sideways force can be estimated from the field.
 - *Detection*: the smallest field change, and the smallest force, that can be distinguished from no-load readings
   (readings without contact).

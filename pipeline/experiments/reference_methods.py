@@ -302,7 +302,9 @@ def score_adversarial(
 def train_until_converged(
     domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train a network; while it collapses, repeat with other random draws, up to `MAX_ATTEMPTS_N` times.
+    """Train a network, with at most `MAX_ATTEMPTS_N` attempts.
+
+    If a network collapses (it then predicts hardly more than a constant), it is trained again with other random draws.
 
     The draws do not depend on the adversarial `weight`, so that a network and its control differ only in this weight.
     """
@@ -347,7 +349,7 @@ class Seconds:
     one_reading_s: float
 
 
-Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Seconds]  # method, places, forces
+Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Seconds]  # method, places, forces, times
 
 
 def score_unlabelled(
@@ -433,8 +435,8 @@ OF_RIGHT, OF_STRANGER = "fitted to the right skin", "fitted to the foreign board
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards. They are simulated: the readings of a board are changed as a wrong plug, driver or skin would change
-# them.
+# Foreign boards, by what is different. They are made from the readings of a recorded board. These readings are changed
+# in the same way as a wrong plug, a wrong driver or a wrong skin would change them.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -468,8 +470,8 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
     A physical model is fitted to the unlabelled pokes of each board's first fold. It is then inverted for test readings
     of this board and of foreign boards, which gives a residual for each reading. An alarm is raised if the residual is
-    above the limit of the board. This limit is set with all other boards, whose own models are fitted to them: a
-    fraction `fraction` of their residuals is above the limit.
+    above the limit of the board. This limit is set with the readings of all other boards: a fraction `fraction` of
+    their residuals is above the limit. The residuals of each of these boards are from the model that is fitted to it.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)

@@ -468,8 +468,9 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
         f"Data: {single['rows_n']} rows of {single['recordings_n']} recordings of one touch, and {double['rows_n']} "
         f"rows of {double['recordings_n']} recordings of two touches, with forces of {numbers['force_min_N']:g} N or "
         "more. Place: the most frequent place among the training rows whose changes of field have the most similar "
-        "directions. Force: ridge regression on the change of field. Mean ± standard deviation over n recordings. By chance: "
-        "the result of a random place, or the variance of the force, which is the error of predicting the mean force. "
+        "directions. Force: ridge regression on the change of field. Mean ± standard deviation over n recordings. By "
+        "chance: the result of a random place, or the variance of the force, which is the error of predicting the mean "
+        "force. "
         f"{ONCE} {APART} {NO_MM}"
         f"{_left_out(numbers)}"
     )

@@ -1,6 +1,6 @@
 """Tests of experiment moving_hand, which studies touches while a hand moves in magnetic fields.
 
-Tested are the external fields, their compensation, thresholds for contacts, places, and the whole stage.
+The tests check the external fields, their compensation, thresholds for contacts, places, and the whole stage.
 """
 
 from dataclasses import replace

@@ -77,7 +77,7 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), make_ro
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_presses_are_paired_with_those_of_equal_place_and_force_on_the_known_board():
+def test_presses_are_paired_with_fields_of_the_known_board_at_equal_place_and_force():
     rows = make_rows()
     rows.target[20:22, 2] = 2.0  # This force is between the two forces of board b0.
     rows.target[22:24, 2] = 9.0  # This force is above the largest force of board b0.
@@ -186,7 +186,7 @@ def test_difference_from_the_control_is_paired_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_tables_list_gains_omitted_methods_and_sources():
+def test_tables_contain_differences_from_controls_and_the_source():
     tables_by_name = tables(numbers(), "recorded")
     assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
     assert tables_by_name["rivals"]["what it can and cannot correct"].tolist() == ["–", WHY["CORAL"]]

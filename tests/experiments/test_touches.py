@@ -1,6 +1,6 @@
 """Tests of experiment touches, in which one or two numbered places of a pad are touched.
 
-The pad is simulated: field changes of two touches add up.
+The pad is simulated. The field change of two touches is the sum of the field changes of the two single touches.
 """
 
 from dataclasses import replace
@@ -65,7 +65,7 @@ def test_rows_are_split_into_training_threshold_and_test_rows_in_order_of_time()
     np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
 
 
-def test_residual_equals_that_of_bounded_least_squares():
+def test_residual_equals_the_residual_of_bounded_least_squares():
     rng = rng_for(0, "touches", "left over")
     known = {place: rng.normal(size=15) for place in PLACES}
     db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)

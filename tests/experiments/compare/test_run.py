@@ -1,6 +1,6 @@
 """Tests of experiment compare, which fits the simulation to recordings.
 
-It must recover parameters and axes, from simulated and from real recordings.
+The fits must recover the parameters of skins and the orientations of axes, from simulated and from real recordings.
 """
 
 import itertools
@@ -134,7 +134,7 @@ def test_sixteen_orientations_of_a_skin_are_distinct():
     assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
-def test_flipped_checkerboard_equals_one_rotated_by_a_quarter_turn():
+def test_flipped_checkerboard_skin_equals_the_skin_rotated_by_a_quarter_turn():
     plain, flipped = (replace(SETUP, skin_flipped=is_flipped).rest for is_flipped in (False, True))
     turn = compare.quarter_turn(1)
     moments_by_node = {
@@ -268,7 +268,7 @@ def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_of_recordings_is_recovered_and_that_of_the_simulation_is_the_set_one(real):
+def test_memory_is_estimated_from_recordings_and_from_simulations(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
         fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]
