@@ -122,7 +122,7 @@ def test_recorded_block_shows_the_scores_of_presses_at_random_places():
         row
         for row in lab["random_presses"]["rows"]
         if (row["tested"], row["presses_n"], row["method"], row["labels"])
-        == ("other colour of a checkerboard", 65, "universal, simulated alone", "40")
+        == ("places without labels (checkerboard)", 65, "universal, simulated alone", "40")
     )
     mean, values = row["accuracy_pct"]["mean"], row["accuracy_pct"]["values"]
     line = next(line for line in block.splitlines() if "we ship" in line and "within 1 mm" in line)

@@ -368,7 +368,7 @@ def test_universal_model_has_scores_with_and_without_labels(tmp_path):
         row["labels"]: row["accuracy_pct"]["mean"]
         for row in io.read_json(lab)["random_presses"]["rows"]
         if (row["tested"], row["presses_n"], row["method"])
-        == ("other colour of a checkerboard", 65, "universal, simulated alone")
+        == ("places without labels (checkerboard)", 65, "universal, simulated alone")
     }
     assert run.data.metrics["accuracy_pct_0_labels"] == pytest.approx(expected["0"], rel=1e-5)
     assert run.data.metrics["accuracy_pct"] == pytest.approx(expected["40"], rel=1e-5)

@@ -15,7 +15,8 @@ from reskin.errors import ParamsError, SchemaError
 NOT_STATED = "not stated"
 NETWORK = "network of the paper"  # name of the entry that corresponds to method `network` of experiment labels
 UNLABELLED_N = 65  # unlabelled presses of dataset lab
-CHECKERBOARD = "other colour of a checkerboard"  # split of experiment random_presses that dataset lab uses
+# Tested places in those rows of experiment random_presses whose labels and tests are divided as in dataset lab.
+CHECKERBOARD = "places without labels (checkerboard)"
 NONE_YET = "No entries yet."
 
 

@@ -4,7 +4,8 @@ A poke is a press at one place to one depth. A law is a physical model of a skin
 the place and the force of a poke. Each board is simulated in three ways:
 - with the nominal skin, without any fit,
 - with a law that is fitted to the pokes of this board,
-- with the law of another board, of which only those parameters are fitted again that may differ between boards.
+- with the law of another board, after the parameters that may differ between boards are fitted to the pokes of this
+  board.
 
 The experiment also examines:
 - the friction under the tip,
@@ -48,8 +49,8 @@ LIGHT_N = 1e-3  # force of a light touch
 FITTED_MAX_N = 600  # largest number of presses per board; fits to more would take minutes
 PLACE_STRIDE = 5  # to save time, |dB| is simulated only at every fifth place of a board, and the median is plotted
 # Values of k / mu in N/mm, where k is the stiffness of the springs that hold the skin, and mu is the friction
-# coefficient under the tip. This ratio limits how far a tip can slide the skin. The first value stands for no limit
-# (the skin slides fully at any force), and the last value stands for a slippery tip.
+# coefficient under the tip. This ratio limits how far a tip can slide the skin. With the first value, there is almost
+# no limit: the skin slides fully at any force. The last value stands for a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -81,8 +82,8 @@ class Compare(SectionWithRows):
             return section
         given, key = section["layout"], f"{where}.layout"
         if isinstance(given, str) and Path(given).suffix:
-            problem = f"{given} is a file, whose changes DVC would not notice"
-            raise ParamsError(f"{key}: {problem}. Write the content of the file there, as `reskin new` does.")
+            problem = f"{given} is the name of a file, and DVC would not notice when this file changes"
+            raise ParamsError(f"{key}: {problem}. Replace the name by the content of the file, as `reskin new` does.")
         layout = read_layout(given) if isinstance(given, str) else as_layout(given, key)
         design = {
             "chips_xy_mm": layout.chips_mm.tolist(), "chips_turn_deg": list(layout.turns_deg), "gap_mm": layout.gap_mm,
@@ -93,12 +94,14 @@ class Compare(SectionWithRows):
             "tip_radius_mm": layout.tip_radius_mm,
         }  # fmt: skip
         if twice := sorted(section.keys() & of_layout.keys() - {"layout"}):
-            raise ParamsError(f"{where}: {', '.join(twice)} cannot be set beside layout. Change the layout instead.")
+            raise ParamsError(
+                f"{where}: {', '.join(twice)} cannot be set together with layout. Change the layout instead."
+            )
         return section | of_layout
 
     @property
     def stated_by(self) -> str:
-        """Words for the source of the stated orientations (the scene, or a layout), for use in messages."""
+        """Name of the source of the stated orientations, for use in messages: the scene, or a layout."""
         return "the scene" if self.layout is None else f"layout {self.layout.name}"
 
 
@@ -268,7 +271,7 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
     if len(turn) != chips_n:
         where = f"compare.{'design' if section.layout is None else 'layout'}"
         what = f"{chips_n} chips were recorded, but {where} has {len(turn)}"
-        raise ParamsError(f"board {pokes.board}: {what}. Correct {where} of the scene.")
+        raise ParamsError(f"board {pokes.board}: {what}. Correct the chips in {where} of the scene.")
     place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
     rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
     return AlignedPresses(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
@@ -346,7 +349,8 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin are oriented as {} states."
-ASSUMED_N = 1.0  # replaces unknown forces; only the directions of fields are compared, which hardly depend on the force
+# This force replaces unknown forces. Only the directions of fields are compared, which hardly depend on the force.
+ASSUMED_N = 1.0
 
 
 @dataclass(frozen=True)
@@ -418,13 +422,13 @@ class Frames:
         if self.as_stated:
             return AS_SAID.format(stated_by)
         differences = [f"the labels are {self.labels.describe(stated_by)}"] * (self.labels != TURNS[0])
-        differences += ["the skin is flipped: every field has the other sign"] * self.flipped
+        differences += ["the skin is flipped: every field has the opposite sign"] * self.flipped
         differences += _describe_exchanges(self.chips)
         for turn in dict.fromkeys(self.turns):
             chips = [i for i, chip_turn in enumerate(self.turns) if chip_turn == turn]
             if turn != TURNS[0]:
                 differences.append(f"{_name_chips(chips, len(self.turns))} {turn.describe(stated_by)}")
-        return f"Against {stated_by}, {'; '.join(differences)}."
+        return f"Contrary to {stated_by}, {'; '.join(differences)}."
 
 
 def _name_chips(chips: Sequence[int], chips_n: int) -> str:
@@ -437,7 +441,7 @@ def _describe_exchanges(positions: Int[np.ndarray, " k"]) -> list[str]:
     moved = np.flatnonzero(positions != np.arange(len(positions))).tolist()
     if len(moved) == 2:
         return [f"chips {moved[0]} and {moved[1]} are exchanged"]
-    places = ", ".join(f"{i} sits at {positions[i]}" for i in moved)
+    places = ", ".join(f"chip {i} is at the position of chip {positions[i]}" for i in moved)
     return [f"chips are exchanged ({places})"] if moved else []
 
 
@@ -480,8 +484,8 @@ def describe_outside(place_mm: Float[np.ndarray, "n 2"], section: Compare) -> st
     key = "labels_middle_mm" if section.layout is None else "centre_mm"
     return (
         f"{outside_n} of {len(place_mm)} presses are outside the skin ({width_mm:g} x {height_mm:g} mm) that "
-        f"{section.stated_by} states: relative to {key} [{x_mm:g}, {y_mm:g}], they have {' and '.join(ranges)}. "
-        f"Correct {key}, the size of the skin or the places."
+        f"{section.stated_by} states: relative to {key} [{x_mm:g}, {y_mm:g}], all presses have "
+        f"{' and '.join(ranges)}. Correct {key}, the size of the skin or the places of the presses."
     )
 
 
@@ -597,44 +601,52 @@ def _thin(pokes: RecordedPresses, most_n: int) -> RecordedPresses:
 COSINE_MIN = {"nominal": 0.90, "fitted": 0.90, "refitted": 0.85}
 EXPLAINED_MIN, GROWTH_WITHIN, MEMORY_PCT = 0.80, 0.10, (5.0, 8.0)
 SIMULATIONS = {
-    "nominal": "nominal skin, nothing fitted", "fitted": "ten parameters, fitted to this board",
+    "nominal": "nominal skin, no fit", "fitted": "law with ten parameters fitted to this board",
     "refitted": "law of another board, seven parameters refitted",
 }  # fmt: skip
 COSINE, EXPLAINED, GROWTH = "cosine", f"explained (≥ {EXPLAINED_MIN:.2f})", f"growth (within {GROWTH_WITHIN:.2f})"
-HELD = "held at the deepest"
+HELD = "pokes simulated at the largest depth"
 MEMORY = "memory, % ({:g} to {:g})".format(*MEMORY_PCT)
 NONE = "–"
 MEANING = (
-    "Compares dB of each recorded poke (mean in contact minus mean before contact) with dB simulated at the labelled "
-    "place and the recorded force. Bounds are in brackets. Cosine: between recorded and simulated dB over all "
-    "channels, mean over pokes. Explained: 1 - |simulated - recorded|² / |recorded|², median over pokes. Growth: d "
-    "log|dB| / d log F at one place, median over places, simulated / recorded. Whether one board is within the bounds "
-    "is judged by its own numbers; four or more boards are also judged together, by the 95 % confidence interval over "
-    "boards (Student's t). Law: the physical model of a skin. The form of the law, its tip radius, its exponent of "
-    "stiffening and the force at which the slide ends were chosen with data of both boards of scene lab, so only a new "
-    "board can test them. The law does not explain why a skin slides towards its middle. Memory, simulated / recorded: "
-    "the fraction of a poke's change of field that remains in the next no-load reading. The simulated memory is set to "
-    "{:g} %, so its estimate tests the estimator and is not a prediction. Held at the deepest: number of pokes whose "
-    "force is larger than at the deepest indentation that the law can follow (0.72 of the thickness); they are "
-    "simulated at that depth, and count like all others."
+    "Compares the recorded field change dB of each poke (mean in contact minus mean before contact) with the field "
+    "change that is simulated at the labelled place and the recorded force. Bounds are in brackets. Law: the physical "
+    "model of a skin, which gives the field change from place and force. Cosine: between recorded and simulated dB "
+    "over all channels, mean over pokes. Cosine by file: the same for each recorded file. Explained: 1 - |simulated - "
+    "recorded|² / |recorded|², median over pokes. Growth: the exponent with which |dB| grows with the force F, d "
+    "log|dB| / d log F at one place, median over places, simulated / recorded. The bounds are applied to each board "
+    "separately. With four or more boards, they are also applied to all boards together, by the 95 % confidence "
+    "interval over boards (Student's t). The form of the law, its tip radius, its exponent of stiffening, and the "
+    "force at which the skin stops sliding were chosen with data of both boards of scene lab, so only a new board can "
+    "test them. The law does not explain why a skin slides towards its middle. Memory, simulated / recorded: the "
+    "fraction of a poke's field change that remains in the next no-load reading. The simulated memory is set to {:g} "
+    "%, so its estimate tests the estimator and is not a prediction. Pokes simulated at the largest depth: the law is "
+    "valid up to an indentation of 0.72 of the skin's thickness. The column contains the number of pokes whose force "
+    "would need a deeper indentation; they are simulated at this depth, and count like all other pokes."
 )
 ABOUT_PARAMETERS = (
-    "Seat: position of the skin's middle relative to the board's. Label offset: from the labelled place to the tip. "
-    "Slide: displacement of the material under the tip towards the skin's middle at vanishing force, per distance from "
-    "the middle. Give: compliance of the rig's arm. Gap and amplitude compensate each other in the fit, so neither "
-    "is a measurement."
+    "Seat: position of the middle of the skin relative to the middle of the board. Rotation: angle by which the skin "
+    "is turned on the board. Gap: distance between chips and skin. Amplitude: magnetisation relative to the nominal "
+    "skin. A larger gap has nearly the same effect as a smaller amplitude, so the fit determines only a combination of "
+    "both, and neither is a measurement. Label offset: place of the tip minus labelled place. Slide to the middle: a "
+    "press displaces the material under the tip towards the middle of the skin. The parameter is this displacement at "
+    "small forces, divided by the distance of the tip from the middle. Give: displacement of the skin that is the same "
+    "at all places, because the arm of the rig gives way."
 )
 ABOUT_GRIP = (
-    "A tip slides the skin no further than the friction under the tip allows: k |u| <= mu F, with spring constant k, "
-    "slide u, friction coefficient mu and force F. k / mu = {grip_N_mm:g} N/mm is used (k is from a recorded sideways "
-    "force, mu is assumed: `skin.hold` in nominal.yaml). For each value of k / mu all other parameters are fitted "
-    "again. Recordings begin above half a newton, where the skin hardly slides any further: the field of a light touch "
-    "therefore depends on the assumed friction. Without this limit, the skin would jump at first contact."
+    "The friction under the tip limits how far a tip can slide the skin: k |u| <= mu F, with spring constant k, slide "
+    "u, friction coefficient mu and force F. Here, k / mu = {grip_N_mm:g} N/mm is used. The constant k follows from a "
+    "recorded sideways force, and mu is assumed (`skin.hold` in nominal.yaml). For each value of k / mu in the table, "
+    "all other parameters are fitted again. The recorded forces are larger than half a newton. At such forces, the "
+    "skin hardly slides any further, so the recordings do not determine the friction, and the simulated field of a "
+    "light touch depends on the assumed friction. Without this limit, the skin would jump at first contact."
 )
 ABOUT_FRAMES = (
-    "Cosines between recorded and simulated dB over all pokes together, with the nominal skin: in the orientations "
-    "that the scene states (as written), and in those that agree best (best). A departure from the scene is reported "
-    "if it raises the sum of the cosines over chips by 0.1 or more."
+    "Checks whether labels, chips and skin are oriented as the scene states. Column `orientation` describes the "
+    "differences from the scene. The cosines are between recorded and simulated dB, over all pokes together; the "
+    "simulated dB is that of the nominal skin. There is one cosine for each chip, in the orientations that the scene "
+    "states (`as written`) and in the orientations with the best agreement (`best`). A difference from the scene is "
+    "reported only if it raises the sum of the cosines over chips by 0.1 or more."
 )
 TITLES = {
     "seat_x_mm": "seat x, mm", "seat_y_mm": "seat y, mm", "rotation_deg": "rotation, degrees", "gap_mm": "gap, mm",
@@ -712,7 +724,7 @@ def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     for board, board_numbers in by_board.items():
         for row in board_numbers.get("grips", []):
             line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}"}
-            line["force at two thirds of the slide, N"] = f"{row['grip_N']:.2g}"
+            line["force at 2/3 of the largest slide, N"] = f"{row['grip_N']:.2g}"
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
             grown = row.get("growth")
             line[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}" if grown else NONE
@@ -732,7 +744,7 @@ def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
         for title, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
     }
     noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values()) or NONE}
-    pokes = {"pokes": str(board_numbers["pokes_n"]), "left out": str(board_numbers["left_out_n"])}
+    pokes = {"pokes": str(board_numbers["pokes_n"]), "pokes left out": str(board_numbers["left_out_n"])}
     return {"board": board, "orientation": board_numbers["frames"]["sentence"]} | cosine | noise | pokes
 
 
@@ -766,7 +778,7 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
             axes.set_ylim(bottom=0.1)
             axes.grid(alpha=0.25)
             axes.legend(frameon=False, fontsize=8)
-        title = f"Change of field against force, from the lightest touch ({source}; simulated: median over places)"
+        title = f"Change of field against force, down to the lightest touch ({source}; simulated: median over places)"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return svg(figure)
 

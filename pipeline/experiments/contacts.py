@@ -52,10 +52,11 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
-SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
+# Number of single contacts that set the thresholds. As many other single contacts test the thresholds.
+SINGLES_N = 1000
 DRAWN_N = 60  # number of pairs in the figure, for each board and separation
 # Separation in mm of pairs of pokes at the same place. Such pairs differ from a single poke only in the strength of the
-# signal and in noise, so they show the effect of these two alone.
+# signal and in noise, so they show the effect of signal strength and noise alone.
 SAME_PLACE = 0.0
 TOLERANCE_MM = 0.5  # places are on a grid, so the separation of a pair may differ by this much (assumed)
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
@@ -89,13 +90,13 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # Two detectors use networks. The networks were trained on all other boards, so their training data include the
-        # contacts that set the thresholds.
+        # Two detectors use networks. These networks were trained on all training contacts, so their training data
+        # include the contacts that set the thresholds.
         "threshold_set_on": (
-            f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
-            "networks behind `residual` and `networks disagree` were trained on them"
+            f"training contacts of one {plot_data[0]['kept_aside']}, to which the detectors are not fitted; but the "
+            "networks behind `residual` and `networks disagree` were trained on these contacts"
         ),
-        "noise": "that of two readings",
+        "noise": "the noise of two readings, because two field changes are added",
         "by_separation": [row(separation_mm) for separation_mm in section.separations_mm],
         "same_place": row(SAME_PLACE),
         "false_alarm_pct": {
@@ -231,7 +232,7 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
             last = labels[train] == kinds[-1]
             return train[~last], train[last], what
     what = "the training rows are of a single board, skin and pass; two boards, skins or passes are needed"
-    raise ParamsError(f"contacts: {what}. Record more, or remove the experiment from the scene.")
+    raise ParamsError(f"contacts: {what}. Record a second pass, skin or board, or remove contacts from the scene.")
 
 
 def compare_prediction(
@@ -302,9 +303,9 @@ def residual(
     """Return how badly the predicted single contact explains each reading.
 
     A network predicts one contact (x_mm, y_mm, F_N) from a reading. The dB that such a contact would cause is
-    interpolated from `known` contacts, which are given as (x_mm, y_mm, F_N) and dB in uT. The contacts that are nearest
-    to the prediction in place and, if forces are known, in force are used. The result is the norm of the difference
-    between this dB and the reading, divided by the reading's |dB| plus noise.
+    interpolated from `known` contacts, which are given as (x_mm, y_mm, F_N) and dB in uT. The interpolation uses the
+    known contacts with the most similar place and, if forces are known, the most similar force. The result is the norm
+    of the difference between the interpolated dB and the reading, divided by the reading's |dB| plus noise.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 
@@ -346,7 +347,7 @@ HEIGHTS_N = 9  # number of heights in the table of displacements, which is inter
 def superposition(
     simulation: SimulationSettings, separations_mm: Sequence[float], *, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the rms error that is made if the field changes of two single contacts are added.
+    """Return the rms error of the assumption that the field changes of two single contacts can be added.
 
     The field change of two contacts is simulated, and compared with the sum of the field changes of the single
     contacts. The skin is the first skin of the scene. The result has one row for each depth and separation; the two
@@ -423,17 +424,21 @@ def _errors(changes_T: Float[np.ndarray, "p 4 k 3"]) -> dict[str, float]:
 # --- Tables and figures ---
 
 MEANING = (
-    "Two contacts at once are modelled as the sum of two changes of field that were recorded on one held-out skin, so "
-    "their noise is that of two readings. Networks trained on single contacts predict one place and one force (columns "
-    "`prediction` and `along the line`). Detected: the score of a detector is above its threshold. Thresholds are set "
-    "so that a given fraction of single contacts of training skins exceeds them; row `single contacts` gives the "
-    "percentage of the held-out boards' single contacts above them, the false alarms. The networks behind `residual` "
-    "and `networks disagree` were trained on the contacts that set the thresholds, so these two thresholds may be too "
-    "low. At 0 mm both pokes are at one place: this shows the effect of strength and noise alone. [low, high] is the "
-    "95 % confidence interval over held-out boards (Student's t). The paper gives no number (section 7: future work)."
+    "Two contacts at once are modelled as the sum of two field changes that were recorded on the same held-out skin, "
+    "so their noise is that of two readings. Networks that were trained on single contacts predict one place and one "
+    "force. The first two columns of results compare the predicted place with the two true places. Column `along the "
+    "line` is the position of the predicted place on the line from the weaker contact (0) to the stronger contact (1). "
+    "Detected: percentage of the double contacts for which the score of a detector is above its threshold. Thresholds "
+    "are set so that a given fraction of single contacts of training skins exceeds them. Row `single contacts` "
+    "contains the false alarms: the percentage of single contacts of the held-out boards that are above the "
+    "thresholds. The networks behind `residual` and `networks disagree` were trained on the contacts that set the "
+    "thresholds, so these two thresholds may be too low. At 0 mm, both pokes are at one place: this row shows the "
+    "effect of signal strength and noise alone. [low, high] is the 95 % confidence interval over held-out boards "
+    "(Student's t). The paper gives no number (section 7: future work)."
 )
 TWO_TIPS = (
-    "Two real tips cannot be closer than their width; smaller distances are possible only for sums of two readings."
+    "Two real tips cannot be closer than their width. Smaller distances are possible only because the field changes of "
+    "two separate pokes are added."
 )
 
 
@@ -475,7 +480,7 @@ def _draw_places(axes: Any, along: Mapping[str, Sequence[float]]) -> None:
     ends_mm = [separations_mm[0] - width_mm, separations_mm[-1] + width_mm]
     axes.plot(ends_mm, ends_mm, color=COLOURS[2], label="stronger contact")
     axes.plot(ends_mm, [0, 0], color=COLOURS[1], linestyle="--", label="weaker contact")
-    axes.set(xlabel="distance of the contacts / mm", ylabel="predicted place along their line / mm")
+    axes.set(xlabel="distance of the contacts / mm", ylabel="predicted place on the line between them / mm")
     axes.set_title("Predicted place (box: middle 50 %; whiskers: 90 %)", loc="left", fontsize=10)
     axes.set_ylim(top=1.45 * ends_mm[1])
     axes.legend(frameon=False, loc="upper left", fontsize=9)
@@ -494,20 +499,22 @@ def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
         )
         axes.axhline(alarm["realised"]["mean"], color=colour, linestyle=":", linewidth=1)
     axes.set(xlabel="distance of the contacts / mm", ylabel="detected as two contacts / %", ylim=(0, 100))
-    axes.set_title("Detected as two (dotted: false alarms;\nhollow: both at one place)", loc="left", fontsize=10)
+    axes.set_title(
+        "Detected as two contacts (dotted: false alarms;\nhollow: both contacts at one place)", loc="left", fontsize=10
+    )
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
 
 def _table_row(result: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, str]:
     row = {
         "distance of the contacts, mm": f"{result['separation_mm']:g}",
-        "prediction within 1 mm of either, %": show_digits(result["near_either_pct"], 1),
-        "distance to the nearer, mm": show_digits(result["nearest_mm"], 2),
+        "prediction within 1 mm of a contact, %": show_digits(result["near_either_pct"], 1),
+        "distance to the nearer contact, mm": show_digits(result["nearest_mm"], 2),
     }
     optional = {
         "along": "along the line (0 weaker, 1 stronger)",
-        "force_over_sum": "force / sum of both",
-        "force_over_larger": "force / larger of both",
+        "force_over_sum": "force / sum of both forces",
+        "force_over_larger": "force / larger of both forces",
     }
     row |= {title: show_digits(result[name], 2) for name, title in optional.items() if name in result}
     return row | {
@@ -518,18 +525,20 @@ def _table_row(result: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[st
 def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
     table = pd.DataFrame(
         {
-            "depth of both, mm": f"{row['depth_mm']:g}",
+            "depth of both contacts, mm": f"{row['depth_mm']:g}",
             "distance of the contacts, mm": f"{row['separation_mm']:g}",
             "error of the sum, % of the change of field": f"{row['error_pct']:.1f}",
-            "orders differ by, %": f"{row['orders_differ_pct']:.1f}",
+            "difference of the two orders, %": f"{row['orders_differ_pct']:.1f}",
             "pairs": row["pairs_n"],
             "source": source,
         }
         for row in rows
     )
     table.attrs["meaning"] = (
-        "Compares the sum of the changes of field of two single contacts with the change of field of both contacts on "
-        "one skin, where the second contact displaces material that the first has already displaced (mean of both "
-        "orders; rms over chips and pairs). Neglected: each contact also lowers the surface under the other tip."
+        "Compares two changes of field (rms over chips and pairs of contacts). One is the sum of the changes of field "
+        "of two single contacts. The other is the change of field if both contacts are on one skin, so that the second "
+        "contact displaces material that the first contact has already displaced. It depends on which contact is "
+        "first, so the mean of both orders is used, and column `difference of the two orders` states how much they "
+        "differ. Neglected effect: each contact also lowers the surface under the other tip."
     )
     return table

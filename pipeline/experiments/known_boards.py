@@ -19,7 +19,9 @@ def read_known_boards(settings: Settings, indentations: Path, folds: Path) -> Kn
     known = align_boards(data, section, read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(known.presses) < 2:
         what = "boards with known forces"
-        raise ParamsError(f"scene {settings.scene}", what, "two or more", len(known.presses), "Add one.")
+        raise ParamsError(
+            f"scene {settings.scene}", what, "two or more", len(known.presses), "Add recordings of another board."
+        )
     return known
 
 

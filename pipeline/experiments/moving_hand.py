@@ -55,11 +55,13 @@ Size_uT = Annotated[float, Field(ge=0, le=10_000)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 
-MOVING_COUNTS = 5  # a joint is at rest if the standard deviation of its positions is smaller, because it is then noise
+# If the standard deviation of a joint's positions is smaller than this, the joint is at rest, and the positions differ
+# only by noise.
+MOVING_COUNTS = 5
 TOUCH_STEP = 20  # a press has 100 nearly equal readings; only every twentieth reading of the boards is used as a touch
 NO_FIELD, TURNED, MAGNET = "none", "turned in the earth's field", "beside a moving magnet"
 OTHER, FIRST_HALF = "the other recording", "the first half"
-# Candidate distances of sources, and candidate sizes, of the fields that a pad experiences
+# Candidates for the distance of the source of a field change, and for the size of its field (see `find_source`).
 DISTANCES_MM = (30.0, 35.0, 40.0, 45.0, 50.0, 60.0, 70.0, 85.0, 100.0, 150.0, 300.0)
 SIZES_uT = (5.0, 7.0, 10.0, 14.0, 20.0, 30.0, 50.0, 70.0, 100.0, 140.0, 200.0, 280.0)
 
@@ -107,12 +109,12 @@ class MovingHand(Strict):
     @model_validator(mode="after")
     def _check(self) -> "MovingHand":
         if sorted(self.pad_chips) != list(range(leaphand.CHIPS_N)):
-            raise ValueError(f"pad_chips must contain each of 0 to {leaphand.CHIPS_N - 1} once")
+            raise ValueError(f"pad_chips must contain each number from 0 to {leaphand.CHIPS_N - 1} once")
         if self.magnet_mm[0] > self.magnet_mm[1]:
-            raise ValueError("magnet_mm must be the least distance, then the largest one")
+            raise ValueError("magnet_mm must contain the smallest distance, then the largest distance")
         names = [NO_FIELD, *(group.name for group in self.groups)]
         if len(set(names)) < len(names):
-            raise ValueError(f"groups must have different names, other than {NO_FIELD}")
+            raise ValueError(f"groups must have different names, and none may be called {NO_FIELD}")
         return self
 
 
@@ -141,7 +143,7 @@ Pair = tuple[Pad, Pad]  # a pad's rows for the threshold, and its tested rows
 
 
 def moving_hand(settings: Settings, section: MovingHand, raw: Path, indentations: Path, results: Path) -> None:
-    """Count false contacts, and score places, for recorded, superposed and simulated changes of external fields."""
+    """Count false contacts, and score places, in recorded, superposed and simulated changes of external fields."""
     seed = settings.seed
     captures = {one.capture: one for one in read_captures(indentations, tuple(settings.captures_in(indentations)))}
     policy = settings.shared_section(FaultPolicy, "faults")
@@ -155,10 +157,11 @@ def moving_hand(settings: Settings, section: MovingHand, raw: Path, indentations
     boards = read_boards(settings, section.presses, [one for name, one in captures.items() if name not in pads])
     touches_uT = np.concatenate([to_chips(board.readings.db_uT[::TOUCH_STEP]) for board in boards])
     contacts = [row for name, pairs in groups.items() for row in contact_rows(name, pairs, touches_uT, section, seed)]
-    say(f"{settings.scene} moving_hand: contacts of {len(pads)} recordings of pads and {len(boards)} boards done")
+    counts = f"{len(pads)} recordings of pads and {len(boards)} boards"
+    say(f"{settings.scene} moving_hand: counted contacts for {counts}")
     recorded_uT = {name: np.concatenate([tested.db_uT for _, tested in pairs]) for name, pairs in groups.items()}
     superposed = [row for board in boards for row in board_rows(board, recorded_uT, section, seed)]
-    say(f"{settings.scene} moving_hand: places of superpositions done")
+    say(f"{settings.scene} moving_hand: scored places in recorded field changes of the hand")
     skins = simulated_skins(setup, section.skins_n, seed, "moving hand")
     fields_uT = [draw_fields(skin, section, seed) for skin in skins]
     simulated = [
@@ -202,10 +205,11 @@ def pairs_of(group: Group, pads: Mapping[str, Pad]) -> list[Pair]:
     if missing:
         known = ", ".join(sorted(pads)) or "none"
         what = f"no capture {missing[0]} of layout leaphand in the scene (it has: {known})"
-        raise ParamsError(f"{where}: {what}. Add it, or correct the name.")
+        raise ParamsError(f"{where}: {what}. Add this capture to the scene, or correct its name in the group.")
     if len(group.threshold) != len(group.tested):
         what = f"{len(group.threshold)} captures in threshold, but {len(group.tested)} in tested"
-        raise ParamsError(f"{where}: {what}. List one of each for every pad, in the same order.")
+        remedy = "For every pad, list one capture in threshold and one in tested, in the same order of the pads."
+        raise ParamsError(f"{where}: {what}. {remedy}")
     return [(pads[first], pads[second]) for first, second in zip(group.threshold, group.tested, strict=True)]
 
 
@@ -252,7 +256,7 @@ def find_source(db_uT: Changes, noise_uT: float) -> tuple[float, float]:
 
 
 def contact_rows(group: str, pairs: Sequence[Pair], touches_uT: Changes, section: MovingHand, seed: int) -> list[Row]:
-    """Count the false contacts of a group of pads with every method, and the detected superpositions of touches."""
+    """Count false contacts of a group of pads, and detected superposed touches, with every method of compensation."""
     methods: list[tuple[Row, Sequence[Pair], tuple[float, ...]]] = [
         ({"method": "none", "trained_on": None}, pairs, section.external_uT)
     ]
@@ -286,7 +290,8 @@ def compensate(learner: str, trained_on: str, pair: Pair, boosting_iterations_n:
     known = pair[0] if trained_on == OTHER else tested[:half]
     moving = known.joint_counts.std(axis=0) > MOVING_COUNTS
     if not moving.any():
-        raise SchemaError("moving_hand: a recording in which no joint moves. Remove it from the groups of the scene.")
+        what = "in a recording, no joint moves, so field changes cannot be predicted from joint positions"
+        raise SchemaError(f"moving_hand: {what}. Remove the recording from moving_hand.groups of the scene.")
     if learner == "ridge":
         regression = make_pipeline(
             StandardScaler(), PolynomialFeatures(2), StandardScaler(), RidgeCV(np.logspace(-2, 4, 13))
@@ -350,7 +355,7 @@ def live_threshold(noise_uT: float, suppressor: Float[np.ndarray, "15 15"] | Non
 
 
 def draw_fields(skin: Skin, section: MovingHand, seed: int) -> dict[str, Changes]:
-    """Draw changes of each kind of external field, relative to the field when the no-load reading was taken."""
+    """Draw changes of each kind of external field, relative to the field at the time of the no-load reading."""
     rng = rng_for(seed, "moving hand", skin.name, "fields")
     n = section.changes_n
     return {
@@ -390,7 +395,11 @@ def _directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
 def simulated_contact_rows(
     skins: Sequence[Skin], fields_uT: Sequence[Mapping[str, Changes]], section: MovingHand, seed: int
 ) -> list[Row]:
-    """Count false contacts and detected presses on simulated skins; every second skin sets the threshold."""
+    """Count false contacts and detected presses on simulated skins.
+
+    They are counted with the threshold of `reskin live` on all skins, and with another threshold, which a fraction
+    `detected_fraction` of the presses exceeds. This threshold is set with every second skin and tested with the others.
+    """
     noise_uT = float(np.sqrt(np.mean(np.square(NOISE_uT))))
     sd_uT = np.tile(NOISE_uT, len(CHIPS_MM))
     rows = []
@@ -429,8 +438,8 @@ def board_rows(board: BoardPresses, fields_uT: Mapping[str, Changes], section: M
     """Score the estimated places of a board's presses, to which field changes of the moving hand are added.
 
     The model is calibrated without such field changes, to 65 unlabelled presses at random places. The board's places
-    are divided like the squares of a checkerboard: labels are at the places of one colour, and tests at the places of
-    the other colour.
+    are coloured like the squares of a checkerboard: labels are at the places of one colour, and tests are at the places
+    of the other colour.
     """
     skin = skin_of_board(board)
     readings_uT = to_chips(board.readings.db_uT)
@@ -504,42 +513,49 @@ def summarise_places(rows: Sequence[Row], unit: str) -> list[Row]:
 # --- Report ---
 
 OF_RECORDINGS = (
-    "Recorded on a hand that moves without contact. Change: length of the change of the 15 channels since the no-load "
-    "field. Source: the dipole that explains the changes best, among {distances_n} distances from {least:g} to "
-    "{most:g} mm; size: standard deviation of a component of its field. Changes that are hardly larger than the noise "
-    "say little about the distance."
+    "Recorded on a hand that moves without contact. Change: difference between a reading and the no-load field, as the "
+    "length over all 15 channels. Source: a dipole whose field would explain the changes best. Its distance from the "
+    "pad is one of {distances_n} candidates from {least:g} to {most:g} mm. Its size is the standard deviation of a "
+    "component of its field. If the changes are hardly larger than the noise, they say little about the distance."
 )
 OF_CONTACTS = (
-    "Recorded. False contacts: readings of the tested recordings, without contact, that are above a threshold: that of "
-    "`reskin live`, or that for {detected:g} % of touches (table moving_hand_detection). Compensation: a regression "
-    "predicts the change from the joint positions, and it is subtracted. The regression is trained on the pad's other "
-    "recording or on the first half of the tested one; then only the second half is tested."
+    "Recorded. False contacts: readings of the tested recordings whose change is above a threshold, although nothing "
+    "touches the pad. There are several thresholds: the threshold of `reskin live`, and the thresholds that "
+    "{detected:g} % of superposed touches exceed (table moving_hand_detection). Compensation: a regression predicts "
+    "the field change from the joint positions, and the prediction is subtracted from the reading. The regression is "
+    "trained on the other recording of the pad, or on the first half of the tested recording. In both cases, only the "
+    "second half of the tested recording is then tested."
 )
 OF_DETECTION = (
-    "Superposed: {touches_n} recorded readings of presses, times a factor, each plus a change recorded on the hand. "
-    "Threshold: {detected:g} % of the superpositions with changes of the rows for the threshold are above it. "
-    "Detected: superpositions with changes of the tested rows above this threshold, or above that of `reskin live`. "
-    "The rows for the threshold are the other recording or, with compensation, the first half of the tested one. "
-    "Superpositions contain the noise of both recordings, and no effect of a press on the hand."
+    "Superposed touches: the field change of each of {touches_n} recorded readings of presses is multiplied by a "
+    "factor, and a field change that was recorded on the moving hand is added. Threshold: {detected:g} % of the "
+    "superposed touches exceed it, with field changes of the hand from the recordings for thresholds. Detected: "
+    "percentage of the superposed touches that exceed this threshold, or the threshold of `reskin live`, with field "
+    "changes of the hand from the tested recordings. The recordings for thresholds are other recordings of the same "
+    "pads or, with compensation, the first halves of the tested recordings. Superposed touches contain the noise of "
+    "both recordings, but no effect of a press on the hand."
 )
 OF_SIMULATED = (
-    "Simulated: {skins_n} skins from the prior of the shipped model. Turned: a skin is turned from one random "
-    "orientation to others in a uniform field of {turned:g} uT. Magnet: a dipole moves from one random place to "
-    "others, {near:g} to {far:g} mm from the board's middle; a component of its field has a root mean square of "
-    "{magnet:g} uT at the least distance. "
+    "Simulated: {skins_n} skins from the prior of the shipped model. Turned in the earth's field: in a uniform field "
+    "of {turned:g} uT, a skin is turned from one random orientation to others. Moving magnet: a dipole moves from one "
+    "random position to others, {near:g} to {far:g} mm from the middle of the board. At the smallest distance, a "
+    "component of its field has a root mean square of {magnet:g} uT. "
 )
 OF_THRESHOLD = (
-    "The other threshold, for {detected:g} % of the presses, is set on every second skin and tested on the others; the "
-    "presses have all forces of the prior."
+    "The first two results are for the threshold of `reskin live`. The other threshold is the one that {detected:g} % "
+    "of the presses exceed. It is set with every second skin, and tested with the other skins. The presses have all "
+    "forces of the prior."
 )
 OF_PLACES = (
-    "Superposed: recorded presses of {boards_n} boards, plus changes of the tested recordings of the hand. "
-    "The model is calibrated at rest to {presses_n} presses at random places; labels and tests are on different "
-    "colours of a checkerboard. Means over {draws_n} draws, then over boards; (a; b) are the values of the boards."
+    "Superposed: a field change that was recorded on the moving hand (in the tested recordings) is added to each "
+    "tested press of {boards_n} recorded boards. With external field `none`, nothing is added. The model is calibrated "
+    "without such field changes, to {presses_n} presses at random places. The places are coloured like the squares of "
+    "a checkerboard: labels are at places of one colour, and tests are at places of the other colour. Means over "
+    "{draws_n} random draws, then over boards; (a; b) are the values of the boards."
 )
 OF_SIMULATED_PLACES = (
-    "The model is calibrated at rest to {presses_n} presses at random places, the first of which are its labels; other "
-    "presses are tested. ±: standard deviation over skins."
+    "The model is calibrated without external fields, to {presses_n} presses at random places. The labels are the "
+    "first of these presses. Other presses are tested. ±: standard deviation over skins."
 )
 METHODS = {
     "none": "none", "ridge": "ridge regression, trained on {trained_on}",
@@ -615,8 +631,8 @@ def _simulated_line(row: Mapping[str, Any]) -> Row:
         "external field": row["field"], "external_uT": f"{row['external_uT']:g}", "readings": row["readings_n"],
         "false contacts per 100 readings": round(row["live_false_pct"], 1),
         "detected, %": round(row["live_detected_pct"], 1), "other threshold, uT": round(row["threshold_uT"]),
-        "with it: false contacts per 100": round(row["false_pct"], 1),
-        "with it: detected, %": round(row["detected_pct"], 1), "source": SIMULATED,
+        "other threshold: false contacts per 100": round(row["false_pct"], 1),
+        "other threshold: detected, %": round(row["detected_pct"], 1), "source": SIMULATED,
     }  # fmt: skip
 
 

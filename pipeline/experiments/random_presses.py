@@ -51,10 +51,12 @@ from reskin.universal.model import (
 
 SPACING_MM = 2.0  # a press belongs to the nearest place of a grid with this spacing
 MIDDLE_MM = 1.0  # a press is in the middle of the skin if |x| and |y| are below this
-# The two ways to divide the places into a part for labels and a part for tests. The places are either coloured like the
-# squares of a checkerboard, and labels are at places of one colour, or labels are on one half of the skin. Each name
-# says where the tested presses are.
-CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
+# The two ways to divide the places into a part for labels and a part for tests. Either the places are coloured like the
+# squares of a checkerboard, labels are at places of one colour, and tests are at places of the other colour. Or labels
+# are on one half of the skin, and tests are on the other half. Each name says where the tested presses are.
+CHECKERBOARD, HALVES = "places without labels (checkerboard)", "half of the skin without labels"
+# Names of the random streams. They are earlier names of the two ways, which are kept so that results do not change.
+STREAMS = {CHECKERBOARD: "other colour of a checkerboard", HALVES: "other half of the skin"}
 WEIGHT = "weight"
 NEAREST = "nearest label"
 
@@ -128,7 +130,7 @@ def random_presses(
         presses = board_presses(known, board)
         for draw_i in range(section.draws_n):
             rows += score_draw(presses, variants, powers, section, settings.seed, draw_i)
-        say(f"{settings.scene} random_presses: board {board} done")
+        say(f"{settings.scene} random_presses: scored board {board}")
     write_results(results, {"rows": summarise_rows(rows), "draws_n": section.draws_n}, {})
 
 
@@ -157,20 +159,20 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
     The tested presses are all other presses in the part of the skin without labels, except those in the middle. Raises
     SchemaError if no press is in the middle of the skin, or if no press is left for labels or for tests.
     """
-    rng = rng_for(seed, "random presses", split, presses_n, draw_i)
+    rng = rng_for(seed, "random presses", STREAMS[split], presses_n, draw_i)
     n, middle = len(board.presses), np.flatnonzero(board.middle)
     if not len(middle):
         raise SchemaError(
             f"random_presses: board {board.board} has no press within {MIDDLE_MM:g} mm of the middle. "
-            "Remove the experiment from the scene."
+            "Remove random_presses from the scene."
         )
     unlabelled, weight = rng.permutation(n)[:presses_n], rng.choice(middle, 1)
     part = board.part(split, draw_i)
     tested = (part == -1) & ~board.middle & ~np.isin(np.arange(n), [*unlabelled, *weight])
     if not tested.any() or not (part == 1).any():
         raise SchemaError(
-            f"random_presses: board {board.board} has too few presses ({n}) to be split by {split}. "
-            "Remove the experiment from the scene."
+            f"random_presses: board {board.board} has too few presses ({n}): none is left for labels or for tests. "
+            "Remove random_presses from the scene."
         )
     return Draw(unlabelled, rng.permutation(np.flatnonzero(part == 1)), weight, np.flatnonzero(tested[board.press_i]))
 
@@ -178,7 +180,11 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
 def score_draw(
     board: BoardPresses, variants: Variants, powers: LikelihoodPowers, section: RandomPresses, seed: int, draw_i: int
 ) -> list[dict[str, Any]]:
-    """Score both variants and the reference methods on one draw of each split and number of presses."""
+    """Score two variants of the universal model, and the reference method, for each split and number of presses.
+
+    One variant is trained on simulated skins alone, and the other is also trained on the other boards of the rig. For
+    each split and each number of unlabelled presses, one random selection of presses is used.
+    """
     rows = []
     most_n = max(section.presses_n)
     for split in (CHECKERBOARD, HALVES):
@@ -205,7 +211,7 @@ def label_sets(board: BoardPresses, draw: Draw, labels_n: Sequence[int]) -> list
     """
     if max(labels_n, default=0) > len(draw.labels):
         what = f"board {board.board} has {len(draw.labels)} presses for labels, but labels_n asks for {max(labels_n)}"
-        raise SchemaError(f"random_presses: {what}. Correct labels_n in the scene.")
+        raise SchemaError(f"random_presses: {what}. Reduce random_presses.labels_n in the scene.")
     sets = []
     for n in labels_n:
         sets.append((raise_forces(board.presses[draw.labels[:n]]), str(n)))
@@ -362,19 +368,23 @@ def summarise_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 TITLES = {
     "accuracy_pct": "within 1 mm, %", "median_mm": "median error, mm", "mse_xy_mm2": "MSE_xy, mm²", "r2_f": "R² of F",
     "mse_f_N2": "MSE_F, N²", "median_error_N": "median error of force, N",
-    "coverage_pct": "place in 90 % interval, %", "half_width_mm": "half-width, mm",
+    "coverage_pct": "place in 90 % interval, %", "half_width_mm": "half-width of the interval, mm",
     "interval_score_mm": "interval score, mm", "coverage_f_pct": "force in 90 % interval, %",
-    "half_width_f_factor": "half-width of force, factor", "r2_line_f": "R² of F, line",
-    "r2_raw_f": "R² of F, uncalibrated",
+    "half_width_f_factor": "half-width of the force's interval, factor", "r2_line_f": "R² of F, always with line",
+    "r2_raw_f": "R² of F, without line",
 }  # fmt: skip
 MEANING = (
-    "Means over {draws_n} draws of presses and labels, then over boards; (a; b) are the values of the boards. The "
-    "model is calibrated to unlabelled presses at random places and forces. Labels are drawn from one part of the "
-    "places. The tested presses are in the other part and were not used for the calibration; choices that were made on "
-    "these boards are listed in docs/learning.md. Label `weight`: one press with a known force in the middle of the "
-    "skin, where no press is tested. Forces: estimator and line are selected by cross-validation over the labels. "
-    "`line` always calibrates the combined force of map and networks; for `nearest label`, it is the mean force of the "
-    "labels."
+    "Each number is the mean over {draws_n} random draws of presses and labels, then over boards; (a; b) are the "
+    "values of the boards. The model is calibrated to unlabelled presses at random places and forces. The places of a "
+    "board are divided into two parts: either they are coloured like the squares of a checkerboard, and each colour is "
+    "one part, or each half of the skin is one part. Labels are drawn from one part. The tested presses are in the "
+    "other part, and were not used for the calibration. Choices that were made on these boards are listed in "
+    "docs/learning.md. Label `weight`: the only label is one press with a known force in the middle of the skin, where "
+    "no press is tested. The model estimates the force with a map of simulated fields and with networks, and corrects "
+    "this force with a calibration line, which is fitted to the labels. Cross-validation over the labels selects how "
+    "the force is corrected. Two columns show R² for fixed choices: for `always with line`, a line corrects the "
+    "combined force of map and networks; for `without line`, this combined force is not corrected. In rows `nearest "
+    "label`, `always with line` is the R² of a constant, which is the mean force of the labels."
 )
 
 
@@ -382,7 +392,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores for each split, number of presses, method and number of labels."""
     lines = []
     for row in numbers["rows"]:
-        line = {"tested places": row["tested"], "presses": row["presses_n"]}
+        line = {"tested places": row["tested"], "unlabelled presses": row["presses_n"]}
         line |= {name: row[name] for name in ("method", "labels")}
         scores = {title: show(row[name]) if name in row else "–" for name, title in TITLES.items()}
         lines.append(line | scores | {"source": source})

@@ -1,8 +1,8 @@
 """Three limits of the recorded boards: rigid registration, shear force, and the smallest detected force.
 
-- *Registration*: a model that was trained on another board estimates places on this board. A few presses at known
-  places determine a rotation and a shift that correct these estimates, as in the procedure published for skins that are
-  mounted again. The corrected estimates are scored on other presses of the same board.
+- *Registration*: a model that was trained on one board estimates places on another board. A few presses at known
+  places on this other board determine a rotation and a shift that correct the estimates. This is the procedure that was
+  published for skins that are mounted again. The corrected estimates are scored on other presses of the same board.
 - *Shear*: how much of the recorded sideways force can be estimated from the field.
 - *Detection*: the smallest field change, and the smallest force, that can be distinguished from no-load readings
   (readings without contact).
@@ -97,17 +97,17 @@ def recorded_limits(
     policy = settings.shared_section(FaultPolicy, "faults")
     recordings = [read_recording(readings, raw / readings.capture, policy) for readings in captures]
     detection, drawn = evaluate_detection(recordings, section)
-    say(f"{settings.scene} recorded_limits: detection done")
+    say(f"{settings.scene} recorded_limits: computed the thresholds of detection")
     rows = gather(captures, settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     shear = evaluate_shear(rows, section, settings.seed)
-    say(f"{settings.scene} recorded_limits: shear done")
+    say(f"{settings.scene} recorded_limits: scored the estimates of shear force")
     variants = read_variants(known, models)
     scores: list[dict[str, Any]] = []
     for board in known.presses:
         regressors = predict_by_regressors(known, board, section.methods, networks)
         for draw_i in range(section.draws_n):
             scores += score_draw(board_presses(known, board), regressors, variants, section, settings.seed, draw_i)
-        say(f"{settings.scene} recorded_limits: registration of {board} done")
+        say(f"{settings.scene} recorded_limits: scored the registration of board {board}")
     settings_used = {
         name: getattr(section, name)
         for name in ("known_n", "presses_n", "draws_n", "folds_n", "false_alarm_fraction", "detected_fraction")
@@ -131,7 +131,7 @@ def number_places(place_mm: Float[np.ndarray, "m 2"]) -> Int64[np.ndarray, " m"]
 # used.
 CANDIDATES_N = 100
 # Names of the ways in which the presses at known places are used.
-UNCHANGED, SHIFT, RIGID, LABELS = "not used", "shift only", "rigid registration", "labels of the model"
+UNCHANGED, SHIFT, RIGID, LABELS = "not used", "shift only", "rigid registration", "as labels of the model"
 NETWORK = "network of the paper, other board"
 
 
@@ -192,8 +192,9 @@ def draw_presses(board: BoardPresses, section: RecordedLimits, seed: int, draw_i
     place_i = number_places(board.presses.place_mm)
     places_n, n = int(place_i.max()) + 1, len(board.presses)
     if places_n <= section.known_n or n <= section.presses_n:
-        what = f"board {board.board} has {n} presses at {places_n} places"
-        raise SchemaError(f"recorded_limits: {what}. Reduce known_n or presses_n in the scene.")
+        needed = f"more than {section.presses_n} presses at more than {section.known_n} places are needed"
+        what = f"board {board.board} has {n} presses at {places_n} places, but {needed}"
+        raise SchemaError(f"recorded_limits: {what}. Reduce presses_n or known_n of recorded_limits in the scene.")
     place_mm = mean_by(place_i, board.presses.place_mm)
     candidates = [rng.permutation(places_n)[: section.known_n] for _ in range(CANDIDATES_N)]
     chosen = max(candidates, key=lambda places: float(pdist(place_mm[places]).min()))
@@ -267,8 +268,8 @@ def score_universal(
 ) -> list[dict[str, Any]]:
     """Score the universal model in four ways of using the presses at known places.
 
-    The presses are not used, or a shift or a rigid motion of the estimated places is fitted to them, or the model is
-    conditioned on them as labels.
+    The four ways are: the presses are not used; a shift of the estimated places is fitted to them; a rotation and a
+    shift of the estimated places are fitted to them; and the model is conditioned on them as labels.
     """
     true_mm, tested_uT = board.readings.place_mm[draw.tested], board.readings.db_uT[draw.tested]
     known, presses_uT = raise_forces(board.presses[draw.known]), board.presses.db_uT[unlabelled]
@@ -368,7 +369,9 @@ def force_presses(rows: Rows) -> ForcePresses:
     unknown.
     """
     if np.isnan(rows.target).any():
-        raise SchemaError("recorded_limits: readings without Fx, Fy or Fz. Remove the experiment from the scene.")
+        raise SchemaError(
+            "recorded_limits: there are readings without Fx, Fy or Fz. Remove recorded_limits from the scene."
+        )
     _, first, press_i = np.unique(rows.indentation, return_index=True, return_inverse=True)
     target = mean_by(press_i, rows.target)
     sd_N = np.sqrt(mean_by(press_i, (rows.target - target[press_i])[:, 2:] ** 2))
@@ -406,7 +409,10 @@ def shear_regressors(methods: Mapping[str, Classical]) -> list[tuple[str, Classi
 
 
 def describe_forces(presses: ForcePresses, capture: str) -> dict[str, Any]:
-    """Describe the forces of one recording: mean and standard deviation of each component, and sideways / normal."""
+    """Describe the forces of one recording.
+
+    Returns the mean and the standard deviation of each component, and the ratio of sideways force to normal force.
+    """
     own = presses.capture == capture
     force_N, sd_N = presses.force_N[own], presses.sd_N[own]
     ratio = np.hypot(force_N[:, 0], force_N[:, 1]) / force_N[:, 2]
@@ -422,7 +428,10 @@ def describe_forces(presses: ForcePresses, capture: str) -> dict[str, Any]:
 def split_places(
     presses: ForcePresses, own: Int64[np.ndarray, " a"], folds_n: int, seed: int
 ) -> list[tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " c"]]]:
-    """Split the presses of a board for cross-validation; all presses at one place are in the same fold."""
+    """Split the presses of a board for cross-validation.
+
+    All presses at one place are in the same fold. Returns the indices of the training and test presses of each fold.
+    """
     place_i = number_places(presses.place_mm[own])
     fold_of_place = rng_for(seed, "recorded limits", "places").permutation(int(place_i.max()) + 1) % folds_n
     fold = fold_of_place[place_i]
@@ -525,8 +534,9 @@ def read_recording(readings: Readings, raw: Path, policy: FaultPolicy) -> Record
     """
     header = read_header(raw)
     if header.layout != "lab":
-        what = f"capture {readings.capture}: layout {header.layout} has no single no-load readings"
-        raise SchemaError(f"recorded_limits: {what}. Remove the experiment from the scene.")
+        needed = "only layout lab contains individual no-load readings"
+        what = f"capture {readings.capture} has layout {header.layout}, but {needed}"
+        raise SchemaError(f"recorded_limits: {what}. Remove recorded_limits from the scene.")
     press_i, noload_uT = lab.read_noload(raw, header, policy)
     place_mm = np.column_stack([readings.x_mm, readings.y_mm]).astype(float)
     return Recording(
@@ -638,7 +648,8 @@ def fit_power_law(
     mean = mean_by(place_i, logs)
     log_N, log_uT = (logs - mean[place_i]).T
     if not (log_N**2).sum() > 0:
-        raise SchemaError("recorded_limits: no place has presses with different forces. Remove the experiment.")
+        what = "no place has presses with different forces, so no power law can be fitted"
+        raise SchemaError(f"recorded_limits: {what}. Remove recorded_limits from the scene.")
     exponent = float(log_N @ log_uT / (log_N @ log_N))
     r2 = 1 - float(((log_uT - exponent * log_N) ** 2).sum() / (log_uT**2).sum())
     return PowerLaw(exponent, np.exp(mean[:, 1] - exponent * mean[:, 0]), r2)
@@ -733,10 +744,11 @@ def contact_presses(recordings: Sequence[Recording]) -> ContactPresses:
 def evaluate_threshold(
     parts: Changes, threshold_uT: float, presses: ContactPresses, law: PowerLaw, fraction: float
 ) -> dict[str, float]:
-    """Evaluate one threshold: percentages of false alarms and of detected readings, and the least detected force.
+    """Evaluate one threshold: percentages of false alarms and of detected readings, and the smallest detected force.
 
-    The field change and the forces that are needed to exceed the threshold are quantiles over all pairs of a recorded
-    press and a no-load reading, with equal weights. Results that do not exist (NaN) are left out.
+    Also returns the field change and the forces that are needed to exceed the threshold. They depend on the direction
+    of the field change and on the noise, so they are computed for every pair of a recorded press and a no-load reading.
+    The returned values suffice for a fraction `fraction` of the pairs. Results that do not exist (NaN) are left out.
     """
     needed_uT = needed_changes_uT(presses.direction, parts.verifying, threshold_uT)
     detected = np.asarray(magnitude(parts.contact) > threshold_uT)
@@ -768,7 +780,10 @@ def smallest_force_N(force_N: Float[np.ndarray, " f"], detected: Bool[np.ndarray
 
 
 def detected_by_force(by_baseline: Mapping[str, Changes], limits_uT: Mapping[str, float]) -> Iterator[dict[str, Any]]:
-    """Yield the percentage of detected readings in each range of the force; each range ends at twice its lower end."""
+    """Yield the percentage of detected readings in each range of the force.
+
+    The upper end of each range is twice its lower end. `limits_uT` contains the threshold for each baseline.
+    """
     least_N = min(float(parts.force_N[parts.force_N > 0].min()) for parts in by_baseline.values())
     most_N = max(float(parts.force_N.max()) for parts in by_baseline.values())
     for power in range(int(np.floor(np.log2(least_N))), int(np.floor(np.log2(most_N))) + 1):
@@ -795,59 +810,73 @@ def in_range(force_N: Float[np.ndarray, " f"], low_N: float, high_N: float) -> B
 # --- Report ---
 
 REGISTRATION_TITLES = {
-    "accuracy_pct": "within 1 mm, %", "sd_draws_pct": "sd over draws, %",
+    "accuracy_pct": "within 1 mm, %", "sd_draws_pct": "standard deviation over draws, %",
     "median_mm": "median error, mm", "mse_xy_mm2": "MSE_xy, mm²",
     "rigid_limit_mm2": "least MSE_xy of a rigid motion, mm²", "angle_deg": "rotation, °", "shift_mm": "shift, mm",
 }  # fmt: skip
 REGISTRATION_MEANING = (
-    "Means over {draws_n} draws (seed {seed}), then over boards; (a; b) are the values of the boards. Each draw "
-    "selects {known_n} presses at known places that are far from each other, and {presses_n} unlabelled presses. All "
-    "rows are tested on the same readings: those of presses that are neither unlabelled nor at one of the known "
-    "places. Rigid registration: the least-squares rotation and shift, without reflection, from the estimated to the "
-    "known places of the {known_n} presses. Shift only: the mean difference of these places. Labels: the universal "
-    "model is conditioned on the {known_n} presses, with their forces. Least MSE_xy of a rigid motion: of one that is "
-    "fitted to the tested readings themselves (a diagnostic, not a result). Rotation and shift (at the middle of the "
-    "skin): mean sizes. sd over draws: standard deviation of the percentage within 1 mm."
+    "Each number is the mean over {draws_n} random draws (seed {seed}), then over boards; (a; b) are the values of the "
+    "boards. Each draw selects {known_n} presses at known places that are far from each other, and {presses_n} "
+    "unlabelled presses. All rows are tested on the same readings: readings of presses that are not among the "
+    "unlabelled presses of the draw, and not at one of its known places. Column `known places` states how the presses "
+    "at known places are used. Rigid registration: all estimated places are rotated and shifted, without reflection. "
+    "Rotation and shift are fitted by least squares, so that the estimated places of the {known_n} presses agree best "
+    "with their known places. Shift only: all estimated places are shifted by the mean difference between the known "
+    "and the estimated places of the {known_n} presses. As labels of the model: the universal model is conditioned on "
+    "the {known_n} presses, with their forces. Least MSE_xy of a rigid motion: the error after the rotation and the "
+    "shift that are fitted to the tested readings themselves. No rigid registration can have a smaller error, so this "
+    "is a limit and not a result. Rotation, shift: mean absolute angle of the rotation, and mean length of the shift "
+    "of the skin's middle. Standard deviation over draws: of the percentage within 1 mm."
 )
 FORCES_MEANING = (
-    "Mean ± standard deviation over the presses of a recording; in brackets, the standard deviation of the readings "
-    "within a press. Fx and Fy act along the axes of the labels. A recording has all presses of a board at one depth. "
-    "Last column: sideways force divided by normal force, median over presses (maximum)."
+    "Each cell contains the mean ± standard deviation over the presses of a recording. In brackets is the standard "
+    "deviation of the readings within a press. Fx and Fy act along the axes of the labels. A recording contains all "
+    "presses of a board at one depth. The last column is the sideways force divided by the normal force: the median "
+    "over presses and, in brackets, the maximum."
 )
 SHEAR_MEANING = (
-    "R² over the presses of a board: 1 is perfect, 0 is the mean of the tested presses, and below 0 is worse. (a; b) "
-    "are the values of the boards. Other places of the same board: cross-validation with {folds_n} folds; all presses "
-    "at one place are in the same fold. Within recordings: after subtraction of each recording's mean from true forces "
-    "and errors, so that presses are compared only with presses at the same depth. Input `true place and normal force` "
-    "uses no field: it shows how much of the sideways force follows from where and how hard the rig presses. Only a "
-    "better estimate from the field would show that the field contains information about shear."
+    "R² over the presses of a board: 1 is a perfect estimate, 0 is as good as the mean force of the tested presses, "
+    "and negative values are worse than this mean. (a; b) are the values of the boards. Trained on other places of the "
+    "same board: cross-validation with {folds_n} folds, in which all presses at one place are in the same fold. R² "
+    "within recordings: before R² is computed, the mean of each recording is subtracted from the true forces and from "
+    "the errors, so that presses are compared only with presses at the same depth. Input `true place and normal force` "
+    "uses no field: it shows how much of the sideways force follows from where and how hard the rig presses. An "
+    "estimate from the field shows that the field contains information about shear only if it is better than the "
+    "estimate from this input."
 )
 DETECTION_MEANING = (
-    "A reading is detected if its field change |dB|, over all channels, is above the threshold. Baseline: the no-load "
-    "reading that is subtracted; the earlier it was taken, the larger the drift. Set by false alarms: "
-    "{false_alarm_pct:g} % of the no-load readings of presses with odd numbers are above the threshold. As in `reskin "
-    "live`: median + {sds:g} times the noise of these readings, relative to the no-load reading of their own press. "
-    "False alarms: percentage of the no-load readings of the other presses; readings of a press have the same drift, "
-    "so rates near {false_alarm_pct:g} % are uncertain. Smallest force: the smallest recorded force from which on "
-    "{detected_pct:g} % of readings are detected, in every range from a force to twice this force; ≤ marks the "
-    "smallest force of the board. Needed field change: detected in {detected_pct:g} % of readings, with the recorded "
-    "noise and drift, in the directions of the recorded field changes. Force: causes the needed field change in "
-    "{detected_pct:g} % of readings, either by the power law |dB| = a F^b (table `limits_law`), or if the field change "
-    "of a place is proportional to the force below its weakest press. Extrapolated forces are not measured. The power "
-    "law cannot hold down to such small forces, because its slope at 0 N is infinite; forces extrapolated by it are "
-    "too small. – : not shown, because more than {alarm_max_pct:g} % of the readings are false alarms."
+    "A reading is detected if the size |dB| of its field change, over all channels, is above the threshold. Baseline: "
+    "the no-load reading (reading without contact) that is subtracted. The earlier the baseline was taken, the larger "
+    "is the drift since then. Threshold `set by false alarms`: {false_alarm_pct:g} % of the no-load readings before "
+    "presses with odd numbers are above this threshold. Threshold `as in reskin live`: the median of |dB| of these "
+    "no-load readings plus {sds:g} times their noise, both relative to the other no-load readings before the same "
+    "press. False alarms: percentage of the no-load readings before presses with even numbers that are above the "
+    "threshold; column `no-load readings` is their number. All no-load readings before one press have the same drift, "
+    "so percentages near {false_alarm_pct:g} % are uncertain. Smallest force: the smallest recorded force at and above "
+    "which {detected_pct:g} % of the readings are detected, counted in every range from a force to twice this force; ≤ "
+    "marks the smallest recorded force of the board. Needed field change: detected in {detected_pct:g} % of the cases "
+    "if it has the direction of a recorded field change, and the noise and drift of a recorded no-load reading are "
+    "added. Last two columns: the force that is large enough for detection in {detected_pct:g} % of the cases. The "
+    "power law is |dB| = a F^b (table `limits_law`). The proportional law assumes that, below the weakest press at a "
+    "place, the field change is proportional to the force. Extrapolated forces are not measured. The power law cannot "
+    "hold down to such small forces, because its slope at 0 N is infinite. Forces that are extrapolated by the power "
+    "law are therefore too small. –: not shown, because more than {alarm_max_pct:g} % of the no-load readings cause "
+    "false alarms."
 )
 BY_FORCE_MEANING = (
-    "Percentage of detected readings in ranges of the force, with the thresholds that are set by false alarms. Field "
-    "changes are relative to the no-load reading before each press."
+    "Percentage of the readings in contact that are detected, in ranges of the force. The thresholds are those that "
+    "are `set by false alarms` in table `limits_detection`. The median and the smallest field change are relative to "
+    "the no-load reading before each press."
 )
 LAW_MEANING = (
-    "Power law |dB| = a F^b with one exponent b per board and one factor a per place, fitted to the means of the "
-    "presses. R²: explained variance of log |dB| between the presses of a place."
+    "The power law |dB| = a F^b has one exponent b for each board and one factor a for each place. It is fitted to the "
+    "means of the presses. R²: fraction of the variance of log |dB| among the presses at one place that the power law "
+    "explains."
 )
-IMPLIED = {"power_law_N": "force by power law, N", "proportional_N": "force in proportion, N"}
+# Forces that are large enough for detection, according to two laws of the field change against the force.
+IMPLIED = {"power_law_N": "force by power law, N", "proportional_N": "force by proportional law, N"}
 # A table shows the smallest forces only if the fraction of false alarms is at most this multiple of the intended
-# fraction.
+# fraction of false alarms, which the settings state.
 ALARMS_MAX = 10
 
 
@@ -894,7 +923,7 @@ def force_line(line: Mapping[str, Any]) -> dict[str, Any]:
     for name in FORCES:
         force = line[name]
         cells[f"{name}, N"] = f"{force['mean_N']:.3f} ± {force['sd_N']:.3f} ({force['sd_in_press_N']:.4f})"
-    return cells | {"sideways / normal": f"{line['ratio_median']:.2f} ({line['ratio_max']:.2f})"}
+    return cells | {"sideways / normal force": f"{line['ratio_median']:.2f} ({line['ratio_max']:.2f})"}
 
 
 def shear_line(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -914,7 +943,7 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
     for row in detection["rows"]:
         cells = {"board": row["board"], "baseline": row["baseline"], "rule for the threshold": row["rule"]}
         cells |= {"threshold, µT": f"{row['threshold_uT']:.3g}", "false alarms, %": f"{row['false_alarm_pct']:.3g}"}
-        cells |= {"of readings": row["verified_n"], "detected, %": f"{row['detected_pct']:.4g}"}
+        cells |= {"no-load readings": row["verified_n"], "detected, %": f"{row['detected_pct']:.4g}"}
         known = row if row["false_alarm_pct"] <= alarm_max_pct else {}
         cells["smallest force, N"] = show_force(known.get("smallest_N"), least_N[row["board"]], "≤ {}")
         cells["needed field change, µT"] = f"{known['needed_uT']:.3g}" if known else "–"
@@ -929,7 +958,7 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
         {
             "board": line["board"], "force, N": f"{line['low_N']:g} to {line['high_N']:g}",
             "readings": line["readings_n"], "median field change, µT": f"{line['median_uT']:.0f}",
-            "least field change, µT": f"{line['least_uT']:.0f}",
+            "smallest field change, µT": f"{line['least_uT']:.0f}",
         }
         | {f"detected, %, baseline {name}": f"{pct:.4g}" for name, pct in line["detected_pct"].items()}
         | {"source": source}
@@ -952,9 +981,10 @@ def tabulate_detection(numbers: Mapping[str, Any], source: str) -> dict[str, pd.
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Plot the field change of each press against the force, with the thresholds and two extrapolations.
+    """Plot the field change of each press against the force, with the thresholds of detection.
 
-    Both extrapolate to weaker forces: one by the power law, the other by assuming proportionality to the force.
+    Two lines extrapolate the field change to forces that are weaker than those of all presses. One line extrapolates by
+    the power law. The other line assumes that the field change is proportional to the force.
     """
     with drawing(3.8 * len(drawn), 4.4) as figure:
         panels = figure.subplots(1, len(drawn), sharey=True, squeeze=False)[0]
@@ -964,12 +994,11 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             recorded_N = np.array([force_N.min(), force_N.max()])
             smaller_N = np.array([FIGURE_MIN_N, force_N.min()])
             law = of_board["factor_uT"], of_board["exponent"]
-            axes.plot(recorded_N, law[0] * recorded_N ** law[1], color=COLOURS[0], label="power law, median place")
+            axes.plot(recorded_N, law[0] * recorded_N ** law[1], color=COLOURS[0], label="power law, median of places")
             axes.plot(smaller_N, law[0] * smaller_N ** law[1], ":", color=COLOURS[0], label="power law, extrapolated")
             weakest_uT = law[0] * force_N.min() ** law[1]
-            axes.plot(
-                smaller_N, weakest_uT * smaller_N / force_N.min(), "--", color="0.5", label="extrapolated in proportion"
-            )
+            proportional_uT = weakest_uT * smaller_N / force_N.min()
+            axes.plot(smaller_N, proportional_uT, "--", color="0.5", label="proportional law, extrapolated")
             for colour, (name, threshold_uT) in zip(COLOURS[2:], of_board["threshold_uT"].items(), strict=False):
                 axes.axhline(threshold_uT, color=colour, linewidth=1, label=f"threshold, baseline {name}")
             axes.set(xscale="log", yscale="log", xlabel="force / N", title=board)

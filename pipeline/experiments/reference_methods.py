@@ -111,14 +111,14 @@ def reference_methods(
         points, trainings = points + adversarial_points, trainings + records
         paired_uT = pairs_uT(data.rows, fold.train, pool_rows(data, fold)[: max(section.labels_n)])
         unpaired_n += int(np.isnan(paired_uT).any(axis=1).sum())
-        say(f"{data.scene} reference_methods: methods with aligned inputs on {fold.name} done")
+        say(f"{data.scene} reference_methods: scored the methods with aligned inputs on {fold.name}")
 
     variants = read_variants(known, models)
     seconds: list[Seconds] = []
     for fold in of_labels:
         unlabelled_points, fold_seconds = score_unlabelled(known, of_labels, fold, variants)
         points, seconds = points + unlabelled_points, seconds + fold_seconds
-        say(f"{settings.scene} reference_methods: methods with unlabelled pokes on {fold.name} done")
+        say(f"{settings.scene} reference_methods: scored the methods with unlabelled pokes on {fold.name}")
 
     alarm, flagged = evaluate_alarm(known, of_labels, section.false_alarm_fraction)
     numbers: dict[str, Any] = {
@@ -181,11 +181,11 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
 
 # --- Models of known boards with aligned inputs ---
 
-EVERY_N = 10  # a labelled poke's readings differ only by noise, so only every tenth of them becomes a training row
-SAME_MM = 0.5  # pokes closer to each other than this are at one place
+EVERY_N = 10  # the readings of a labelled poke differ only by noise, so only every tenth becomes a training row
+SAME_MM = 0.5  # pokes that are closer to each other than this count as pokes at the same place
 ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
-ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without it"
+ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without adversarial loss"
 
 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
@@ -230,8 +230,8 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     paired = np.isfinite(old_uT).all(axis=1)
     if not paired.any():
-        what = f"no labelled poke is within {SAME_MM} mm of one on the known boards"
-        remedy = "Record known boards at the same places, or remove the experiment from the scene."
+        what = f"no labelled poke is within {SAME_MM} mm of a poke on the known boards"
+        remedy = "Record the known boards at the same places, or remove reference_methods from the scene."
         raise ParamsError(f"fold {fold.name}: {what}. {remedy}")
     length_uT = np.linalg.norm(new_uT[paired], axis=1, keepdims=True)
     new, old = new_uT[paired] / length_uT, old_uT[paired] / length_uT
@@ -302,7 +302,9 @@ def score_adversarial(
 def train_until_converged(
     domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train a network; while it collapses, repeat with other random draws, up to `MAX_ATTEMPTS_N` times.
+    """Train a network, with at most `MAX_ATTEMPTS_N` attempts.
+
+    If a network collapses (it then predicts hardly more than a constant), it is trained again with other random draws.
 
     The draws do not depend on the adversarial `weight`, so that a network and its control differ only in this weight.
     """
@@ -347,7 +349,7 @@ class Seconds:
     one_reading_s: float
 
 
-Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Seconds]  # method, places, forces
+Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Seconds]  # method, places, forces, times
 
 
 def score_unlabelled(
@@ -429,17 +431,17 @@ def unlabelled_controls() -> dict[Key, Key]:
 # --- Alarms ---
 
 TESTED_EVERY_N = 10  # alarms are evaluated on every tenth test reading
-OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
+OF_RIGHT, OF_STRANGER = "fitted to the right skin", "fitted to the foreign board itself"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards. They are simulated: the readings of a board are changed as a wrong plug, driver or skin would change
-# them.
+# Foreign boards, by what is different. They are made from the readings of a recorded board. These readings are changed
+# in the same way as a wrong plug, a wrong driver or a wrong skin would change them.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
-    "every chip turned by a quarter": lambda chips: chips @ QUARTER_TURN,
-    "north for south": lambda chips: -chips,
+    "every chip turned by 90 degrees": lambda chips: chips @ QUARTER_TURN,
+    "all magnetic poles swapped": lambda chips: -chips,
 }
 ByBoard = Mapping[str, Float[np.ndarray, "_"]]  # one value per reading, by board
 
@@ -468,8 +470,8 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
     A physical model is fitted to the unlabelled pokes of each board's first fold. It is then inverted for test readings
     of this board and of foreign boards, which gives a residual for each reading. An alarm is raised if the residual is
-    above the limit of the board. This limit is set with all other boards, whose own models are fitted to them: a
-    fraction `fraction` of their residuals is above the limit.
+    above the limit of the board. This limit is set with the readings of all other boards: a fraction `fraction` of
+    their residuals is above the limit. The residuals of each of these boards are from the model that is fitted to it.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
@@ -509,7 +511,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
             for (stranger, law), stranger_residuals in strangers.items()
         ],
     }
-    return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(residuals, off_mm, fraction)
+    return alarm, {"method": INVERSION, "by": "residual of the inversion"} | score_flagged(residuals, off_mm, fraction)
 
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
@@ -576,46 +578,52 @@ DASH = "–"
 # What each method can and cannot correct in principle. Whether a method helps in practice is in the table's other
 # columns.
 WHY = {
-    "channels matched": "corrects the gain of each channel; a shifted or rotated skin mixes channels, and standard "
-    "deviations also differ if forces differ",
-    "CORAL": "also corrects mixed channels, as far as the presses determine all covariances; many linear maps give "
-    "the same covariances, and only one of them preserves places",
-    "direct standardisation": "knows which places correspond, but has as many unknowns as the square of the number of "
-    "channels, and a shift of the skin does not change the field linearly",
-    "labels as rows": "adds fields of this skin, at the labelled places only",
-    "network, domain-adversarial": "makes the distributions of features equal on both boards; equal features need not "
-    "have equal places",
+    "channels matched": "It corrects the gain of each channel, by equal standard deviations on both boards. It cannot "
+    "correct a shifted or rotated skin, which mixes channels. Standard deviations also differ if the forces differ.",
+    "CORAL": "It corrects mixed channels as well, by equal covariances on both boards. Many linear maps give these "
+    "covariances, and only one of them preserves places.",
+    "direct standardisation": "It uses pairs of fields at equal places. The linear map has as many unknowns as the "
+    "square of the number of channels, and a shift of the skin does not change the field linearly.",
+    "labels as rows": "It adds fields of the new skin to the training rows, but only at the labelled places.",
+    "network, domain-adversarial": "It makes the distributions of features equal on both boards. Readings with equal "
+    "features can still be from different places.",
 }
 BASELINES = (
-    "Regressors and networks of the known boards, tested on the held-out board. They are aligned with all its "
-    "unlabelled pokes, or with the given number of labelled ones; direct standardisation pairs each of these with the "
-    "field that known boards read at the same place and force. Paired: difference to the same method without alignment "
-    "(the regressor without labels; the network trained as long without it), board by board. The ridge penalty of "
-    "direct standardisation is chosen by leave-one-out over these pairs, because with a single training board there is "
-    "no second one for validation. No other setting was tuned."
+    "Regressors and networks that are trained on the known boards, and tested on the held-out board. To align their "
+    "inputs with the held-out board, the methods receive all unlabelled pokes of this board, or the given number of "
+    "labelled pokes. Direct standardisation pairs each labelled poke with the field of the known boards at the same "
+    "place and force. Labels as rows: labelled pokes are additional training rows. Paired: difference to the control, "
+    "board by board. The control of a regressor is the same regressor without alignment and labels. The control of the "
+    "domain-adversarial network is a network that is trained as long without the adversarial loss. The ridge penalty "
+    "of direct standardisation is chosen by leave-one-out cross-validation over the pairs, because with a single "
+    "training board, no other board is left for validation. No other setting was tuned."
 )
 UNLABELLED = (
-    "No label of the held-out board is used. Paired: difference to the same method with the skin's own pokes, board by "
-    "board. Physics inversion: eight parameters of the physical model (the law), and place and force of each poke, are "
-    "fitted by least squares, starting from nominal parameters; the nominal stiffness and slide are typical values "
-    "of recorded boards, including these boards. Each tested reading is then looked up in the fitted model. Centred: "
-    "places are shifted so that the mean of the pokes is the middle; maps and networks assume the same. The stiffness "
-    "of the model is nominal, so its forces are in nominal units. Another skin's: the pokes of the next board, "
-    "together with the held-out board's own field at rest."
+    "No label of the held-out board is used. Column `unlabelled pokes` states whose pokes a method receives: pokes of "
+    "the tested skin (its own), no pokes, or pokes of the next board (another skin's). In the last case, the method "
+    "still receives the held-out board's own field at rest. Paired: difference to the same method with the skin's own "
+    "pokes, board by board. Physics inversion: eight parameters of the physical model, and the place and the force of "
+    "each poke, are fitted by least squares, starting from nominal parameters. The nominal stiffness and slide are "
+    "typical values of recorded boards, including these boards. For each tested reading, the fitted model is then "
+    "searched for the place and force that explain the reading best. Centred: places are shifted so that the mean "
+    "place of the pokes is the middle of the skin; maps and networks also assume this mean. The stiffness of the model "
+    "is nominal, so forces are estimated as if the skin had this stiffness."
 )
 ALARM = (
-    "Left over: the residual |dB - simulated| / |dB| at the best place in the physical model (the law), median over "
-    "readings. A reading raises the alarm if its residual is above the limit that {asked:g} % of the readings of the "
-    "other boards exceed; limit {limit}. Area under the ROC curve: 0.5 is chance level, 1 is perfect. Strangers: "
-    "recorded readings of another board, or of the same board with its chips changed in software. The law is that of "
-    "the right skin, or is fitted again to the stranger's own pokes and field at rest. n boards; [low, high]: 95 % "
-    "confidence interval over them (Student's t; it may extend beyond the possible range)."
+    "A physical model is fitted to the unlabelled pokes of a skin. Residual: |dB - simulated| / |dB| at the place and "
+    "force that explain a reading best. A reading raises the alarm if its residual is above the limit, which {asked:g} "
+    "% of the readings of the other boards exceed; limit {limit}. Area under the ROC curve: 0.5 is chance level, 1 is "
+    "perfect. Foreign boards: recorded readings of another board, or readings of the same board whose chips are "
+    "changed in software. The physical model is fitted to the right skin, or to the unlabelled pokes and the field at "
+    "rest of the foreign board itself. n: number of boards; [low, high]: 95 % confidence interval over boards "
+    "(Student's t; it may extend beyond the possible range)."
 )
 FLAGGED = (
-    "Each method receives the right skin's own unlabelled pokes and no label. Flagged: readings above the limit that "
-    "{asked:g} % of the readings of the other boards exceed. n boards; errors of flagged readings are over the boards "
-    "that flag any. A large misfit means that dB is unlike any that such a skin produces; a large standard deviation "
-    "means that several places give similar readings. Only the standard deviation is related to the error of the place."
+    "Each method receives unlabelled pokes of the right skin, and no label. Flagged: readings for which the quantity "
+    "in column `flagged by` is above a limit, which {asked:g} % of the readings of the other boards exceed. n: number "
+    "of boards; errors of flagged readings are averaged over the boards with flagged readings. A large misfit means "
+    "that dB is unlike any field change that such a skin produces. A large standard deviation means that several "
+    "places give similar readings. Only the standard deviation is related to the error of the place."
 )
 
 
@@ -624,21 +632,22 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     unlabelled = [row for row in numbers["methods"] if row["method"].startswith(("universal", INVERSION))]
     aligned = [row for row in numbers["methods"] if row not in unlabelled]
     alarm = numbers["alarm"]
-    right_row = {"stranger": "none: the right skin", "law": OF_RIGHT} | alarm["right"]
+    right_row = {"stranger": "right skin (no foreign board)", "law": OF_RIGHT} | alarm["right"]
     unpaired = f" {numbers['unpaired_n']} labelled pokes had no pair." if numbers["unpaired_n"] else ""
     return {
         "rivals": tabulate(
-            [_line(row, source) | {"why": _why(row["method"])} for row in aligned], meaning=BASELINES + unpaired
+            [_line(row, source) | {"what it can and cannot correct": _why(row["method"])} for row in aligned],
+            meaning=BASELINES + unpaired,
         ),
         "rivals_told": tabulate([_line(row, source) for row in unlabelled], meaning=UNLABELLED),
         "rivals_alarm": tabulate(
             [
                 {
-                    "stranger": row["stranger"],
-                    "law": row["law"],
+                    "readings of": row["stranger"],
+                    "physical model": row["law"],
                     "alarm, % of readings": show(row["alarm_pct"]),
-                    "area under ROC": show(row["auc"]),
-                    "left over": show(row["left_median"]),
+                    "area under the ROC curve": show(row["auc"]),
+                    "median residual": show(row["left_median"]),
                     "n": str(row["auc"]["n"]),
                     "source": source,
                 }

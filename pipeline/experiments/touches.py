@@ -67,7 +67,7 @@ class Touches(Strict):
     @model_validator(mode="after")
     def _check_test_rows_are_left(self) -> "Touches":
         if self.train_fraction + self.aside_fraction >= 1:
-            raise ValueError("train_fraction + aside_fraction must be less than 1; the rest are the test rows")
+            raise ValueError("train_fraction + aside_fraction must be less than 1, because the rest are the test rows")
         return self
 
 
@@ -86,10 +86,10 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
         "left_out": recordings.left_out,
     }
     for name, reason in recordings.left_out.items():
-        say(f"{settings.scene}: warning: {name} left out: {reason}")
+        say(f"{settings.scene}: warning: recording {name} is left out: {reason}")
     if recordings.problem:
         write_results(results, counts | {"not_computed": recordings.problem}, {})
-        say(f"{settings.scene}: warning: touches not computed: {recordings.problem}")
+        say(f"{settings.scene}: warning: experiment touches is not computed: {recordings.problem}")
         return
     blocks = [split_by_time(recording, section) for recording in single]
     numbers = counts | {
@@ -100,7 +100,7 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
         "detection": evaluate_detection(blocks, double, section, settings.seed),
     }
     write_results(results, numbers, {})
-    say(f"{settings.scene}: {len(single)} recordings of one place, {len(double)} of two")
+    say(f"{settings.scene} touches: evaluated {len(single)} recordings of one place and {len(double)} of two places")
 
 
 # --- Recordings ---
@@ -140,7 +140,7 @@ def touched_rows(readings: Readings, account: Mapping[str, int], selection: Sele
     places = tuple(sorted(int(match[1]) for name in account if (match := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         what = f"one or two numbered places are needed; got {list(places)}"
-        remedy = "Only layout eflash7 has such places: run this experiment in a scene of its own."
+        remedy = "Only recordings with layout eflash7 have numbered places. Move all others to another scene."
         raise ParamsError(f"capture {readings.capture}: {what}. {remedy}")
     rows = readings.Fz_N >= selection.force_min_N
     db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
@@ -181,7 +181,7 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     # Recordings of a single place come first.
     ordered = sorted(recordings, key=lambda recording: (len(recording.places), recording.places, recording.name))
     left_out = {
-        recording.name: f"{len(recording.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
+        recording.name: f"{len(recording.db_uT)} rows with enough force, but {ROWS_MIN_N} are needed"
         for recording in ordered
         if len(recording.db_uT) < ROWS_MIN_N
     }
@@ -191,18 +191,19 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     for recording in usable:
         unknown = sorted(set(recording.places) - single.keys()) if len(recording.places) == 2 else []
         if unknown:
-            left_out[recording.name] = f"place {' and '.join(map(str, unknown))} not recorded alone"
+            left_out[recording.name] = f"no recording of place {' and '.join(map(str, unknown))} alone"
         elif len(recording.places) == 2:
             double.append(recording)
         elif recording.places[0] in single:
             left_out[recording.name] = (
-                f"place {recording.places[0]} already recorded alone, by {single[recording.places[0]].name}"
+                f"recording {single[recording.places[0]].name} of place {recording.places[0]} alone is used instead"
             )
         else:
             single[recording.places[0]] = recording
     problem = None
     if len(single) < 2:
-        problem = f"places recorded alone: {len(single)}; at least 2 are needed. Add their recordings to this scene."
+        remedy = "Add recordings of single places to the scene."
+        problem = f"places recorded alone: {len(single)}; at least 2 are needed. {remedy}"
     return Sorted(list(single.values()), double, left_out, problem)
 
 
@@ -249,7 +250,7 @@ def directions(
 def relative_residual(
     known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Return which part of each row cannot be explained by touches at these places, as residual / |dB|.
+    """Return the fraction of each row that touches at these places cannot explain, as residual / |dB|.
 
     Each row is fitted by a sum of the places' directions of dB, each multiplied by an amplitude of 0 or more. The
     forces at the single places were not recorded, so the amplitudes that give the smallest residual are used.
@@ -265,13 +266,13 @@ def score_unlike_one(
     """Score how different each tested row is from a single touch, with several detectors of two touches.
 
     The detectors are those of experiment `contacts` that use no network, and a detector that fits each row by a touch
-    at one place. The score of the latter is the smallest residual among all places.
+    at one place. The score of the last detector is the smallest residual among all places.
     """
     residuals = [relative_residual(known, (place,), tested_uT) for place in known]
     return {
         "direction and length": neighbour_distance(shape(known_uT), shape(tested_uT)),
         "direction above noise": direction_distance(known_uT, tested_uT),
-        "left over by one place": np.min(residuals, axis=0),
+        "residual of one place": np.min(residuals, axis=0),
     }
 
 
@@ -325,7 +326,7 @@ def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generat
 
 
 def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Return which part of the field change of two touches a sum of two single touches cannot explain.
+    """Return the part of the field change of two touches that a sum of two single touches cannot explain, in percent.
 
     Each reading of two touches is fitted by the directions of single touches (see `relative_residual`). For comparison,
     `single_touches_pct` is the residual of single touches after a fit by the direction of their own place.
@@ -424,11 +425,12 @@ def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: floa
 
 BY_TIME = "later in the same recordings"
 ONCE = (
-    "Each place was recorded once, so later readings may be recognised by their recording as well as by their place; "
-    "only a recording from another day, or a place left out of training, rules this out."
+    "Each place was recorded once. Later readings may therefore be recognised by properties of their recording instead "
+    "of by their place. Only tests with a recording from another day, or with a place that is left out of training, "
+    "exclude this."
 )
-APART = "Single touches and two touches at once are in different recordings; data/README.md gives their dates."
-NO_MM = "The spacing of the 3 x 3 places is not documented, so nothing is given in mm."
+APART = "Single touches and two touches at once are in different recordings, whose dates are in data/README.md."
+NO_MM = "The spacing of the 3 x 3 places is not documented, so no error is given in mm."
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -445,21 +447,31 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     place, force = numbers["place"], numbers["force"]
-    rows = [_row(f"place of one touch, {BY_TIME}", place["by_time"], "%", f"{place['by_time']['chance_pct']:.1f}")]
+    rows = [
+        _row(
+            f"place of one touch is predicted correctly, {BY_TIME}",
+            place["by_time"],
+            "%",
+            f"{place['by_time']['chance_pct']:.1f}",
+        )
+    ]
     if "one_of_two" in place:
         two = place["one_of_two"]
         chance = f"{two['chance_pct']:.1f}"
-        rows.append(_row("two touches, in their own recordings: predicted place is one of the two", two, "%", chance))
+        rows.append(_row("two touches at once: predicted place is one of the two places", two, "%", chance))
     variance = f"{force['variance']['mean']:.3g} (variance)"
-    for way, split in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
-        rows.append(_row(f"force of one touch, squared error, {split}", force[way], "N²", variance))
+    for way, split in (("by_time", BY_TIME), ("place_left_out", "at a place that is left out of training")):
+        rows.append(_row(f"mean squared error of the force of one touch, {split}", force[way], "N²", variance))
     table = pd.DataFrame(rows)
     single, double = numbers["single"], numbers["double"]
     table.attrs["meaning"] = (
-        f"{single['rows_n']} rows of {single['recordings_n']} recordings of one touch, {double['rows_n']} rows of "
-        f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: majority of the nearest "
-        "known directions of the change of field. Force: ridge regression on the change of field. Mean ± standard "
-        f"deviation over n recordings. {ONCE} {APART} {NO_MM}"
+        f"Data: {single['rows_n']} rows of {single['recordings_n']} recordings of one touch, and {double['rows_n']} "
+        f"rows of {double['recordings_n']} recordings of two touches, with forces of {numbers['force_min_N']:g} N or "
+        "more. Place: the most frequent place among the training rows whose changes of field have the most similar "
+        "directions. Force: ridge regression on the change of field. Mean ± standard deviation over n recordings. By "
+        "chance: the result of a random place, or the variance of the force, which is the error of predicting the mean "
+        "force. "
+        f"{ONCE} {APART} {NO_MM}"
         f"{_left_out(numbers)}"
     )
     return table
@@ -471,13 +483,13 @@ def _not_computed(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
     table = pd.DataFrame(rows).assign(source=source)
     table.attrs["meaning"] = (
         f"Nothing was computed from {numbers['single']['recordings_n']} usable recordings of one touch and "
-        f"{numbers['double']['recordings_n']} of two."
+        f"{numbers['double']['recordings_n']} usable recordings of two touches."
     )
     return table
 
 
 def _left_out(numbers: Mapping[str, Any]) -> str:
-    return "".join(f" Left out: {name} ({reason})." for name, reason in numbers.get("left_out", {}).items())
+    return "".join(f" Recording {name} is left out ({reason})." for name, reason in numbers.get("left_out", {}).items())
 
 
 def _row(what: str, stat: Mapping[str, Any], unit: str, chance: str) -> dict[str, Any]:
@@ -489,37 +501,40 @@ def _superposition(numbers: Mapping[str, Any]) -> pd.DataFrame:
     rows = [
         {
             "places": " and ".join(map(str, pair["places"])),
-            "sum of both, %": f"{pair['left_over_pct']:.0f}",
-            "the stronger alone, %": f"{pair['stronger_alone_pct']:.0f}",
-            "the best of all places alone, %": f"{pair['best_alone_pct']:.0f} (place {pair['best_alone']})",
-            "other pairs, mean, %": f"{pair['other_pairs_pct']:.0f}",
-            "rank among pairs": f"{pair['rank']} of {pair['pairs_n']}",
+            "fit by both places, %": f"{pair['left_over_pct']:.0f}",
+            "fit by the better of them alone, %": f"{pair['stronger_alone_pct']:.0f}",
+            "fit by the best of all places alone, %": f"{pair['best_alone_pct']:.0f} (place {pair['best_alone']})",
+            "fit by other pairs of places, mean, %": f"{pair['other_pairs_pct']:.0f}",
+            "rank among all pairs": f"{pair['rank']} of {pair['pairs_n']}",
             "rows": f"{pair['rows_n']}",
         }
         for pair in numbers["pairs"]
     ]
     means = {
-        "sum of both, %": "mean_left_over_pct", "the stronger alone, %": "mean_stronger_alone_pct",
-        "other pairs, mean, %": "mean_other_pairs_pct",
+        "fit by both places, %": "mean_left_over_pct",
+        "fit by the better of them alone, %": "mean_stronger_alone_pct",
+        "fit by other pairs of places, mean, %": "mean_other_pairs_pct",
     }  # fmt: skip
     rows.append({"places": "mean"} | {title: show_digits(numbers[name], 0) for title, name in means.items()})
     table = pd.DataFrame(rows).fillna("–")
     table.attrs["meaning"] = (
-        "Residual of the recorded change of field of two touches, as a percentage of its size (median over rows), "
-        "after a fit by the mean directions of single touches at these places, each with an amplitude of 0 or more, "
-        "because how hard each place was pressed is not recorded. A direction that changes with force adds to the "
-        f"residual: for single touches the residual is {show_digits(numbers['single_touches_pct'], 0)} %. Two "
-        f"amplitudes always fit better than one; the other pairs have two amplitudes as well. {APART}"
+        "The recorded change of field of two touches is fitted by a sum of the mean directions of single touches at "
+        "one or two places. Each direction has an amplitude of 0 or more, which is fitted to each row, because the "
+        "force at each place was not recorded. The table shows the residual as a percentage of the change of field "
+        "(median over rows). If the direction at a place changes with the force, the residual is larger: for single "
+        f"touches, fitted by their own place, it is {show_digits(numbers['single_touches_pct'], 0)} %. A fit by two "
+        "amplitudes is always at least as good as a fit by one of them. Therefore compare the fit by both places with "
+        f"the fits by other pairs of places, which also have two amplitudes. {APART}"
     )
     return table
 
 
 def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
     columns = {
-        "two touches called two, %": "detected_pct",
-        "single touches called two, %": "false_alarm_pct",
-        "a single touch at an unknown place called two, %": "unseen_place_called_two_pct",
-        "sums of two single touches called two, %": "sums_called_two_pct",
+        "two touches reported as two, %": "detected_pct",
+        "single touches reported as two, %": "false_alarm_pct",
+        "single, unknown place, reported as two, %": "unseen_place_called_two_pct",
+        "sums of two touches reported as two, %": "sums_called_two_pct",
     }
     rows = [
         {"detector": name}
@@ -529,9 +544,10 @@ def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
     ]
     table = pd.DataFrame(rows)
     table.attrs["meaning"] = (
-        f"Thresholds are set for {numbers['false_alarm_asked_pct']:g} % false alarms, as in `contacts`, on single "
-        "touches recorded after the known and before the tested ones. A detector that also calls a single touch at an "
-        "unknown place `two` responds to anything unfamiliar, not to two touches; its first column is then no evidence "
-        f"that it detects two touches. {APART}"
+        f"Thresholds are set as in experiment `contacts`, so that {numbers['false_alarm_asked_pct']:g} % of single "
+        "touches are reported as two. These single touches were recorded after the training rows and before the tested "
+        "rows. At an unknown place: the place was left out of training. A detector that also reports single touches at "
+        "an unknown place as two touches responds to anything unfamiliar. Its first column is then no evidence that it "
+        f"detects two touches. {APART}"
     )
     return table

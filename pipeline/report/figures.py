@@ -44,8 +44,9 @@ SENSOR_METHODS = ("multi", "triplet", "adapted")
 PAPER = {"fmt": "D", "color": "black", "markerfacecolor": "white", "markersize": 6, "ecolor": "#00000030"}
 PAPER |= {"elinewidth": 8, "zorder": 1.5}
 PAPER_NAME = "paper's table 2: mean ± standard deviation"
-# Boards that were never seen in training (experiment random_presses): tests and models in figures.
-TESTED = "other colour of a checkerboard"
+# Figures of boards that were never seen in training show the rows of experiment random_presses with these tested places
+# and these models.
+TESTED = "places without labels (checkerboard)"
 WAYS = {
     "universal, boards of the rig": "trained on simulation and the rig's other board",
     "universal, simulated alone": "trained on simulation (the model that we ship)",

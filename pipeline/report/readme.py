@@ -48,7 +48,7 @@ SIMULATED_MEANING = (
     "simulated, the paper's were recorded. An earlier simulation was tuned to row *Single-sensor*, so this row is not "
     "evidence. The paper does not state its forces, so MSE_F may not be comparable."
 )
-HALVES = "other half of the skin"
+HALVES = "half of the skin without labels"
 TRAINED_ON = {
     "universal, boards of the rig": "simulation and the rig's other board",
     "universal, simulated alone": "simulation (the universal model that we ship)",
@@ -114,8 +114,8 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
 def measured_of(numbers: Numbers) -> dict[str, Any]:
     """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
 
-    Scores of places are for presses at random places. Labels and tests are on different colours of a checkerboard of
-    places.
+    Scores of places are for presses at random places. The places are coloured like the squares of a checkerboard.
+    Labels are at places of one colour, and tests are at places of the other colour.
     """
 
     def by_board(row: Numbers) -> dict[str, list[float]]:

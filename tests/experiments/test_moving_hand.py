@@ -1,6 +1,6 @@
 """Tests of experiment moving_hand, which studies touches while a hand moves in magnetic fields.
 
-Tested are the external fields, their compensation, thresholds for contacts, places, and the whole stage.
+The tests check the external fields, their compensation, thresholds for contacts, places, and the whole stage.
 """
 
 from dataclasses import replace
@@ -128,9 +128,12 @@ def test_groups_that_name_unknown_captures_are_refused():
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"pad_chips": [0, 1, 2, 3, 3]}, "pad_chips must contain each of 0 to 4 once"),
-        ({"magnet_mm": [80.0, 40.0]}, "magnet_mm must be the least distance, then the largest one"),
-        ({"groups": 2 * [SECTION.groups[0].model_dump()]}, "groups must have different names, other than none"),
+        ({"pad_chips": [0, 1, 2, 3, 3]}, "pad_chips must contain each number from 0 to 4 once"),
+        ({"magnet_mm": [80.0, 40.0]}, "magnet_mm must contain the smallest distance, then the largest distance"),
+        (
+            {"groups": 2 * [SECTION.groups[0].model_dump()]},
+            "groups must have different names, and none may be called none",
+        ),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(change, expected):

@@ -1,4 +1,4 @@
-"""Tests of experiment random_presses: how presses are drawn, their distance from tested presses, scores and tables."""
+"""Tests of experiment random_presses, which check how presses are drawn and scored, and what the table contains."""
 
 from dataclasses import replace
 

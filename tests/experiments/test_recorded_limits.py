@@ -1,6 +1,6 @@
-"""Tests of experiment recorded_limits, which asks what limits the accuracy on recorded boards.
+"""Tests of experiment recorded_limits, which examines what limits the accuracy on recorded boards.
 
-Tested are the rigid registration of places, estimates of shear, thresholds of detection, and tables.
+The tests check the rigid registration of places, estimates of shear force, thresholds of detection, and tables.
 """
 
 from dataclasses import replace
@@ -313,7 +313,7 @@ def test_power_law_cannot_be_fitted_if_all_forces_at_a_place_are_equal():
 
 
 @given(st.lists(st.tuples(st.integers(1, 40), st.booleans()), min_size=1, max_size=30), st.sampled_from([0.5, 0.95]))
-def test_smallest_detected_force_equals_that_of_a_search(readings, fraction):
+def test_smallest_detected_force_equals_the_result_of_a_search_over_all_forces(readings, fraction):
     force_N, detected = np.array([n / 4 for n, _ in readings]), np.array([found for _, found in readings])
 
     def enough(least_N: float) -> bool:
@@ -345,7 +345,7 @@ def make_recording(board: str = "b1", *, drift_uT: float = 3.0, seed: int = 3) -
     )  # fmt: skip
 
 
-def test_no_load_readings_of_each_policy_are_subtracted():
+def test_each_baseline_subtracts_its_own_no_load_readings():
     recording = make_recording()
     noload_uT = recording.noload_uT.reshape(40, 10, 15)
     each = limits.changes(recording, limits.EACH)

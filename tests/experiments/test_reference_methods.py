@@ -77,7 +77,7 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), make_ro
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_presses_are_paired_with_those_of_equal_place_and_force_on_the_known_board():
+def test_presses_are_paired_with_fields_of_the_known_board_at_equal_place_and_force():
     rows = make_rows()
     rows.target[20:22, 2] = 2.0  # This force is between the two forces of board b0.
     rows.target[22:24, 2] = 9.0  # This force is above the largest force of board b0.
@@ -169,11 +169,11 @@ def numbers() -> dict[str, Any]:
     controls = unlabelled_controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
     stat = {"mean": 0.9, "n": 2, "ci95": [0.8, 1.0]}
     row = {"alarm_pct": stat, "auc": stat, "left_median": stat}
-    strangers = [{"stranger": "north for south", "law": OF_RIGHT} | row]
+    strangers = [{"stranger": "all magnetic poles swapped", "law": OF_RIGHT} | row]
     return {
         "methods": summarise(inversion_points + others, controls), "unpaired_n": 2,
         "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
-        "flagged": [{"method": name, "by": "left over", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
+        "flagged": [{"method": name, "by": "misfit", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
     }  # fmt: skip
 
 
@@ -186,13 +186,13 @@ def test_difference_from_the_control_is_paired_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_tables_list_gains_omitted_methods_and_sources():
+def test_tables_contain_differences_from_controls_and_the_source():
     tables_by_name = tables(numbers(), "recorded")
     assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
-    assert tables_by_name["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
+    assert tables_by_name["rivals"]["what it can and cannot correct"].tolist() == ["–", WHY["CORAL"]]
     assert tables_by_name["rivals"]["paired, accuracy, points"][1].startswith("+25")
     assert tables_by_name["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
-    assert tables_by_name["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
+    assert tables_by_name["rivals_alarm"]["physical model"].tolist() == [OF_RIGHT] * 2
     # No reading was flagged, so there is no error of flagged readings.
     assert tables_by_name["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]
     assert tables_by_name["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")

@@ -1,6 +1,6 @@
 """Tests of experiment touches, in which one or two numbered places of a pad are touched.
 
-The pad is simulated: field changes of two touches add up.
+The pad is simulated. The field change of two touches is the sum of the field changes of the two single touches.
 """
 
 from dataclasses import replace
@@ -65,7 +65,7 @@ def test_rows_are_split_into_training_threshold_and_test_rows_in_order_of_time()
     np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
 
 
-def test_residual_equals_that_of_bounded_least_squares():
+def test_residual_equals_the_residual_of_bounded_least_squares():
     rng = rng_for(0, "touches", "left over")
     known = {place: rng.normal(size=15) for place in PLACES}
     db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)
@@ -119,17 +119,20 @@ def test_unusable_recordings_are_omitted_with_a_reason():
     result = sort_recordings([*single[1:], again, short, *double])
     assert [one.name for one in result.single] == [one.name for one in single[1:]]
     assert result.problem is None
-    assert result.left_out["short"] == "19 touched rows, fewer than 20"
-    assert result.left_out["second of place 2"] == "place 2 already recorded alone, by (2,)"
+    assert result.left_out["short"] == "19 rows with enough force, but 20 are needed"
+    assert result.left_out["second of place 2"] == "recording (2,) of place 2 alone is used instead"
     without_1 = [one for one in double if 1 not in one.places]
     assert [one.name for one in result.double] == [one.name for one in without_1]
-    assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
+    assert result.left_out["(1, 2)"] == "no recording of place 1 alone"
 
 
 def test_if_all_recordings_are_of_pairs_the_reason_is_reported():
     _, double = pad()
     result = sort_recordings(double)
-    assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
+    assert (
+        result.problem
+        == "places recorded alone: 0; at least 2 are needed. Add recordings of single places to the scene."
+    )
     numbers = {
         "force_min_N": 0.5, "single": {"recordings_n": 0, "rows_n": 0}, "double": {"recordings_n": 0, "rows_n": 0},
         "left_out": result.left_out, "not_computed": result.problem,
@@ -157,5 +160,5 @@ def test_table_of_pairs_shows_only_touched_pairs(split_pad):
         }  # fmt: skip
         shown = tables(numbers, "recorded")
         assert ("touches_superposition" in shown) == bool(pairs)
-        assert ("two touches called two, %" in shown["touches_detection"]) == bool(pairs)
+        assert ("two touches reported as two, %" in shown["touches_detection"]) == bool(pairs)
         assert all((table["source"] == "recorded").all() for table in shown.values())

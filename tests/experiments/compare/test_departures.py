@@ -51,12 +51,12 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(real):
 def test_exchanged_chips_are_named(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
-    assert find_departure([swapped], SECTION, DESIGN) == "Against the scene, chips 1 and 2 are exchanged."
+    assert find_departure([swapped], SECTION, DESIGN) == "Contrary to the scene, chips 1 and 2 are exchanged."
 
 
 def test_mirrored_labels_are_named(real):
     mirrored = replace(real, y_mm=16 - real.y_mm)
-    assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
+    assert find_departure([mirrored], SECTION, DESIGN) == "Contrary to the scene, the labels are mirrored along y."
 
 
 def test_captures_with_missing_data_have_no_departure(real):
@@ -73,7 +73,7 @@ def test_orientation_is_found_without_forces(real):
     unknown = np.full(len(real), np.nan, np.float32)
     assert find_departure([replace(real, Fz_N=unknown)], SECTION, DESIGN) is None
     mirrored = replace(real, Fz_N=unknown, y_mm=16 - real.y_mm)
-    assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
+    assert find_departure([mirrored], SECTION, DESIGN) == "Contrary to the scene, the labels are mirrored along y."
 
 
 # The layout of a square board with four chips, as the file of a scene states it.
@@ -111,7 +111,7 @@ def test_departures_from_a_layout_name_the_layout_instead_of_the_scene():
     assert find_departure([recording], section, DESIGN) is None
     swapped = recording.b_uT.reshape(25, 4, 3)[:, [0, 3, 2, 1]].reshape(25, 12)
     sentence = find_departure([replace(recording, b_uT=swapped)], section, DESIGN)
-    assert sentence == "Against layout square, chips 1 and 3 are exchanged."
+    assert sentence == "Contrary to layout square, chips 1 and 3 are exchanged."
 
 
 def test_presses_outside_the_skin_are_reported_before_orientations_are_compared():
@@ -121,7 +121,8 @@ def test_presses_outside_the_skin_are_reported_before_orientations_are_compared(
     sentence = find_departure([elsewhere], section, DESIGN)
     assert sentence == (
         "25 of 25 presses are outside the skin (20 x 20 mm) that layout square states: relative to centre_mm [10, 12], "
-        "they have x from 14 to 26 mm and y from -11 to 1 mm. Correct centre_mm, the size of the skin or the places."
+        "all presses have x from 14 to 26 mm and y from -11 to 1 mm. Correct centre_mm, the size of the skin or the "
+        "places of the presses."
     )
     aligned = to_board_axes(pool([elsewhere], with_force=False), section)
     assert check_frames(aligned, make_setup(section, DESIGN), section)["sentence"] == sentence
@@ -143,9 +144,12 @@ def test_boards_without_known_forces_have_only_the_table_of_axes(monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"layout": "my_board.yaml"}, "my_board.yaml is a file, .* Write the content of the file there"),
+        (
+            {"layout": "my_board.yaml"},
+            "my_board.yaml is the name of a file, .* Replace the name by the content",
+        ),
         ({"layout": "reskim"}, "reskim: not a YAML file.*Did you mean reskin"),
-        ({"skin_mm": [20.0, 20.0]}, "skin_mm cannot be set beside layout"),
+        ({"skin_mm": [20.0, 20.0]}, "skin_mm cannot be set together with layout"),
         ({"layout": SQUARE | {"gap": 1.0}}, "compare.layout: gap is not a known parameter"),
     ],
 )

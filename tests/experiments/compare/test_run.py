@@ -1,6 +1,6 @@
 """Tests of experiment compare, which fits the simulation to recordings.
 
-It must recover parameters and axes, from simulated and from real recordings.
+The fits must recover the parameters of skins and the orientations of axes, from simulated and from real recordings.
 """
 
 import itertools
@@ -94,14 +94,14 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(recorded):
 
 def test_exchanged_chips_are_named(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
-    assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
+    assert sentence(swapped) == "Contrary to the scene, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_axis_along_which_all_chips_are_mirrored_is_named(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
-        f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
+        f"Contrary to the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
@@ -109,7 +109,7 @@ def test_rotated_chip_is_named(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
-        "Against the scene, chip 3 is turned by 90 degrees more than the scene says."
+        "Contrary to the scene, chip 3 is turned by 90 degrees more than the scene says."
     )
 
 
@@ -118,13 +118,13 @@ def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
-        f"Against the scene, the labels are mirrored along {'xy'[axis]}."
+        f"Contrary to the scene, the labels are mirrored along {'xy'[axis]}."
     )
 
 
 def test_skin_with_exchanged_poles_is_named(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
-    assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
+    assert sentence(flipped) == "Contrary to the scene, the skin is flipped: every field has the opposite sign."
 
 
 def test_sixteen_orientations_of_a_skin_are_distinct():
@@ -134,7 +134,7 @@ def test_sixteen_orientations_of_a_skin_are_distinct():
     assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
-def test_flipped_checkerboard_equals_one_rotated_by_a_quarter_turn():
+def test_flipped_checkerboard_skin_equals_the_skin_rotated_by_a_quarter_turn():
     plain, flipped = (replace(SETUP, skin_flipped=is_flipped).rest for is_flipped in (False, True))
     turn = compare.quarter_turn(1)
     moments_by_node = {
@@ -268,7 +268,7 @@ def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_of_recordings_is_recovered_and_that_of_the_simulation_is_the_set_one(real):
+def test_memory_is_estimated_from_recordings_and_from_simulations(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
         fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]

@@ -20,7 +20,7 @@ BOARD = AGREEMENT | {
     "nominal": AGREEMENT | {"cosine_mean": 0.7, "beyond_n": 3},
     "refitted": AGREEMENT | {"growth": {"recorded": 0.3, "simulated": 0.5}},
     "memory": {"recorded": 0.07, "simulated": 0.065}, "laws": {"fitted": LAW, "refitted": LAW | {"law_of": "b2"}},
-    "frames": {"sentence": "Against the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
+    "frames": {"sentence": "Contrary to the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
     "grips": [GRIP | {"grip_N_mm": 1e-6, "grip_N": 5e-8, "light_uT": 300.0}, GRIP],
     "noise_uT": {"x": 3.3, "y": 3.3, "z": 5.0}, "pokes_n": 4, "left_out_n": 1,
 }  # fmt: skip
@@ -52,7 +52,7 @@ def test_table_compares_simulations_with_bounds():
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
     assert table["simulated with"][2] == "law of b2, seven parameters refitted"
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
-    assert table["held at the deepest"].tolist() == ["3", "0", "0", "–"]
+    assert table["pokes simulated at the largest depth"].tolist() == ["3", "0", "0", "–"]
     assert set(table["source"]) == {"recorded"}
     for words in ("memory is set to 6.5 %", "both boards of scene lab", "does not explain"):
         assert words in table.attrs["meaning"]
@@ -73,7 +73,7 @@ def test_table_for_one_board_with_equal_forces_has_no_growth_and_no_second_fit()
 
 def test_tables_list_axes_and_parameters():
     found = tables(NUMBERS, "recorded")
-    assert found["compare_frames"]["orientation"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
+    assert found["compare_frames"]["orientation"].tolist() == ["Contrary to the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
     assert {"gap, mm", "slide to the middle, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
