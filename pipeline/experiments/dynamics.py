@@ -59,7 +59,7 @@ def dynamics(settings: Settings, indentations: Path, models: Path, results: Path
     numbers = score_presses(presses, networks_held_out(models, capture.board), board=capture.board)
     write_results(results, numbers, {}, read_losses(indentations, {}))
     described = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
-    say(f"{settings.scene}: {numbers['readings_n']} readings of {described}")
+    say(f"{settings.scene}: scored {numbers['readings_n']} readings of {described}")
 
 
 def find_presses(
@@ -165,13 +165,15 @@ def lag_ms(
 
 
 MEANING = (
-    "Half-sine presses at random places of the grid, recorded at the full rate. The model is the paper's network, "
-    "trained on other boards with readings at rest. A reading is scored if four readings of the same press come before "
-    f"it and its force is at least {FORCE_MIN_N:g} N. The mean of the last five readings is the paper's protocol at "
-    "rest; during a press, these five readings are taken at different depths. The third method compares the same mean "
-    "with place and force at its middle reading, two frames earlier: the difference in error is due to lag. Presses "
-    "of different durations also differ in depth and place, so compare methods at the same duration. "
-    f"± is the standard deviation over network seeds; all presses are on one board. {VERDICTS}"
+    "The presses are at random places of the grid, and are recorded at the full rate. During a press, the depth "
+    "follows half a period of a sine. The model is the paper's network, trained on other boards with readings at rest. "
+    "A reading is scored if four readings of the same press come before it and its force is at least "
+    f"{FORCE_MIN_N:g} N. For presses at rest, the paper averages five readings; here, the last five readings are taken "
+    "at different depths. The estimate from their mean is compared with the true place and force at the last of the "
+    "five readings and, in the third method, at the middle reading, which is two frames earlier. The difference "
+    "between these two errors is due to lag. Presses of different durations also differ in depth and place, so compare "
+    "methods at the same duration. ± is the standard deviation over network seeds. All presses are on one board. "
+    f"{VERDICTS}"
 )
 TITLES = {
     "one": "each reading alone",

@@ -56,15 +56,17 @@ class Frame:
 def read_model(file: Path, layout: BoardLayout | None, settings: Settings) -> Universal:
     """Read the model; raise `ParamsError` if it was made for a layout other than the scene's."""
     if layout is None:
-        raise ParamsError(f"{settings.where}: experiment calibrated needs key layout in section compare. Add it there.")
+        raise ParamsError(
+            f"{settings.where}: experiment calibrated needs compare.layout. Add key layout to section compare."
+        )
     model = load_universal(file=file)
     if replace_name(model.layout, layout.name) != layout:
         own, other = layout.model_dump(), model.layout.model_dump()
         differing = ", ".join(key for key in own if key != "name" and own[key] != other[key])
-        remedy = f"Make a model: reskin model make --layout {settings.where} --out NEW.safetensors"
+        remedy = f"Make a model for this layout: reskin model make --layout {settings.where} --out NEW.safetensors"
         raise ParamsError(
             f"{file}: the model was made for layout {model.layout.name}, which differs from compare.layout of "
-            f"{settings.where} in {differing}. {remedy}, and name it in section calibrated."
+            f"{settings.where} in {differing}. {remedy}. Then set calibrated.model to the new file."
         )
     return model
 

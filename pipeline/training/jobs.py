@@ -242,7 +242,8 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
     record_trainings(COSTS / data.scene, stage, times, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
-            say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}; its earlier weights are kept")
+            what = f"training of {job.name} diverged by step {result.stopped_step}"
+            say(f"warning: {prefix}: {what}, so its weights from before the divergence are kept")
     return results
 
 

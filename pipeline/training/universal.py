@@ -199,8 +199,8 @@ def score_fold(
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
     if board not in known.presses:  # if a board has several skins, the keys of `presses` name both board and skin
-        what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
-        raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
+        what = f"experiment universal needs boards with one skin each, but the scene has {', '.join(known.presses)}"
+        raise ParamsError(f"fold {fold.name}: {what}. Remove this experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
     test_uT = known.frame.field(data.rows.db_uT[fold.test])
     points = []
