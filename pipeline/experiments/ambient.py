@@ -39,7 +39,7 @@ from reskin.simulation.settings import SimulationSettings
 # Distance of the reference chip from the board's middle, along x. The reference chip is assumed to be so far from the
 # skin that a poke does not change the field at this chip.
 REFERENCE_ASIDE_MM = 30.0
-AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
+AS_IT_IS, ASIDE, OWN = "reading as it is", "reference chip subtracted", "common part of all chips subtracted"
 
 Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction (AS_IT_IS, ASIDE, OWN)
 

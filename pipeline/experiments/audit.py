@@ -446,7 +446,8 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
     """Return the arrays of a scaler that is fitted to these rows; equal fits are computed only once."""
-    fit_key = (*key, len(db_uT))  # the row count distinguishes training rows from training and test rows
+    # The number of rows distinguishes a fit to the training rows from a fit to training and test rows.
+    fit_key = (*key, len(db_uT))
     if fit_key not in fits:
         fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
     return fits[fit_key]
@@ -471,7 +472,8 @@ def audit_scaler(
         "scaler fitted to training and test rows"
     )
     rule = f"the scaler was fitted to the training rows alone (tolerance: relative difference {SCALER_TOLERANCE:.2g})"
-    return Check("scaler", where, rule, found, holds=train_gap <= SCALER_TOLERANCE and train_gap <= both_gap)
+    holds = train_gap <= SCALER_TOLERANCE and train_gap <= both_gap
+    return Check("scaler", where, rule, found, holds=holds, remedy="Train this network again.")
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
@@ -482,7 +484,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
-            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Retrain this network.")
+            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Train it again.")
         size = np.where(value == 0, 1.0, np.abs(value))
         gaps.append(np.max(np.abs(arrays[name].astype(np.float64) - value) / size))
     return float(np.max(gaps))
@@ -499,6 +501,7 @@ def audit_tuning(
     tested = np.intersect1d(adapted_to, indentation[sides.test])
     foreign = np.setdiff1d(adapted_to, indentation[sides.pool])
     base_known = tuning["from"] in bases
+    remedy = "Adapt this network again."
     base = f"the pretrained network is {'' if base_known else 'not '}of the same fold and seed"
     pokes = (
         f"of {len(adapted_to)} indentations for adaptation, {len(tested)} are tested, and {len(foreign)} are not in "
@@ -509,8 +512,8 @@ def audit_tuning(
         "all indentations for adaptation are in the fold's pool, and none of them is tested",
     )
     return [
-        Check("base", where, rules[0], base, holds=base_known),
-        Check("pokes", where, rules[1], pokes, holds=not len(tested) and not len(foreign)),
+        Check("base", where, rules[0], base, holds=base_known, remedy=remedy),
+        Check("pokes", where, rules[1], pokes, holds=not len(tested) and not len(foreign), remedy=remedy),
     ]
 
 
@@ -593,7 +596,8 @@ def audit_choice(
         names = f": {', '.join(shared)}" if shared else ""
         found = f"{len(shared)} of {len(set(tested))} tested {what} were used to choose the settings{names}"
         rule = f"no tested {what.removesuffix('s')} was used in scene {record.scene} to choose the settings"
-        checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared))
+        remedy = "Choose the settings in a scene with other boards and skins."
+        checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared, remedy=remedy))
     changed = f"{NOT_CHOSEN}: fingerprint {record.physics}, now {physics}; run the study of settings again"
     found = "equal" if record.physics == physics else changed
     rule = f"the settings of the simulated skin are those with which scene {record.scene} chose the training settings"
@@ -603,7 +607,7 @@ def audit_choice(
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
     """Report how a recipe differs from the recipe that the study chose; a difference is not a leak."""
-    rule = f"the recipe is the recipe that scene {record.scene} chose; differences are only listed"
+    rule = f"the recipe equals the recipe that scene {record.scene} chose; differences are only listed"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)
     if chosen is None:

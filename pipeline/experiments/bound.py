@@ -194,7 +194,7 @@ def score_network(models: Path, skin: str) -> dict[str, Any]:
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
-SIDES = {"signal": "bound", "with_label_errors": "bound, labels' errors added"}
+SIDES = {"signal": "bound", "with_label_errors": "bound with label errors"}
 NONE = "–"
 
 

@@ -608,7 +608,8 @@ def mean_over_boards(
 ) -> tuple[dict[str, Any], list[float] | None]:
     """Average the values of each board's networks; return statistics of these averages over boards.
 
-    The second result is the 95 % interval of the mean over networks, which ignores that networks share boards.
+    The second result is the 95 % interval of the mean over networks. It is computed as if all networks were
+    independent, although networks of the same board are not.
     """
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
@@ -776,7 +777,8 @@ def _possible_reasons(numbers: Mapping[str, Any]) -> str:
         left_pct = late["force_left_pct"]
         text += (
             f" After {late['contacts_n']:,} contacts, the force at the same places and depths is {left_pct:.4g} % of "
-            "the force in the training window, because the skin has softened. The softening explains a force bias of "
+            "the force in the training window, because the skin has softened. Networks that were trained before the "
+            "softening still estimate the early force, so the softening explains a force bias of "
             f"{100 - left_pct:+.2g} %."
         )
     return text
@@ -788,7 +790,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
         "initial": "once at the start",
         "regular": f"every {numbers.get('regular_n')} indentations",
         "each": "before every contact",
-        "free": "whenever judged free of contact",
+        "free": "whenever a reading is judged free of contact",
     }
     return {policy: (titles[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
 

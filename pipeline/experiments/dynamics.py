@@ -177,8 +177,8 @@ MEANING = (
 )
 TITLES = {
     "one": "each reading alone",
-    "mean5": "mean of the last five",
-    "mean5_of_middle": "same mean, compared with its middle reading",
+    "mean5": "mean of the last five readings",
+    "mean5_of_middle": "same mean, compared with middle reading",
 }
 LESS = "less force error than each reading alone, N²"  # title of a column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -191,7 +191,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
         {
-            "press lasts about, s": label,
+            "duration of the press (about), s": label,
             "presses": result["presses_n"],
             "readings": result["n"],
             "estimated from": title,

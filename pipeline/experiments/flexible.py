@@ -200,9 +200,9 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
         f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted minus true force, also as a percentage of "
         f"the mean force; the paper reports {FLEXIBLE_BIAS} after adaptation, without a number. In our simulation, "
         f"|dB| at equal depth is {show(numbers['strength_ratio'])} times as large as on rigid boards (± over depths). "
-        f"The gap between chips and skin is {gap_mm['flexible']:g} mm on flexible boards and {gap_mm['rigid']:g} mm "
-        f"on rigid boards, which is {numbers['gap_less_pct']:.0f} % less. In the paper, it is "
-        f"{FLEXIBLE_GAP_LESS_PCT:g} % less. The paper's numbers are for adapted networks, and its accuracy is "
+        f"The gap between chips and skin is {numbers['gap_less_pct']:.0f} % smaller on flexible boards "
+        f"({gap_mm['flexible']:g} mm) than on rigid boards ({gap_mm['rigid']:g} mm). In the paper, it is "
+        f"{FLEXIBLE_GAP_LESS_PCT:g} % smaller. The paper's numbers are for adapted networks, and its accuracy is "
         "approximate."
     )
 

@@ -242,7 +242,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         panels[2].set_xlabel("time / s")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-        panels[0].set_title(f"A log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
+        panels[0].set_title(f"Estimates from a log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
         return {"logs.svg": svg(figure)}
 
 

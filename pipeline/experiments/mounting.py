@@ -229,8 +229,8 @@ OF_ORIENTATION = (
     "skins that the model takes for skins turned by 90 degrees. Warned: percentage of skins for which the model warns "
     "that the orientation is uncertain. Smallest log odds: smallest value, over the skins, of the log odds of the "
     "found orientation against the other orientation. Large misfit: percentage of skins for which 65 presses at random "
-    "places, seen after the no-load field, have a median misfit above {misfit:g}. To turn a skin by 90 degrees negates "
-    "all of its fields."
+    "places have a median misfit above {misfit:g}. A skin that is turned by 90 degrees "
+    "has all fields negated."
 )
 OF_LABELS = (
     "Percentage of trials in which the model warns that the labels have these wrong axes. In the row `as given`, the "
@@ -238,7 +238,7 @@ OF_LABELS = (
     "no-load field and the labels. On each recorded board, labels are drawn at random {draws_n} times."
 )
 OF_ACCURACY = (
-    "Places at held-out places of recorded boards, as recorded and with all fields negated (as if the skin had been "
+    "Accuracy of estimated places on recorded boards, as recorded and with all fields negated (as if the skin had been "
     "turned by 90 degrees). The model is calibrated with 65 unlabelled presses at random places. Labelled presses are "
     "at places of one colour of a checkerboard, and tested presses at places of the other colour. The scores are means "
     "over {draws_n} random draws and then over boards; (a; b) are the values of the boards. `orientation found`: the "

@@ -125,7 +125,7 @@ def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
         (
             "ageing",
             Terms(ageing=AGEING),
-            f"last of {n} contacts, with a no-load reading before each",
+            f"field at rest and force: at the last of {n} contacts; no-load reading before each contact",
         ),
         (
             "relaxation",
@@ -135,7 +135,7 @@ def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
         (
             "memory",
             Terms(memory=MEMORY),
-            f"pokes of {MEMORY.contact_s:g} s with rests of {MEMORY.rest_s:g} s",
+            f"each poke is held for {MEMORY.contact_s:g} s, and the next poke follows {MEMORY.rest_s:g} s later",
         ),
     ):
         simulated = _simulate(subject, terms, seed)
@@ -168,7 +168,7 @@ def _friction(subject: Subject) -> Effect:
 
 
 def _earth(plain: Response) -> Effect:
-    """Evaluate the earth's field, which is added to the no-load reading and to the contact reading."""
+    """Evaluate the earth's field, which changes the no-load reading and the contact reading by the same amount."""
     rest_T = plain.rest_T[:, None] + EARTH_T
     measured_T = (rest_T + plain.change_T) - rest_T
     description = (
@@ -180,7 +180,10 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate the hold of the base, by comparison with an infinite linearly elastic layer that slides freely."""
+    """Evaluate the effect that the base holds the skin.
+
+    The simulated skin is compared with an infinite linearly elastic layer that slides freely.
+    """
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
@@ -368,7 +371,7 @@ MEANING = (
     "scene, even if this protocol does not neglect the effect. Change of field: root mean square error over all "
     "changes of field, relative to their root mean square. Field at rest: largest error of the no-load field, before "
     "it is subtracted. Force: relative error of the force. Two effects are always neglected, and their errors are not "
-    "known: the skin's corner tabs, and that the skin is held by single screws."
+    "known: the corner tabs of the skin, and the single screws that hold the skin."
 )
 
 

@@ -66,7 +66,7 @@ WEIGHT_N = 5.0
 # Standard deviation of log(assumed force / true force) of the known weight. The two forces differ because of friction
 # in the weight's guide, and because of an error of its mass.
 WEIGHT_SD = 0.02
-LOG_FORCE_MIN_N = 0.2  # presses with less force hardly change the field; they are left out of errors of log F
+LOG_FORCE_MIN_N = 0.2  # errors of log F are computed without presses of less force, which hardly change the field
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINING_MODULE = "reskin.universal.training"
@@ -123,9 +123,9 @@ class DesignedSkins:
     seed: int
 
     def draw(self, name: str, which: slice, weight_N: float | None = None) -> Population:
-        """Draw the skins `which` of the population `name`.
+        """Draw some skins of the population `name`: the skins whose indices are in the slice `which`.
 
-        If `weight_N` is given, the last press on each skin is by a weight of this force.
+        If `weight_N` is given, the last press on each skin is the press of a weight with this force.
         """
         prior, rng = self.prior, rng_for(self.seed, "population", name)
         return draw_population(prior.centre, prior.spreads, prior.setup, which, rng, Forces(*self.forces_N, weight_N))
@@ -286,7 +286,7 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
     middle = own[off_mm == off_mm.min()]
     press_i, first = np.unique(rows.indentation[middle], return_index=True)
     ratio = rows.target[middle[first], 2] / WEIGHT_N
-    log_ratio = np.full(len(ratio), np.inf)  # gauges may read 0 N or less; such presses are never chosen
+    log_ratio = np.full(len(ratio), np.inf)  # a force gauge may read 0 N or less; such presses are never chosen
     log_ratio[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
     if np.isinf(log_ratio).all():
         what = f"none of the {len(ratio)} presses near the middle has a force above 0 N"
@@ -443,7 +443,7 @@ def score_all(
     networks: dict[int, Weights] = {}
     for n in section.skins_n:
         networks[n] = train_network(designed, skins, n, section.steps_n)
-        say(f"{scene} population: network of {n} skins trained")
+        say(f"{scene} population: trained the network of {n} skins")
     model = PriorModel(new_map(designed.tables()), [networks[max(section.skins_n)]])
     further = designed.draw("further", slice(CALIBRATION_SKINS_N), WEIGHT_N)
     further_skins = simulated_skins(further, rng_for(designed.seed, "population", "noise"))
@@ -455,7 +455,8 @@ def score_all(
         calibrations[size] = calibrate_ways(model, further_skins, size)
         rows += [row for skin in tested for row in score_skin(model, skin, size, calibrations[size])]
         fresh_rows += [row for skin in fresh_skins for row in score_skin(model, skin, size, calibrations[size])]
-        say(f"{scene} population: {size.presses_n} unlabelled presses and {size.labels_n} labels done")
+        what = f"{size.presses_n} unlabelled presses and {size.labels_n} labels"
+        say(f"{scene} population: scored the model calibrated with {what}")
     for n, weights in networks.items():
         smaller = replace(model, networks=[weights])
         of_n = [row for skin in tested for row in score_skin(smaller, skin, full, calibrations[full])]
@@ -553,7 +554,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         axes.set_ylabel("readings with an error above 1 mm / %")
         axes.legend(frameon=False)
         boards_n = rows["accuracy_pct"].iloc[0]["n"]
-        axes.set_title(f"{numbers['steps_n']} steps each, skins of {boards_n} boards ({source})", fontsize=9)
+        title = f"Networks trained for {numbers['steps_n']} steps, tested on skins of {boards_n} boards ({source})"
+        axes.set_title(title, fontsize=9)
         return {"population_scaling.svg": svg(figure)}
 
 

@@ -38,7 +38,8 @@ Stats = dict[str, dict[str, float]]  # for each metric: mean, n and, for several
 class Sleeve(SectionWithTraining):
     """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # this fraction of each capture's pokes, at its end, is held out
+    # Fraction of the pokes of each capture that is held out. The held-out pokes are the last pokes of the capture.
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 

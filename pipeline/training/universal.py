@@ -73,7 +73,7 @@ class Estimates(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What all folds share.
+    """Data, models and likelihood powers that are the same for all folds.
 
     - known: the recorded boards of the scene.
     - nominal: variant `nominal` of the model, made from simulated skins alone.

@@ -200,7 +200,7 @@ def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str
         "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,
         "skins_n": settings.skins_n, "steps_n": settings.steps_n, "networks_n": len(variant.model.networks),
         "centre": asdict(prior.centre), "spreads": dict(prior.spreads), "recorded_boards_n": len(prior.recorded),
-        "inputs": "change of field (uT, board's axes), field at rest, any number of unlabelled pokes",
-        "outputs": "x, y over 8 mm; log F over 3; log sd of each",
-        "not_for": "other boards' layouts, skins of another polarity, two contacts at once, shear",
+        "inputs": "change of field (uT, in the board's axes), field at rest, and any number of unlabelled pokes",
+        "outputs": "x and y divided by 8 mm, log F divided by 3, and the logarithm of the standard deviation of each",
+        "not_for": "boards of another layout, skins of another polarity, two contacts at once, shear",
     }  # fmt: skip

@@ -164,7 +164,7 @@ def test_table_compares_the_network_with_the_bound():
     table = tables(NUMBERS, "simulated")["bound"]
     assert table["depth, mm"].tolist() == ["0.2", "1.2", "all"]
     assert table["MSE_xy, mm² (bound)"].tolist() == ["0.01"] * 3
-    assert table["MSE_xy, mm² (bound, labels' errors added)"].tolist() == ["0.04"] * 3
+    assert table["MSE_xy, mm² (bound with label errors)"].tolist() == ["0.04"] * 3
     assert table["MSE_xy, mm² (network)"].tolist() == ["–", "–", "1.00 ± 0.50"]
     assert set(table["source"]) == {"simulated"}
 

@@ -437,7 +437,7 @@ def test_euler_method_diverges_if_steps_exceed_twice_the_shortest_relaxation_tim
         assert euler.error < 1e-2
     else:
         assert euler.error is None
-        assert euler.failure.startswith("diverged: error")
+        assert euler.failure.startswith("diverged: the error")
         assert euler.key not in {one.key for one in calls}
 
 

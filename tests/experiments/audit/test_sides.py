@@ -341,8 +341,8 @@ def test_scaler_fitted_to_both_sides_is_detected_even_if_it_is_close():
     arrays = fit(DB_uT, TARGET)  # The scaler is fitted to all rows, those of the training side and of the test side.
     check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
     assert check.found == (
-        "relative difference 3.6e-08 from a scaler fitted to the training rows, and 0 from a scaler fitted to training and "
-        "test rows"
+        "relative difference 3.6e-08 from a scaler fitted to the training rows, and 0 from a scaler fitted to "
+        "training and test rows"
     )
     assert not check.holds
 

@@ -60,12 +60,12 @@ def test_findings_table_has_a_verdict_and_the_measured_differences():
     assert set(table["source"]) == {"simulated"}
     text = to_markdown(table)
     assert "95 % interval over pairs of networks" in text
-    assert "A contact changes the field by 140 µT rms" in text
+    assert "A contact changes the field by 140 µT (rms" in text
     assert "by policy: 3 µT (once at the start), 2 µT (every 390 indentations), 0 µT (before every contact)" in text
     assert "is 98.1 % of the force in the training window" in text
-    assert "The softening explains a force bias of +1.9 %" in text
+    assert "the softening explains a force bias of +1.9 %" in text
     without_forces = to_markdown(tables(numbers(force=False), "recorded")["drift_findings"])
-    assert "The softening" not in without_forces
+    assert "the softening" not in without_forces
 
 
 def test_note_states_the_protocol_and_how_many_contacts_were_omitted():
