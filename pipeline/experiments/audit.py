@@ -381,8 +381,9 @@ def nearest_rays(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Find, for each row of `db_uT`, the row of `others_uT` whose direction is nearest.
 
-    Returns the index of this row of `others_uT`, and the distance in uT between the row of `db_uT` and the line through
-    the origin in the direction of this row. The distance does not change if `others_uT` is multiplied by a factor.
+    Returns two arrays. The first contains the index of the nearest row of `others_uT`. The second contains the distance
+    in uT between the row of `db_uT` and the line through the origin and this nearest row. The distance does not change
+    if `others_uT` is multiplied by a factor.
     """
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))

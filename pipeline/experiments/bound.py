@@ -1,6 +1,6 @@
 """The smallest error that the noise of the chips allows, compared with the scores of a network (paper section 4).
 
-The experiment computes the Cramér-Rao bound for estimates of place and force from one input row, which is a lower limit
+Place and force are estimated from one input row. The experiment computes the Cramér-Rao bound, which is a lower limit
 of the variance of unbiased estimates. The skin is simulated, and its properties are assumed to be known.
 """
 

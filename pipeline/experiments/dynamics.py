@@ -1,8 +1,8 @@
 """Dynamic presses: readings at the full rate while the force keeps changing (paper section 7, future work).
 
-Place and force are estimated from each reading alone, and from the mean of the last five readings, because the paper
-averages five readings of a press at rest. While the force changes, such a mean has less noise but lags behind the
-force.
+Place and force are estimated in two ways: from each reading alone, and from the mean of the last five readings. The
+paper averages five readings of a press at rest. While the force changes, such a mean has less noise than a single
+reading, but it lags behind the force.
 """
 
 from collections.abc import Callable, Mapping, Sequence

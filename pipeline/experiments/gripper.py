@@ -154,7 +154,8 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
 def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
     """Scale all estimates by the factor that makes the estimate for the press of known force correct."""
-    factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)  # networks may predict 0 or less
+    # The estimate is raised to at least 1 mN, because a network may predict a force of 0 or less.
+    factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)
     return lambda b_uT: factor * estimate(b_uT)
 
 

@@ -85,7 +85,8 @@ def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[E
     """Score the networks on the log as if its board rotated in the earth's field, without and with a reference chip."""
     simulation, seed = simulation_settings(settings), settings.seed
     chip = simulation.chip
-    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])  # a log has single readings, not means
+    # A log contains single readings, not means of several readings, so the noise of a single reading is used.
+    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     instrument = replace(draw_instrument(simulation, board, seed=seed), noise_uT=noise_uT)
     return {
         "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),

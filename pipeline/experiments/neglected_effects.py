@@ -96,7 +96,7 @@ def measure(simulation: SimulationSettings, *, seed: int) -> list[Effect]:
 
 
 def _by_protocol(effect: Effect, simulation: SimulationSettings) -> Effect:
-    """Return the effect with the names of the protocols that neglect it, and of those that compute it."""
+    """Return the effect with the names of the protocols that neglect it, and of the protocols that compute it."""
     computed = tuple(name for name, protocol in simulation.protocols.items() if effect.term in protocol.terms)
     return replace(
         effect, left_out_by=tuple(name for name in simulation.protocols if name not in computed), computed_by=computed
@@ -313,7 +313,7 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
     boxes_m = np.tile(box_m(subject.skin.thickness_m, BOXES), (boxes_n**2, 1))
     own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
-    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # mu0 H = B - J acts on the powder
+    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # the field that magnetises the powder is mu0 H = B - J
     pokes_m = np.array([(*place_m, float(subject.tip_m[..., 2].max())) for place_m in PLACES_M])
     nodes_m = rest.nodes_m + np.append(subject.skin.seat_m, 0.0)
     moments = [magnet.moments(magnetisation_T, rest.volumes_m3) for magnetisation_T in (j_T, with_own_T)]

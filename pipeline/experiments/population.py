@@ -314,8 +314,8 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
 def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
     """Return the skins of a simulated population as test skins, with noise added to their field changes.
 
-    The first `PLACES_N` presses (on the grid) are the pool, the last press is that of the known weight, and all other
-    presses are test presses.
+    The first `PLACES_N` presses, which are on the grid, are the pool. The last press is the press of the known weight.
+    All other presses are test presses.
     """
     tested = []
     for i in range(len(skins)):
@@ -386,8 +386,9 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
     """Return how much of the force error of the known weight is, on average, also found at other presses.
 
-    This is the factor by which the weight's errors of log F (`weight_off`, one per skin) must be multiplied to fit the
-    mean errors of the test presses (`others_off`) best, by least squares.
+    Each skin has two errors of log F: the error of the known weight (`weight_off`), and the mean error of the test
+    presses (`others_off`). The result is a factor. The errors of the weight, multiplied by this factor, fit the mean
+    errors of the test presses best by least squares.
     """
     return float(weight_off @ others_off / (weight_off @ weight_off))
 

@@ -61,7 +61,7 @@ class Prepared:
 class Trial:
     """One simulated skin on its board, and the indentations of this skin, sorted by depth.
 
-    `depths_mm` are the depths to which the rig is told to press. `pokes_m` has a row (x, y, depth) for each
+    `depths_mm` are the depths that the rig is commanded to reach. `pokes_m` has a row (x, y, depth) for each
     indentation.
     """
 
@@ -295,8 +295,8 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
-# Ratio of the absolute to the relative tolerance of the solvers. The peak elastic force is 1, and the states of which
-# the tolerance is compared are a few percent of it.
+# Ratio of the absolute to the relative tolerance of the solvers. The absolute tolerance must be small compared with the
+# states that are integrated. These states are a few percent of the peak elastic force, which is 1.
 ATOL = 1e-3
 DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s

@@ -1,7 +1,7 @@
 """Find which properties of simulated skins determine the scores of the paper's table 2 (not in the paper).
 
 The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from the
-settings of the scene in one factor, such as how much skins vary, or how large an error of the simulation is.
+settings of the scene in one factor. Two of the factors are the variation of skins and the error of the simulation.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

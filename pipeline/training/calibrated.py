@@ -89,8 +89,8 @@ def score_fold(
 ) -> list[dict[str, Any]]:
     """Calibrate the model to each skin of the held-out board; score it for every number of labels.
 
-    The calibration to a skin uses its no-load field, all presses in the fold's pool without their labels, and the
-    labels of the given number of these presses.
+    The calibration to a skin uses its no-load field and the presses of the fold's pool, which are reserved for
+    calibration. All presses are used without labels; the given number of them is used with labels, too.
     """
     points = []
     presses, tested = pool_rows(data, fold), data.rows.skin[fold.test]

@@ -123,7 +123,7 @@ def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, 
 
     def over_budgets(key: Mapping[str, Any]) -> float:
         by_budget = {budget: errors[name] for name, (other, budget) in settings.items() if other == key}
-        return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
+        return float(np.mean(list(by_budget.values())))  # two recipes with equal settings and steps count only once
 
     return {name: over_budgets(key) for name, (key, _) in settings.items()}
 
@@ -142,7 +142,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without budget; for an adaptation, also those of the pretrained network."""
+    """Return the settings without budget; for an adaptation, also the settings of the pretrained network."""
     return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
@@ -152,7 +152,8 @@ def _budget(card: Card) -> tuple[int, int]:
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # the first card of each recipe
+    # The order is reversed, so that the settings of the first card of each recipe are kept.
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}
     return [
         {
             "recipe_name": name,

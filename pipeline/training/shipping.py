@@ -76,7 +76,7 @@ MADE = {
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
     """Choose the likelihood powers of a model, for each number of presses and labels.
 
-    The chosen powers are those for which the 90 % intervals have the right coverage on simulated skins. They are valid
+    The chosen powers are those for which the 90 % intervals have a coverage of 90 % on simulated skins. They are valid
     for a skin with a misfit of 1. On any other skin, the power is divided by the misfit of this skin.
     """
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}

@@ -344,8 +344,8 @@ def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int)
     the variance inflation of its labels.
 
     The simulated skins have errors of the law that are as large as in training, and errors that the map does not model
-    (see `unmodelled_error`). If there are labels, skins with twice as large errors of the law are also used, because
-    the residuals at the labels then reveal how large the errors are.
+    (see `unmodelled_error`). If there are labels, skins whose errors of the law are twice as large are also used. With
+    labels, the model can estimate the size of the errors from the residuals at the labels.
     """
     by_labels_n: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in CALIBRATION_ERRORS.items():

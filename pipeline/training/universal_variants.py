@@ -165,9 +165,8 @@ def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarr
     """
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
-    rows_by_press = own[
-        first[:, None] + np.arange(READINGS_N) % counts[:, None]
-    ]  # the readings of a press are adjacent
+    # The readings of a press are adjacent in `own`: the first has index `first`.
+    rows_by_press = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]
     db_uT = frame.field(rows.db_uT[rows_by_press.ravel()]).reshape(*rows_by_press.shape, -1)
     place_mm = frame.place(rows.target[rows_by_press[:, 0], :2].astype(float))
     parts = db_uT, rest_uT, place_mm, rows.target[rows_by_press, 2]
