@@ -338,10 +338,10 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 
 
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
-    """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
+    """Choose likelihood powers for each number of labels, from the coverage of intervals on simulated skins.
 
-    When the model is used on a board, the chosen powers are divided by the misfit of this board (Birge's ratio), and by
-    the variance inflation of its labels.
+    The chosen powers are valid for a board whose misfit is 1. When the model is used on another board, the powers are
+    divided by the misfit of this board (Birge's ratio), and by the variance inflation of its labels.
 
     The simulated skins have errors of the law that are as large as in training, and errors that the map does not model
     (see `unmodelled_error`). If there are labels, skins whose errors of the law are twice as large are also used. With

@@ -147,7 +147,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit a model of the laws' errors, to the relative errors of each law on the board to which the law was fitted."""
+    """Fit a model of the errors of laws. The data are the relative errors of each law on the board of its fit."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
