@@ -36,10 +36,10 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-# Distance of the reference chip from the board's middle, along x. The chip is assumed to be too far away from the skin
-# to measure any change of field by a poke.
+# Distance of the reference chip from the board's middle, along x. The reference chip is assumed to be so far from the
+# skin that a poke does not change the field at this chip.
 REFERENCE_ASIDE_MM = 30.0
-AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
+AS_IT_IS, ASIDE, OWN = "reading as it is", "reference chip subtracted", "common part of all chips subtracted"
 
 Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction (AS_IT_IS, ASIDE, OWN)
 
@@ -48,7 +48,7 @@ class Iron(Strict):
     """A ball of soft iron directly above the middle of the skin."""
 
     radius_mm: Annotated[float, Field(gt=0, le=100)]
-    # Distances from the top of the skin to the surface of the ball.
+    # Each distance is from the top of the skin to the surface of the ball.
     distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
 
 
@@ -62,8 +62,9 @@ class Ambient(Strict):
 def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Score the networks of every held-out board in ambient fields.
 
-    If the common part of all chips is subtracted, networks must also be trained on such inputs (see
-    `remove_common_part`). To save time, such networks are trained only for the last board.
+    The method that subtracts the common part of all chips (see `remove_common_part`) needs networks that were trained
+    on inputs from which this part was also subtracted. To save time, such networks are trained only for the last
+    board.
     """
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
@@ -80,13 +81,15 @@ def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Pat
     last = boards[-1:]
     numbers = {
         "arms": {
-            AS_IT_IS: "the paper's network",
-            ASIDE: f"a chip {REFERENCE_ASIDE_MM:g} mm aside reads the ambient field, and its mean reading is taken off",
-            OWN: "the uniform field that fits a board's own chips best is taken off, in training as in use",
+            AS_IT_IS: "nothing but the no-load reading is subtracted from the input of the paper's network",
+            ASIDE: f"a reference chip {REFERENCE_ASIDE_MM:g} mm from the middle of the board measures the ambient "
+            "field, and its mean reading is subtracted from the readings of all chips of the board",
+            OWN: "the uniform field that best fits the readings of the board's own chips is subtracted from these "
+            "readings, in training and in use",
         },
         "boards_n": len(boards),
         "seeds_n": training.seeds_n,
-        "directions": "a random one for each poke",
+        "directions": "drawn at random for each poke",
         "earth_uT": EARTH_SIZE_T / micro,
         "earth_dip_deg": EARTH_DIP_DEG,
         "iron_radius_mm": section.iron.radius_mm,
@@ -356,13 +359,14 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame(rows)
     meanings = "; ".join(f"{method}: {text}" for method, text in numbers["arms"].items())
     table.attrs["meaning"] = (
-        "The field appears after the no-load reading, so subtracting that reading does not remove it. The direction of "
-        f"a uniform field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, is "
-        f"directly above the skin's middle; it is magnetised by the earth's field ({numbers['earth_uT']:g} µT, dipping "
-        f"{numbers['earth_dip_deg']:g}°) and by the skin's field. Methods: {meanings}. The last method has networks "
-        f"for board {last['board']} only, so compare all methods on that board. [low, high] is the 95 % confidence "
-        f"interval over held-out boards (Student's t); ± (seeds) is the standard deviation over {numbers['seeds_n']} "
-        "network seeds on one board, averaged over boards. The paper gives no number (section 7: future work)."
+        "The field appears after the no-load reading, so subtracting the no-load reading does not remove the field. "
+        f"The direction of a uniform field is {numbers['directions']}. The ball of iron, "
+        f"{2 * numbers['iron_radius_mm']:g} mm across, is directly above the skin's middle. The ball is magnetised by "
+        f"the earth's field ({numbers['earth_uT']:g} µT, dipping {numbers['earth_dip_deg']:g}°) and by the skin's "
+        f"field. Methods: {meanings}. Networks for the last method were trained for board {last['board']} only, so "
+        "compare all methods in the rows of this board. [low, high] is the 95 % confidence interval over held-out "
+        f"boards (Student's t); ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds on one "
+        "board, averaged over boards. The paper names external fields as future work (section 7), and gives no number."
     )
     return {"ambient": table}
 
@@ -385,7 +389,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         right.minorticks_off()
         handles, labels = left.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", frameon=False, fontsize=9, ncols=2)
-        title = f"External fields, held-out board {last['board']} ({source})"
+        title = f"Accuracy in external fields, held-out board {last['board']} ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"ambient.svg": svg(figure)}
 

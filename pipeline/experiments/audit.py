@@ -68,7 +68,7 @@ class Check:
     found: str
     holds: bool
     known: bool = False
-    remedy: str = "Check which readings the folds hold out."
+    remedy: str = "Check section split of the scene, and run stage split again."
 
 
 def audit(
@@ -111,9 +111,9 @@ def audit(
     accepted_n = sum(check.known and check.what == COPIES for check in checks)
     known_leaks_n = sum(check.known for check in checks) - collapsed_n - accepted_n
     say(
-        f"{settings.scene}: {len(checks)} checks, no leak; {known_leaks_n} known leaks of the paper's own protocol; "
-        f"{accepted_n} folds with skins that the scene accepts as similar or weak; "
-        f"{collapsed_n} variants with collapsed networks; {unchosen_n} settings that the study did not choose"
+        f"{settings.scene}: {len(checks)} checks found no leak. In addition, {known_leaks_n} known leaks are part of "
+        f"the paper's own protocol, {accepted_n} folds have skins that the scene accepts as similar or weak, "
+        f"{collapsed_n} variants have collapsed networks, and {unchosen_n} settings were not chosen by the study"
     )
 
 
@@ -189,10 +189,13 @@ def audit_fold(
         checks.append(_check_disjoint("indentations", labels.indentation, sides))
         checks.append(_check_copies(sides, labels, db_uT, rng, accepted, scene))
     elif sides.experiment in SKIN_SHARED:
-        rule = "no test indentation is in training; the skin is the same by design"
+        rule = "no test indentation is in training (the skin is in training and test by design)"
         checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule))
     else:
-        rule = "no test indentation is in training, except in the paper's own protocol; the skin is the same by design"
+        rule = (
+            "no test indentation is in training (the skin is in training and test by design); the paper's own protocol "
+            "breaks this rule"
+        )
         checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule, known=True))
     return checks + (_check_pool(sides, labels) if len(sides.pool) else [])
 
@@ -202,11 +205,12 @@ def _check_experiment(sides: Sides) -> None:
     if sides.experiment not in known:
         raise ParamsError(
                 f"fold {sides.where}", "the experiment", f"one of {', '.join(known)}", sides.experiment,
-                "State in pipeline/experiments/audit.py what its training and test rows may share.",
+                "Add the experiment to SKINS_UNSEEN or SKIN_SHARED in pipeline/experiments/audit.py.",
             )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):
         got = f"{len(sides.train)} to train on, {len(sides.test)} to test on"
-        raise ParamsError(f"fold {sides.where}: one side of the fold has no rows: {got}. Split again.")
+        remedy = "Change section split of the scene, and run stage split again."
+        raise ParamsError(f"fold {sides.where}: one side of the fold has no rows: {got}. {remedy}")
 
 
 def _check_readings(sides: Sides) -> Check:
@@ -246,7 +250,7 @@ def _check_copies(
     if len(unaccepted) or not (len(train.name) and len(test.name)):
         least_uT = STRONG_NOISES * noise_uT(db_uT.shape[1])
         found = f"not checked, because no field change exceeds {least_uT:.0f} µT{_first_names(weak_skins)}"
-        remedy = f"To accept this, write in {section}: weak_skins: [{', '.join(map(str, unaccepted))}]"
+        remedy = f"To accept these weak skins, write in {section}: weak_skins: [{', '.join(map(str, unaccepted))}]"
         return Check(COPIES, sides.where, rule, found, holds=False, known=not len(unaccepted), remedy=remedy)
     likenesses = all_likenesses(test, train, rng=rng)
     captures_n = len({likeness.capture for likeness in likenesses})
@@ -265,8 +269,8 @@ def _check_copies(
         f"skin {other}"
     )
     remedy = (
-        f"Is it the same recording? Then remove one of the two: reskin remove {scene} {capture}. If the recordings are "
-        f"different, write in {section}: similar_skins: [[{skin_of[capture]}, {other}]]"
+        f"If both are the same recording, remove one of them: reskin remove {scene} {capture}. If they are different "
+        f"recordings, write in {section}: similar_skins: [[{skin_of[capture]}, {other}]]"
     )
     return Check(COPIES, sides.where, rule, found, holds=False, known=not not_accepted, remedy=remedy)
 
@@ -377,8 +381,9 @@ def nearest_rays(
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Find, for each row of `db_uT`, the row of `others_uT` whose direction is nearest.
 
-    Returns the index of this row of `others_uT`, and the distance in uT between the row of `db_uT` and the line through
-    the origin in the direction of this row. The distance does not change if `others_uT` is multiplied by a factor.
+    Returns two arrays. The first contains the index of the nearest row of `others_uT`. The second contains the distance
+    in uT between the row of `db_uT` and the line through the origin and this nearest row. The distance does not change
+    if `others_uT` is multiplied by a factor.
     """
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))
@@ -442,7 +447,8 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
     """Return the arrays of a scaler that is fitted to these rows; equal fits are computed only once."""
-    fit_key = (*key, len(db_uT))  # the row count distinguishes training rows from training and test rows
+    # The number of rows distinguishes a fit to the training rows from a fit to training and test rows.
+    fit_key = (*key, len(db_uT))
     if fit_key not in fits:
         fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
     return fits[fit_key]
@@ -463,11 +469,12 @@ def audit_scaler(
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
     )
     found = (
-        f"relative difference {train_gap:.2g} from a scaler of the training rows, {both_gap:.2g} from one of training "
-        "and test rows"
+        f"relative difference {train_gap:.2g} from a scaler fitted to the training rows, and {both_gap:.2g} from a "
+        "scaler fitted to training and test rows"
     )
-    rule = f"the scaler was fitted to the training rows alone; allowed relative difference {SCALER_TOLERANCE:.2g}"
-    return Check("scaler", where, rule, found, holds=train_gap <= SCALER_TOLERANCE and train_gap <= both_gap)
+    rule = f"the scaler was fitted to the training rows alone (tolerance: relative difference {SCALER_TOLERANCE:.2g})"
+    holds = train_gap <= SCALER_TOLERANCE and train_gap <= both_gap
+    return Check("scaler", where, rule, found, holds=holds, remedy="Train this network again.")
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
@@ -478,7 +485,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
-            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Retrain this network.")
+            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Train it again.")
         size = np.where(value == 0, 1.0, np.abs(value))
         gaps.append(np.max(np.abs(arrays[name].astype(np.float64) - value) / size))
     return float(np.max(gaps))
@@ -495,15 +502,19 @@ def audit_tuning(
     tested = np.intersect1d(adapted_to, indentation[sides.test])
     foreign = np.setdiff1d(adapted_to, indentation[sides.pool])
     base_known = tuning["from"] in bases
+    remedy = "Adapt this network again."
     base = f"the pretrained network is {'' if base_known else 'not '}of the same fold and seed"
     pokes = (
         f"of {len(adapted_to)} indentations for adaptation, {len(tested)} are tested, and {len(foreign)} are not in "
         "the fold's pool"
     )
-    rules = "the pretrained network has the same fold and seed", "all are in the fold's pool, and none is tested"
+    rules = (
+        "the pretrained network has the same fold and seed as the adapted network",
+        "all indentations for adaptation are in the fold's pool, and none of them is tested",
+    )
     return [
-        Check("base", where, rules[0], base, holds=base_known),
-        Check("pokes", where, rules[1], pokes, holds=not len(tested) and not len(foreign)),
+        Check("base", where, rules[0], base, holds=base_known, remedy=remedy),
+        Check("pokes", where, rules[1], pokes, holds=not len(tested) and not len(foreign), remedy=remedy),
     ]
 
 
@@ -519,13 +530,14 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
         f"{len(collapsed)} of {len(cards)} networks collapsed{': ' if collapsed else ''}{', '.join(collapsed)}; "
         f"{again_n} training runs were repeated"
     )
-    rule = "no network predicts nearly the same for any input"
+    rule = "no network predicts nearly the same values for all inputs"
     return Check(COLLAPSE, variant, rule, found, holds=not collapsed, known=bool(collapsed))
 
 
 # --- Settings ---
 
-# The variant on the left uses the recipe that was chosen for the one on the right
+# The study chooses no recipe for the variants on the left. Each of them uses the recipe that the study chose for the
+# variant on the right.
 SAME_AS = {"train_single": "train_multi"}
 
 
@@ -585,8 +597,10 @@ def audit_choice(
         names = f": {', '.join(shared)}" if shared else ""
         found = f"{len(shared)} of {len(set(tested))} tested {what} were used to choose the settings{names}"
         rule = f"no tested {what.removesuffix('s')} was used in scene {record.scene} to choose the settings"
-        checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared))
-    found = "equal" if record.physics == physics else f"{NOT_CHOSEN}: {record.physics}, now {physics}; run it again"
+        remedy = "Choose the settings in a scene with other boards and skins."
+        checks.append(Check(f"settings: {what}", "all folds", rule, found, holds=not shared, remedy=remedy))
+    changed = f"{NOT_CHOSEN}: fingerprint {record.physics}, now {physics}; run the study of settings again"
+    found = "equal" if record.physics == physics else changed
     rule = f"the settings of the simulated skin are those with which scene {record.scene} chose the training settings"
     checks.append(Check("settings: physics", "all variants", rule, found, holds=True))
     return checks + [audit_recipe(variant, recipe, record) for variant, recipe in recipes.items()]
@@ -594,11 +608,13 @@ def audit_choice(
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
     """Report how a recipe differs from the recipe that the study chose; a difference is not a leak."""
-    rule = f"the recipe is the one that scene {record.scene} chose; differences are listed"
+    rule = f"the recipe equals the recipe that scene {record.scene} chose; differences are only listed"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)
     if chosen is None:
-        return Check("settings: recipe", variant, rule, f"{NOT_CHOSEN}: it chose no recipe for this stage", holds=True)
+        return Check(
+            "settings: recipe", variant, rule, f"{NOT_CHOSEN}: the study chose no recipe for this stage", holds=True
+        )
     used, best = ({key: repr(value) for key, value in settings.items()} for settings in (recipe, chosen))
     differing = [
         f"{key} {used.get(key, 'absent')} (study: {best.get(key, 'absent')})"

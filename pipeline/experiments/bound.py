@@ -1,6 +1,6 @@
 """The smallest error that the noise of the chips allows, compared with the scores of a network (paper section 4).
 
-The experiment computes the Cramér-Rao bound for estimates of place and force from one input row, which is a lower limit
+Place and force are estimated from one input row. The experiment computes the Cramér-Rao bound, which is a lower limit
 of the variance of unbiased estimates. The skin is simulated, and its properties are assumed to be known.
 """
 
@@ -89,8 +89,8 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
     touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
     if not touched.any():
         what = (
-            f"its surface is {-skin.depth_zero_m / milli:.2g} mm below depth 0, and depths_mm are at most "
-            f"{depths_mm.max():g}"
+            f"no poke touches the skin, because its surface is {-skin.depth_zero_m / milli:.2g} mm below depth 0, and "
+            f"the largest of depths_mm is {depths_mm.max():g} mm"
         )
         raise ParamsError(f"skin {skin.name}: {what}. Increase depths_mm of the main protocol.")
     return touched
@@ -187,13 +187,14 @@ def score_network(models: Path, skin: str) -> dict[str, Any]:
     skins = sorted({name for card in cards for name in card["train_skins"]})
     if skins != [skin]:
         raise SchemaError(
-            f"{models}: the networks of {NETWORK} were trained on skins {skins}, not on {skin}. Retrain them."
+            f"{models}: the networks of {NETWORK} were trained on skins {skins}, not on {skin}. Run stage "
+            "train_single again."
         )
     scores = over_folds(tidy(cards))
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
-SIDES = {"signal": "bound", "with_label_errors": "bound, labels' errors added"}
+SIDES = {"signal": "bound", "with_label_errors": "bound with label errors"}
 NONE = "–"
 
 
@@ -218,13 +219,13 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     labels, above_n = numbers["labels"], numbers["above_the_skin_n"]
     above = f" {above_n} pokes that do not touch the skin are excluded." if above_n else ""
     return (
-        "Bound (Cramér-Rao): the smallest error of an unbiased estimate from the change of field of one row "
+        "Bound (Cramér-Rao): the smallest error of an unbiased estimate from the change of field of one input row "
         f"({numbers['readings_n']} reading minus the mean of {numbers['noload_frames_n']} no-load readings), averaged "
-        f"over the {numbers['places_n']} places of skin {numbers['skin']}; its accuracy assumes normally distributed "
-        "errors. The only sources of error are the chips' noise and rounding: the skin, its board and the "
-        "after-effects of earlier pokes are taken as known. Errors of the labels, as standard deviations: "
-        f"{labels['place_sd_mm']:g} mm per axis for the robot's position, and {labels['force_sd_N']:.2g} N for the "
-        f"force sensor, which measures the force at the true depth.{above} Network: random passes of the same skin are "
-        "held out. All places are on a grid; a network that learns the grid is biased towards it and may have a "
-        "smaller error than the bound."
+        f"over the {numbers['places_n']} places of skin {numbers['skin']}. The accuracy of the bound assumes normally "
+        "distributed errors. The only sources of error are the noise of the chips and rounding, because the skin, its "
+        "board and the after-effects of earlier pokes are assumed to be known. Standard deviations of the labels' "
+        f"errors: {labels['place_sd_mm']:g} mm per axis for the robot's position, and {labels['force_sd_N']:.2g} N for "
+        f"the force sensor, which measures the force at the true depth.{above} Network: random passes of the same skin "
+        "are held out. All places are on a grid. A network that learns this grid is biased towards its places, and may "
+        "therefore have a smaller error than the bound."
     )

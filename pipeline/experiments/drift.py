@@ -89,9 +89,10 @@ class Drift(SectionWithTraining):
     @model_validator(mode="after")
     def _check_windows_and_policies(self) -> "Drift":
         if self.test_n > self.every_n:
-            raise ValueError(f"test_n must be at most every_n ({self.every_n}), so that windows do not overlap")
+            raise ValueError(f"test_n must be at most every_n ({self.every_n}), so that test windows do not overlap")
         if self.train_n > self.every_n:
-            raise ValueError(f"train_n must be at most every_n ({self.every_n}), where the first test window begins")
+            what = "the first test window begins after every_n indentations or passes"
+            raise ValueError(f"train_n must be at most every_n ({self.every_n}), because {what}")
         if ("regular" in self.policies) != (self.regular_n is not None):
             raise ValueError("regular_n is required if policies contains regular, and not allowed otherwise")
         if len(set(self.policies)) < len(self.policies):
@@ -125,8 +126,10 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
     selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
     if section.wander_uT and captures[0].source != "simulated":
-        what = f"drift.wander_uT is {list(section.wander_uT)}, but a recorded scene has its own drift"
-        raise ParamsError(f"{settings.where}: {what}. Remove it.")
+        raise ParamsError(
+            f"{settings.where}: drift.wander_uT is {list(section.wander_uT)}, but a recorded scene already contains "
+            "real drift, so simulated drift must not be added. Remove drift.wander_uT."
+        )
     windows, parts = cut_windows(captures, section, selection)
     jobs = list(make_jobs(parts, section, settings.seed))
     data = SceneData(settings.scene, settings, stack(parts), [])
@@ -334,9 +337,9 @@ class ContactForces:
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
     """Average true and predicted forces over the readings of each indentation.
 
-    The average is taken because the readings of one indentation are not independent, so the standard error of the force
-    bias must be computed over indentations. All `predictions` must be for the same window, and each for a different
-    skin.
+    The readings of one indentation are not independent. The standard error of the force bias must therefore be computed
+    over indentations, each of which has one averaged force. All `predictions` must be for the same window, and each for
+    a different skin.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -464,16 +467,20 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Describe the times in `numbers` (see `pace`); for simulated captures, add a remark on temperature."""
+    """Return sentences about the times of the contacts; `numbers` contains the values that `pace` returned.
+
+    If the captures are simulated (`source`), a sentence explains why changes of temperature are spread over many
+    contacts.
+    """
     if "lasts_s" not in numbers:
         return "The times of the contacts are not known."
     every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"
-    text = f"{every}; the whole capture lasts {numbers['lasts_s']:,.0f} s."
+    text = f"{every}, and the longest capture lasts {numbers['lasts_s']:,.0f} s."
     if source != "simulated":
         return text
     return (
-        f"{text} A real rig takes seconds per contact, so in the simulation a change of temperature is spread over "
-        "many more contacts than on a rig."
+        f"{text} A real rig takes several seconds per contact. The simulated contacts follow one another much faster, "
+        "so many more contacts take place while the temperature changes by a given amount."
     )
 
 
@@ -601,7 +608,8 @@ def mean_over_boards(
 ) -> tuple[dict[str, Any], list[float] | None]:
     """Average the values of each board's networks; return statistics of these averages over boards.
 
-    The second result is the 95 % interval of the mean over networks, which ignores that networks share boards.
+    The second result is the 95 % interval of the mean over networks. It is computed as if all networks were
+    independent, although networks of the same board are not.
     """
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
@@ -657,7 +665,7 @@ def judge_findings(
 
 
 def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
-    """Return how fast the errors of each network grow: their least-squares slope per 10,000 contacts."""
+    """Return how fast the errors of each network grow: the slope of a fitted straight line, per 10,000 contacts."""
     contacts = np.array(contacts_n, float) / PER_CONTACTS_N
     deviation = contacts - contacts.mean()
     return errors @ deviation / (deviation @ deviation)
@@ -700,18 +708,20 @@ def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) ->
 
 POLICIES = ("initial", "regular", "each", "free")
 WANDER_MEANING = (
-    "The networks of figure 5a, tested again on their last window after a random walk was added to the captures. After "
-    "the training contacts, each contact adds one normally distributed step per channel, to contact readings and to "
-    "no-load readings. The row without an added walk is the last window of figure 5a. The table of skins gives the "
-    "drift of the field at rest without an added walk, as rms change over 1 to 1,000 contacts."
+    "The networks of figure 5a are tested again on their last test window, after a random walk was added to the "
+    "captures as additional drift. At each contact after the training contacts, every channel of the walk changes by a "
+    "normally distributed step. The walk is added to contact readings and to no-load readings. The row with a walk of "
+    "0 µT repeats the scores of the last window of figure 5a. For comparison, the table of skins states the drift that "
+    "the captures have without an added walk: the rms change of the field at rest over 1 to 1,000 contacts."
 )
 FINDINGS_MEANING = (
-    f"{VERDICTS} A finding with several parts is contradicted if one part is, and supported if all are. Over these "
-    "training runs: the same verdicts, but from the 95 % interval over pairs of networks (policies trained from the "
-    "same seed on the same skin); for the force bias this interval is widened to two standard errors over indentations "
-    "where these are larger. Several training runs on one skin show how much training runs vary, not how much boards "
-    "do. Measured: values by no-load policy; brackets are the 95 % interval over boards, or over these training runs "
-    "if there are too few boards."
+    f"{VERDICTS} A finding with several parts is contradicted if one part is contradicted, and supported if all parts "
+    "are supported. Column `over these training runs`: the same verdicts, but computed from the 95 % interval over "
+    "pairs of networks. The two networks of a pair were trained with different no-load policies, from the same seed "
+    "and on the same skin. The interval of the force bias extends by at least two standard errors over indentations to "
+    "each side. Several training runs on one skin show how much training runs vary, not how much boards vary. Column "
+    "`measured`: the compared values, with the no-load policy of each. Brackets are the 95 % interval over boards or, "
+    "if there are too few boards, over training runs."
 )
 
 
@@ -745,7 +755,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             line = {"added walk, µT per contact": f"{first['step_uT']:g}", "source": source}
             for policy, (title, _) in policies.items():
                 row = numbers["wander"][policy][i]
-                line[f"no-load reading off by, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
+                line[f"error of the no-load reading, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
                 line |= {f"{COLUMNS[name]} ({title})": show(_stat(row, name)) for name in ("accuracy_pct", error)}
             walked.append(line)
         result["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
@@ -759,15 +769,17 @@ def _possible_reasons(numbers: Mapping[str, Any]) -> str:
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
     )
     text = (
-        f"A contact changes the field by {field['contact_uT']:.3g} µT rms over channels; the noise of a no-load "
-        f"reading is {field['noload_noise_uT']:.2g} µT. In the last window, the no-load reading in use differs from "
-        f"one taken just before the contact by {offsets}."
+        f"A contact changes the field by {field['contact_uT']:.3g} µT (rms over channels). The noise of a no-load "
+        f"reading is {field['noload_noise_uT']:.2g} µT. A no-load reading may be outdated. In the last window, the rms "
+        f"difference between the subtracted no-load reading and one just before the contact is, by policy: {offsets}."
     )
     if "force_left_pct" in late:
         left_pct = late["force_left_pct"]
         text += (
-            f" After {late['contacts_n']:,} contacts, the force at equal places and depths is {left_pct:.4g} % of the "
-            f"early force, so softening explains a force bias of {100 - left_pct:+.2g} %."
+            f" After {late['contacts_n']:,} contacts, the force at the same places and depths is {left_pct:.4g} % of "
+            "the force in the training window, because the skin has softened. Networks that were trained before the "
+            "softening still estimate the early force, so the softening explains a force bias of "
+            f"{100 - left_pct:+.2g} %."
         )
     return text
 
@@ -778,7 +790,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
         "initial": "once at the start",
         "regular": f"every {numbers.get('regular_n')} indentations",
         "each": "before every contact",
-        "free": "whenever judged free of contact",
+        "free": "whenever a reading is judged free of contact",
     }
     return {policy: (titles[policy], numbers[policy]) for policy in POLICIES if policy in numbers}
 
@@ -814,11 +826,14 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
         for name in ("train_n", "test_n", "every_n", "left_out_units_n")
     )
     text = (
-        f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
-        "the no-load reading has its own networks. Contacts: number of contacts of the skin before the test."
+        f"Networks are trained on the first {train} of each skin, and tested on {test} after every {every}. Separate "
+        "networks are trained for each no-load policy, which states when a new no-load reading is taken. Column "
+        "`contacts`: number of contacts of the skin before the test."
     )
     return text + (
-        f" The last {left_out} do not fill a test window, and are not used." if numbers["left_out_units_n"] else ""
+        f" The last {left_out} are not used, because they do not fill a test window."
+        if numbers["left_out_units_n"]
+        else ""
     )
 
 
@@ -830,7 +845,7 @@ MARGIN = 0.05  # margin of the axes of figure 5b, as a fraction of the range of 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot scores against contacts (figure 5a), scores against the added random walk, and late forces (figure 5b)."""
     windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
-    title = f"Trained on the first contacts, tested on later ones ({source})"
+    title = f"Networks trained on the first contacts, tested on later contacts ({source})"
     texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}
     if "wander" in numbers:
         last_n = next(iter(windows.values()))[-1]["contacts_n"]
@@ -888,7 +903,8 @@ def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]],
             f"bias {show_difference(bias)} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
             f"no-load reading: {name}\n"
-            f"mean of {len(late['network_bias_N'])} networks; points: the first"
+            f"bias and slope: mean of {len(late['network_bias_N'])} networks\n"
+            "points: networks of the first seed"
         )
         axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=10)
         axes.legend(loc="lower right", frameon=False)

@@ -1,8 +1,8 @@
 """Dynamic presses: readings at the full rate while the force keeps changing (paper section 7, future work).
 
-Place and force are estimated from each reading alone, and from the mean of the last five readings, because the paper
-averages five readings of a press at rest. While the force changes, such a mean has less noise but lags behind the
-force.
+Place and force are estimated in two ways: from each reading alone, and from the mean of the last five readings. The
+paper averages five readings of a press at rest. While the force changes, such a mean has less noise than a single
+reading, but it lags behind the force.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -59,7 +59,7 @@ def dynamics(settings: Settings, indentations: Path, models: Path, results: Path
     numbers = score_presses(presses, networks_held_out(models, capture.board), board=capture.board)
     write_results(results, numbers, {}, read_losses(indentations, {}))
     described = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
-    say(f"{settings.scene}: {numbers['readings_n']} readings of {described}")
+    say(f"{settings.scene}: scored {numbers['readings_n']} readings of {described}")
 
 
 def find_presses(
@@ -165,18 +165,20 @@ def lag_ms(
 
 
 MEANING = (
-    "Half-sine presses at random places of the grid, recorded at the full rate. The model is the paper's network, "
-    "trained on other boards with readings at rest. A reading is scored if four readings of the same press come before "
-    f"it and its force is at least {FORCE_MIN_N:g} N. The mean of the last five readings is the paper's protocol at "
-    "rest; during a press, these five readings are taken at different depths. The third method compares the same mean "
-    "with place and force at its middle reading, two frames earlier: the difference in error is due to lag. Presses "
-    "of different durations also differ in depth and place, so compare methods at the same duration. "
-    f"± is the standard deviation over network seeds; all presses are on one board. {VERDICTS}"
+    "The presses are at random places of the grid, and are recorded at the full rate. During a press, the depth "
+    "follows half a period of a sine. The model is the paper's network, trained on other boards with readings at rest. "
+    "A reading is scored if four readings of the same press come before it and its force is at least "
+    f"{FORCE_MIN_N:g} N. For presses at rest, the paper averages five readings; here, the last five readings are taken "
+    "at different depths. The estimate from their mean is compared with the true place and force at the last of the "
+    "five readings and, in the third method, at the middle reading, which is two frames earlier. The difference "
+    "between these two errors is due to lag. Presses of different durations also differ in depth and place, so compare "
+    "methods at the same duration. ± is the standard deviation over network seeds. All presses are on one board. "
+    f"{VERDICTS}"
 )
 TITLES = {
     "one": "each reading alone",
-    "mean5": "mean of the last five",
-    "mean5_of_middle": "same mean, compared with its middle reading",
+    "mean5": "mean of the last five readings",
+    "mean5_of_middle": "same mean, compared with middle reading",
 }
 LESS = "less force error than each reading alone, N²"  # title of a column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -189,7 +191,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
         {
-            "press lasts about, s": label,
+            "duration of the press (about), s": label,
             "presses": result["presses_n"],
             "readings": result["n"],
             "estimated from": title,

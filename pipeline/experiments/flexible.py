@@ -148,7 +148,7 @@ def draw_forces(
     }  # fmt: skip
 
 
-VARIANTS = {"before": "before", "after": "adapted", "control": "as long, without pokes"}
+VARIANTS = {"before": "before adaptation", "after": "adapted", "control": "control: trained as long, without pokes"}
 OF_SHAPE = "direction and length of the change of field (ours): "
 
 
@@ -199,10 +199,11 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
         f"tested on {numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted with "
         f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted minus true force, also as a percentage of "
         f"the mean force; the paper reports {FLEXIBLE_BIAS} after adaptation, without a number. In our simulation, "
-        f"|dB| at equal depth is {show(numbers['strength_ratio'])} times that on rigid boards (± over depths). The gap "
-        f"between chips and skin is {gap_mm['flexible']:g} mm instead of {gap_mm['rigid']:g} mm, "
-        f"{numbers['gap_less_pct']:.0f} % less; in the paper it is {FLEXIBLE_GAP_LESS_PCT:g} % less. "
-        "The paper's numbers are after adaptation; its accuracy is approximate."
+        f"|dB| at equal depth is {show(numbers['strength_ratio'])} times as large as on rigid boards (± over depths). "
+        f"The gap between chips and skin is {numbers['gap_less_pct']:.0f} % smaller on flexible boards "
+        f"({gap_mm['flexible']:g} mm) than on rigid boards ({gap_mm['rigid']:g} mm). In the paper, it is "
+        f"{FLEXIBLE_GAP_LESS_PCT:g} % smaller. The paper's numbers are for adapted networks, and its accuracy is "
+        "approximate."
     )
 
 

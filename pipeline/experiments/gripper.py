@@ -106,8 +106,8 @@ def gripper(settings: Settings, section: Gripper, indentations: Path, models: Pa
     write_results(results, numbers, plot_data, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
     say(
-        f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "
-        f"{best['press']}"
+        f"{settings.scene}: best result: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs; force estimated "
+        f"by {best['feedback']}, one known press used: {PRESSES[best['press']]}"
     )
 
 
@@ -154,7 +154,8 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
 def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
     """Scale all estimates by the factor that makes the estimate for the press of known force correct."""
-    factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)  # networks may predict 0 or less
+    # The estimate is raised to at least 1 mN, because a network may predict a force of 0 or less.
+    factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)
     return lambda b_uT: factor * estimate(b_uT)
 
 
@@ -237,16 +238,18 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
 
 
 MEANING = (
-    "A one-line controller closes a gripper until the estimated force equals the intended force (the aim), "
-    "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times per second, while the object stiffens "
-    "threefold, softens ninefold and stiffens again: {objects_n} objects of {soft:g} to {hard:g} N/mm on each of "
-    "{skins_n} skins, one per board, pressed at the skin's middle. The networks were trained without the board; `map` "
-    "is the universal model that comes with the project. The known press has the intended force, at the place where "
-    "the object is then held: as a factor, it scales all estimates; as a label, it calibrates the universal model. The "
-    "true force is scored from one second on. Held: the run's mean force is within {within_pct:g} % of the aim. "
-    "Always: the force never leaves that band. Error: mean absolute deviation from the aim over a run. [low, high]: 95 "
-    "% confidence interval over boards. Each of the {seeds_n} networks of a board controls its own runs; ± (seeds): "
-    "standard deviation over {seeds_n} network seeds on one board, averaged over boards."
+    "A controller closes a gripper until the estimated force equals the intended force (the aim). It computes "
+    "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times per second. During a run, the stiffness "
+    "of the object rises to three times its nominal value, falls to a third of this value, and returns to it. The "
+    "{objects_n} objects have nominal stiffnesses of {soft:g} to {hard:g} N/mm. Each is held on each of {skins_n} "
+    "skins (one per board), at the skin's middle. The networks were trained without the board. `map` is the universal "
+    "model that comes with the project. The known press has the intended force, and is at the place where the object "
+    "is held later. As a factor: all estimates are multiplied by the factor that corrects the estimate for this "
+    "press. As a label: the universal model is calibrated with this press. The true force is scored from one second "
+    "on. Held: the mean force of the run is within {within_pct:g} % of the aim. Always within: the force is within "
+    "{within_pct:g} % of the aim at all times. Error: mean absolute deviation from the aim over a run. [low, high]: "
+    "95 % confidence interval over boards. Each of the {seeds_n} networks of a board controls its own runs. ± "
+    "(seeds): standard deviation over {seeds_n} network seeds on one board, averaged over boards."
 )
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 
@@ -259,7 +262,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             "force estimated by": row["feedback"],
             "one known press": PRESSES[row["press"]],
             "held, % of runs": f"{row['held_pct']:.0f}",
-            "always, % of runs": f"{row['always_pct']:.0f}",
+            "always within, % of runs": f"{row['always_pct']:.0f}",
             "median error, %": f"{row['median_error_pct']:.1f}",
             "worst run's error, %": f"{row['worst_error_pct']:.0f}",
             "error, % (boards)": _interval(row["error_pct"]),
@@ -290,7 +293,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set_xticks(range(len(rows)), labels, fontsize=8, rotation=45)
             axes.set_title(f"{aim_N:g} N", fontsize=10)
         panels[0].set_ylabel("mean force minus aim / %")
-        title = f"Force control by estimated force; labels: model, and use of a known press ({source})"
+        title = f"Force control with estimated forces, by model and by use of one known press ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"gripper.svg": svg(figure)}
 

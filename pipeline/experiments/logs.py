@@ -65,7 +65,7 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
         numbers |= score_turning(Log(t_s, b_uT, true, estimated.quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
     write_results(results, numbers, thin(estimated, true), losses)
-    say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
+    say(f"{settings.scene}: {numbers['contacts_n']} contacts found in a log of {numbers['duration_s']:.1f} s")
 
 
 # --- A board that rotates in the earth's field ---
@@ -85,7 +85,8 @@ def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[E
     """Score the networks on the log as if its board rotated in the earth's field, without and with a reference chip."""
     simulation, seed = simulation_settings(settings), settings.seed
     chip = simulation.chip
-    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])  # a log has single readings, not means
+    # A log contains single readings, not means of several readings, so the noise of a single reading is used.
+    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     instrument = replace(draw_instrument(simulation, board, seed=seed), noise_uT=noise_uT)
     return {
         "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),
@@ -131,8 +132,8 @@ def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) ->
 def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
     """Return the earth's field in the axes of a board that pitches about its y axis.
 
-    At rest, the board's x axis points north. This direction is the worst case, because the whole field is in the plane
-    in which the x axis moves.
+    At a pitch of 0, the board's x axis points north. This direction is the worst case, because the x axis then moves in
+    the plane that contains the whole field.
     """
     return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
 
@@ -146,20 +147,23 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
 # --- Tables and figures ---
 
 MEANING = (  # the experiment's numbers are inserted by `str.format`
-    "A log at {rate_hz:.0f} Hz with only times and readings, as a board writes it to an SD card: a quiet start, "
-    "then footfalls at random places. The quiet start is the no-load reading; a contact is a change of field well "
-    "above its noise. Places and forces are predicted by networks trained without the board, each scored separately: ± "
-    "is the standard deviation over {networks_n} network seeds. Errors are over the readings detected as contact, "
-    "against the true values of the simulation. The board does not rotate: the earth's field is part of the no-load "
-    "reading and remains constant, unlike in a dog's shoe or on a hand."
+    "The log has a rate of {rate_hz:.0f} Hz and contains only times and readings, as a board writes it to an SD card. "
+    "It begins with a quiet time without contact, which is followed by footfalls at random places. The mean of the "
+    "quiet readings is the no-load reading. A reading is detected as contact if the field has changed by much more "
+    "than the noise of the quiet readings. Networks that were trained without this board predict places and forces. "
+    "Each network is scored separately: ± is the standard deviation over {networks_n} network seeds. Errors are "
+    "computed for the readings that are detected as contact, from the true values of the simulation. The board does "
+    "not rotate, so the earth's field is constant and is subtracted with the no-load reading. In a dog's shoe or on a "
+    "hand, the board would rotate."
 )
 TURNING = (
-    "The same log, as if the board pitched to either side by the given angle, sinusoidally once per step "
-    "({turning_period_s:.2g} s) in the earth's field of {earth_uT:.0f} µT, walking north (the worst direction); the "
-    "angles are assumed. Changes of that field are mistaken for contacts. As a remedy, one additional chip of the same "
-    "type and noise, placed aside, is read with every frame; its reading, rotated to each chip's axes by the board's "
-    "design, is subtracted from all others. Errors are over the readings in contact that were detected as contact: "
-    "if more weak contacts are detected, the mean force error falls. ± is the standard deviation over network seeds."
+    "The same log, as if the board pitched in the earth's field of {earth_uT:.0f} µT. The pitch angle is a sine with "
+    "the given amplitude and one period per step ({turning_period_s:.2g} s). The amplitudes are assumed. The wearer "
+    "walks north, which is the worst direction. The field in the axes of the board changes with the pitch, and these "
+    "changes are mistaken for contacts. As a remedy, an additional chip of the same type and noise, which is not under "
+    "the skin, is read with every frame. Its reading is rotated to the axes of each chip and subtracted from the "
+    "chip's reading. Errors are computed for the readings in contact that were detected as contact. The mean force "
+    "error is therefore smaller if more weak contacts are detected. ± is the standard deviation over network seeds."
 )
 VARIANTS = {"as logged": None, "reference chip subtracted": "reference_chip"}
 
@@ -175,7 +179,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         ("duration, s", f"{numbers['duration_s']:.1f}", "–"),
         ("readings", f"{numbers['readings_n']}", "–"),
         ("readings lost to failed reads and stuck chips", f"{account['rows_read_n'] - account['rows_n']}", "–"),
-        ("frames missing in time gaps", f"{account['gap_frames_n']}", "–"),
+        ("frames missing from gaps between times", f"{account['gap_frames_n']}", "–"),
         ("contacts found", f"{numbers['contacts_n']}", "–"),
         ("true contacts", _show(numbers, "contacts_true_n"), "–"),
         ("readings in contact", f"{numbers['contact_readings_n']}", "–"),
@@ -239,7 +243,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         panels[2].set_xlabel("time / s")
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-        panels[0].set_title(f"A log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
+        panels[0].set_title(f"Estimates from a log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
         return {"logs.svg": svg(figure)}
 
 

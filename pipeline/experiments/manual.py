@@ -97,7 +97,9 @@ def fold_without(data: SceneData, board: str) -> Fold:
     """Return the fold of experiment `lobo` (leave one board out) that holds out `board`."""
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
-        what = f"board {board} is not held out by any fold of lobo ({', '.join(sorted(folds))})"
+        what = (
+            f"no fold of experiment lobo (leave one board out) holds out board {board}, only {', '.join(sorted(folds))}"
+        )
         raise SchemaError(
             f"experiment manual: {what}. Record hand pokes on skins that also occur in other captures of the scene."
         )
@@ -128,9 +130,9 @@ def summarise_manual(
 
 
 VARIANTS = {
-    "before": "before",
+    "before": "before adaptation",
     "after": "adapted with hand pokes",
-    "control": "as long, without pokes",
+    "control": "control: trained as long, without pokes",
     "grid": "adapted with as many robot pokes",
 }
 DIFFERENCES = {
@@ -159,15 +161,17 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             cells = {metric: judge(difference.get(metric), metric) for metric in COLUMNS}
             lines.append(_line(title, difference, cells, PAPER_DIFFERENCES.get(name, {}), source))
     meaning = (
-        f"{numbers['pokes_n']} hand pokes per skin (paper: {MANUAL_POKES_N}), along {numbers['lines_n']} lines; only "
-        "the order of the pokes along a line is known, not their places. Networks of folds that hold out the skin's "
-        "board are adapted with these pokes and tested on the robot's grid of the same skin. Differences: is "
-        f"adaptation with hand pokes better than the alternative? {VERDICTS}"
+        f"Each skin has {numbers['pokes_n']} hand pokes (paper: {MANUAL_POKES_N}), along {numbers['lines_n']} lines. "
+        "The order of the pokes along a line is known, but not their places. Networks that were trained without the "
+        "skin's board are adapted with these pokes, and tested on pokes by the robot on a grid of the same skin. The "
+        "rows of differences state whether adaptation with hand pokes is better than the alternative. "
+        f"{VERDICTS}"
     )
     spread = (
         "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
         f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
-        "on one skin, averaged over skins; for a difference, that of the differences between networks of equal seed."
+        "on one skin, averaged over skins. In the rows of differences, it is the standard deviation of the differences "
+        "between networks with the same seed."
     )
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
 

@@ -225,19 +225,25 @@ def summarise_accuracy(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]
 
 
 OF_ORIENTATION = (
-    "What the shipped universal model finds from the no-load field alone. `found turned`: percentage of skins that it "
-    "takes as turned by a quarter; `warned`: for which it warns that the orientation is uncertain; `large misfit`: "
-    "whose 65 presses at random places then have a median misfit above {misfit:g}. Log odds: of the found orientation "
-    "against the other one. A turned skin has all fields negated."
+    "The orientation that the shipped universal model finds from the no-load field alone. Found turned: percentage of "
+    "skins that the model takes for skins turned by 90 degrees. Warned: percentage of skins for which the model warns "
+    "that the orientation is uncertain. Smallest log odds: smallest value, over the skins, of the log odds of the "
+    "found orientation against the other orientation. Large misfit: percentage of skins for which 65 presses at random "
+    "places have a median misfit above {misfit:g}. A skin that is turned by 90 degrees "
+    "has all fields negated."
 )
 OF_LABELS = (
-    "Percentage of trials with a warning that names these axes; for labels as given, with any such warning (false "
-    "alarms). The model has only the no-load field and the labels. Recorded boards: {draws_n} draws of labels each."
+    "Percentage of trials in which the model warns that the labels have these wrong axes. In the row `as given`, the "
+    "axes are right, so every warning is a false alarm, and all warnings are counted. The model receives only the "
+    "no-load field and the labels. On each recorded board, labels are drawn at random {draws_n} times."
 )
 OF_ACCURACY = (
-    "Held-out places of recorded boards, as recorded and with all fields negated: 65 unlabelled presses at random "
-    "places, labels and tests on different colours of a checkerboard, means over {draws_n} draws and then over boards; "
-    "(a; b) are the values of the boards. `orientation assumed`: the model takes every skin as not turned."
+    "Accuracy of estimated places on recorded boards, as recorded and with all fields negated (as if the skin had been "
+    "turned by 90 degrees). The model is calibrated with 65 unlabelled presses at random places. Labelled presses are "
+    "at places of one colour of a checkerboard, and tested presses at places of the other colour. The scores are means "
+    "over {draws_n} random draws and then over boards; (a; b) are the values of the boards. `orientation found`: the "
+    "model finds the orientation from the no-load field. `orientation assumed`: the model assumes that no skin is "
+    "turned."
 )
 
 
@@ -247,7 +253,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         {
             "skins": f"{row['skins_n']} {row['source']}", "mounting": row["change"],
             "found turned, %": round(row["turned_pct"], 1), "warned, %": round(row["warned_pct"], 1),
-            "least log odds": round(row["log_odds_min"], 1), "large misfit, %": round(row["misfit_pct"], 1),
+            "smallest log odds": round(row["log_odds_min"], 1), "large misfit, %": round(row["misfit_pct"], 1),
         }
         for row in numbers["orientation"]
     ]  # fmt: skip

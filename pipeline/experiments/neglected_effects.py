@@ -96,7 +96,7 @@ def measure(simulation: SimulationSettings, *, seed: int) -> list[Effect]:
 
 
 def _by_protocol(effect: Effect, simulation: SimulationSettings) -> Effect:
-    """Return the effect with the names of the protocols that neglect it, and of those that compute it."""
+    """Return the effect with the names of the protocols that neglect it, and of the protocols that compute it."""
     computed = tuple(name for name, protocol in simulation.protocols.items() if effect.term in protocol.terms)
     return replace(
         effect, left_out_by=tuple(name for name in simulation.protocols if name not in computed), computed_by=computed
@@ -122,13 +122,21 @@ def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
     n, relaxation = len(subject.plan), RELAXATION
     rows = []
     for name, terms, description in (
-        ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
+        (
+            "ageing",
+            Terms(ageing=AGEING),
+            f"field at rest and force: at the last of {n} contacts; no-load reading before each contact",
+        ),
         (
             "relaxation",
             Terms(relaxation=relaxation),
-            f"{relaxation.approach_s:g} s down, held for {relaxation.hold_s:g} s",
+            f"the tip moves down for {relaxation.approach_s:g} s, and is then held for {relaxation.hold_s:g} s",
         ),
-        ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
+        (
+            "memory",
+            Terms(memory=MEMORY),
+            f"each poke is held for {MEMORY.contact_s:g} s, and the next poke follows {MEMORY.rest_s:g} s later",
+        ),
     ):
         simulated = _simulate(subject, terms, seed)
         rest_uT = np.abs(simulated.rest_T[-1] - plain.rest_T[-1]).max() / micro
@@ -142,7 +150,7 @@ def _temperature(subject: Subject, plain: Response) -> Effect:
     factor = aging.relative_remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * plain.rest_T).max() / micro)
     field_pct = _error_pct(plain.change_T, factor * plain.change_T)
-    description = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
+    description = f"the skin is {WARMER_K:g} K warmer; a no-load reading is taken before each contact"
     return Effect("temperature", _status("temperature", subject), field_pct, rest_uT, 0.0, description)
 
 
@@ -152,21 +160,30 @@ def _friction(subject: Subject) -> Effect:
     dragged = drag_tip(subject.board, subject.skin, tip_m, tilt=subject.plan.tilt[:FEW], friction=FRICTION)
     field_pct = _error_pct(pressed.reshape(dragged.change_T.shape), dragged.change_T)
     force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(subject.skin, tip_m[..., 2].ravel()).max())
-    description = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
+    description = (
+        f"friction coefficient {FRICTION.coefficient:g}; {FEW} indentations of the protocol, in which the tip does not "
+        "move sideways"
+    )
     return Effect("friction", _status("friction", subject), field_pct, 0.0, force_pct, description)
 
 
 def _earth(plain: Response) -> Effect:
-    """Evaluate the earth's field, which is added to the no-load reading and to the contact reading."""
+    """Evaluate the earth's field, which changes the no-load reading and the contact reading by the same amount."""
     rest_T = plain.rest_T[:, None] + EARTH_T
     measured_T = (rest_T + plain.change_T) - rest_T
-    description = "a steady field, as long as the board does not turn; a no-load reading before each contact"
+    description = (
+        "the field is constant, because the board does not rotate; a no-load reading is taken before each contact, and "
+        "subtracted"
+    )
     rest_uT = float(np.abs(EARTH_T).max() / micro)
     return Effect("the earth's field", "left out", _error_pct(plain.change_T, measured_T), rest_uT, 0.0, description)
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate the hold of the base, by comparison with an infinite linearly elastic layer that slides freely."""
+    """Evaluate the effect that the base holds the skin.
+
+    The simulated skin is compared with an infinite linearly elastic layer that slides freely.
+    """
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
@@ -174,7 +191,8 @@ def _hold(subject: Subject) -> list[Effect]:
     held_T, free_T = (changes_of_field(subject.board, skin, pokes_m)[1] for skin in (subject.skin, free))
     force_pct = _error_pct(forces(free, deepest_m), forces(subject.skin, deepest_m))
     description = (
-        f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
+        "compared with an infinite layer that slides freely, whose force follows from linear elasticity; change of "
+        f"field: {FEW} indentations; force: at the largest depth"
     )
     return [Effect("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, description)]
 
@@ -200,7 +218,8 @@ def _free_edge(subject: Subject) -> list[Effect]:
     endless_T = change_of_field(before, after, subject.board.chips_m)
     ended_T = change_of_field(before, (stretched_m, after[1]), subject.board.chips_m)
     description = (
-        f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
+        f"compared with a disc that has a free edge and a diameter of {2 * edge_m / milli:g} mm, in plane stress, "
+        f"poked in its middle to a depth of {depth_m / milli:.2g} mm"
     )
     return [Effect("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, description)]
 
@@ -217,17 +236,18 @@ def _inside(subject: Subject) -> list[Effect]:
     )
     cases: dict[str, tuple[list[Moved], float, str]] = {
         "rotation of the magnetisation": (
-            [(r, z, np.zeros_like(a)) for r, z, a in complete], 0.0, "moments do not turn",
+            [(r, z, np.zeros_like(a)) for r, z, a in complete], 0.0, "the magnetic moments do not rotate",
         ),
         "increments": (
             [_one_shot(subject, place_m, depth_m, press) for place_m in PLACES_M], 0.0,
-            "one linear step to the full depth",
+            "the full depth is reached in one linear step",
         ),
         f"{skin.base} base": (
-            _flow(subject, depth_m, swapped), _error_pct(swapped_N, complete_N), f"a {base} base",
+            _flow(subject, depth_m, swapped), _error_pct(swapped_N, complete_N),
+            f"the base is {base} instead of {skin.base}",
         ),
     }  # fmt: skip
-    complete_T, pokes = _change(subject, complete), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
+    complete_T, pokes = _change(subject, complete), f"{len(PLACES_M)} pokes to {depth_m / milli:.2g} mm"
     return [
         Effect(term, "kept", _error_pct(_change(subject, moved), complete_T), 0.0, force_pct, f"{description}; {pokes}")
         for term, (moved, force_pct, description) in cases.items()
@@ -275,7 +295,9 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
     change_uT = plain.change_T / micro
     step_uT = chip.steps_uT(simulation.chip.gain_sel)
     fraction = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
-    return Effect("the chips' steps", "kept", float(100 * fraction), float(step_uT.max() / 2), 0.0, "rounding alone")
+    return Effect(
+        "the chips' steps", "kept", float(100 * fraction), float(step_uT.max() / 2), 0.0, "only rounding, no noise"
+    )
 
 
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
@@ -291,14 +313,15 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
     boxes_m = np.tile(box_m(subject.skin.thickness_m, BOXES), (boxes_n**2, 1))
     own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
-    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # mu0 H = B - J acts on the powder
+    with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # the field that magnetises the powder is mu0 H = B - J
     pokes_m = np.array([(*place_m, float(subject.tip_m[..., 2].max())) for place_m in PLACES_M])
     nodes_m = rest.nodes_m + np.append(subject.skin.seat_m, 0.0)
     moments = [magnet.moments(magnetisation_T, rest.volumes_m3) for magnetisation_T in (j_T, with_own_T)]
     skins = [replace(subject.skin, nodes_m=nodes_m, moments_A_m2=moments_A_m2) for moments_A_m2 in moments]
     changes_T = [changes_of_field(subject.board, skin, pokes_m)[1] for skin in skins]
     description = (
-        f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
+        f"computed to first order, for {boxes_n} boxes of powder and {len(PLACES_M)} pokes; the magnetisation itself "
+        f"changes by {_error_pct(j_T, with_own_T):.2g} %"
     )
     return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, description)
 
@@ -315,7 +338,8 @@ def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
     ]
     share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     description = (
-        f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
+        f"not computed, because no published solution covers these depths; {share_pct:.3g} % of the stops of "
+        f"{len(skins)} skins are deeper than 0.6 of the thickness"
     )
     return Effect("depths past 0.6 of the thickness", "kept", None, None, None, description)
 
@@ -339,14 +363,15 @@ def neglected_effects(settings: Settings, results: Path) -> None:
     effects = measure(simulation, seed=seed)
     io.write_json(results, [asdict(effect) for effect in effects])
     neglected = ", ".join(effect.term for effect in effects if effect.done == "left out")
-    say(f"{settings.scene}: neglected by the main protocol, and measured: {neglected}")
+    say(f"{settings.scene}: computed the errors of these effects, which the main protocol neglects: {neglected}")
 
 
 MEANING = (
-    "Error caused by neglecting each effect, measured on this scene's first skin under the main protocol, whichever "
-    "protocols neglect it. Change of field: root mean square error over all changes of field, relative to their root "
-    "mean square. Field at rest: largest error of the no-load field, before it is subtracted. Force: relative error of "
-    "the force. Always neglected and not quantified: the skin's corner tabs, and each single screw that holds it."
+    "The error that is made if an effect is neglected. It is computed for the first skin and the main protocol of this "
+    "scene, even if this protocol does not neglect the effect. Change of field: root mean square error over all "
+    "changes of field, relative to their root mean square. Field at rest: largest error of the no-load field, before "
+    "it is subtracted. Force: relative error of the force. Two effects are always neglected, and their errors are not "
+    "known: the corner tabs of the skin, and the single screws that hold the skin."
 )
 
 

@@ -58,14 +58,15 @@ TESTED_MAX_N = 2000  # at most this number of test rows per skin, drawn at rando
 CALIBRATION_SKINS_N = 16  # simulated skins that determine likelihood powers and weight shares (see `Calibration`)
 FRESH_N = 32  # number of further simulated skins, which are used to measure the coverage of intervals
 BY = ("way", "pokes_n", "labels_n")
-WAYS = ("map", "universal", "network")  # the map alone, map and networks, the networks alone
+# Ways to estimate place and force: with the map alone, with the map and the networks, with the networks alone.
+WAYS = ("map", "universal", "network")
 # Force of the known weight (500 g). It is put on the skin's middle, which is the place that is most informative about
 # forces at other places.
 WEIGHT_N = 5.0
 # Standard deviation of log(assumed force / true force) of the known weight. The two forces differ because of friction
 # in the weight's guide, and because of an error of its mass.
 WEIGHT_SD = 0.02
-LOG_FORCE_MIN_N = 0.2  # presses with less force hardly change the field; they are left out of errors of log F
+LOG_FORCE_MIN_N = 0.2  # errors of log F are computed without presses of less force, which hardly change the field
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINING_MODULE = "reskin.universal.training"
@@ -122,9 +123,9 @@ class DesignedSkins:
     seed: int
 
     def draw(self, name: str, which: slice, weight_N: float | None = None) -> Population:
-        """Draw the skins `which` of the population `name`.
+        """Draw some skins of the population `name`: the skins whose indices are in the slice `which`.
 
-        If `weight_N` is given, the last press on each skin is by a weight of this force.
+        If `weight_N` is given, the last press on each skin is the press of a weight with this force.
         """
         prior, rng = self.prior, rng_for(self.seed, "population", name)
         return draw_population(prior.centre, prior.spreads, prior.setup, which, rng, Forces(*self.forces_N, weight_N))
@@ -139,8 +140,8 @@ class DesignedSkins:
 def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
     """Return the distribution of skins around a design; boards do not vary, but are exactly as designed."""
     if design.hold is None:
-        what = "hold of section skin is null, but this experiment needs a skin that slides"
-        raise ParamsError(f"nominal.yaml: {what}. Run it in a scene whose skin has hold.")
+        what = "hold of section skin is null, but experiment population needs a skin that slides on its base"
+        raise ParamsError(f"nominal.yaml: {what}. Set skin.hold, or run the experiment in a scene that sets it.")
     modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
         0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, modulus_MPa, design.hold.away_um_mm,
@@ -285,11 +286,11 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
     middle = own[off_mm == off_mm.min()]
     press_i, first = np.unique(rows.indentation[middle], return_index=True)
     ratio = rows.target[middle[first], 2] / WEIGHT_N
-    log_ratio = np.full(len(ratio), np.inf)  # gauges may read 0 N or less; such presses are never chosen
+    log_ratio = np.full(len(ratio), np.inf)  # a force gauge may read 0 N or less; such presses are never chosen
     log_ratio[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
     if np.isinf(log_ratio).all():
         what = f"none of the {len(ratio)} presses near the middle has a force above 0 N"
-        raise SchemaError(f"skin {rows.skin[own[0]]}: {what}. Check the sign of its forces.")
+        raise SchemaError(f"skin {rows.skin[own[0]]}: {what}. Check the sign of this skin's forces.")
     press = middle[rows.indentation[middle] == press_i[log_ratio.argmin()]]
     return known_weight(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
 
@@ -313,8 +314,8 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
 def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
     """Return the skins of a simulated population as test skins, with noise added to their field changes.
 
-    The first `PLACES_N` presses (on the grid) are the pool, the last press is that of the known weight, and all other
-    presses are test presses.
+    The first `PLACES_N` presses, which are on the grid, are the pool. The last press is the press of the known weight.
+    All other presses are test presses.
     """
     tested = []
     for i in range(len(skins)):
@@ -385,8 +386,9 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
     """Return how much of the force error of the known weight is, on average, also found at other presses.
 
-    This is the factor by which the weight's errors of log F (`weight_off`, one per skin) must be multiplied to fit the
-    mean errors of the test presses (`others_off`) best, by least squares.
+    Each skin has two errors of log F: the error of the known weight (`weight_off`), and the mean error of the test
+    presses (`others_off`). The result is a factor. The errors of the weight, multiplied by this factor, fit the mean
+    errors of the test presses best by least squares.
     """
     return float(weight_off @ others_off / (weight_off @ weight_off))
 
@@ -442,7 +444,7 @@ def score_all(
     networks: dict[int, Weights] = {}
     for n in section.skins_n:
         networks[n] = train_network(designed, skins, n, section.steps_n)
-        say(f"{scene} population: network of {n} skins trained")
+        say(f"{scene} population: trained the network of {n} skins")
     model = PriorModel(new_map(designed.tables()), [networks[max(section.skins_n)]])
     further = designed.draw("further", slice(CALIBRATION_SKINS_N), WEIGHT_N)
     further_skins = simulated_skins(further, rng_for(designed.seed, "population", "noise"))
@@ -454,7 +456,8 @@ def score_all(
         calibrations[size] = calibrate_ways(model, further_skins, size)
         rows += [row for skin in tested for row in score_skin(model, skin, size, calibrations[size])]
         fresh_rows += [row for skin in fresh_skins for row in score_skin(model, skin, size, calibrations[size])]
-        say(f"{scene} population: {size.presses_n} unlabelled presses and {size.labels_n} labels done")
+        what = f"{size.presses_n} unlabelled presses and {size.labels_n} labels"
+        say(f"{scene} population: scored the model calibrated with {what}")
     for n, weights in networks.items():
         smaller = replace(model, networks=[weights])
         of_n = [row for skin in tested for row in score_skin(smaller, skin, full, calibrations[full])]
@@ -501,10 +504,10 @@ NAMES = {
     "network": "universal network alone, skin as designed",
 }
 SHORT_NAMES = {"map": "map", "network": "network", "universal": "both"}
-COVERAGE = "in 90 % intervals / %"
+COVERAGE = "places in 90 % intervals / %"
 FURTHER = {
     "mse_f_weight_N2": "MSE_F with one known weight / N²",
-    "mse_f_factor_N2": "MSE_F after one factor per skin (diagnosis) / N²",
+    "mse_f_factor_N2": "MSE_F with the best factor per skin / N²",
     "coverage_pct": COVERAGE,
 }
 
@@ -516,16 +519,17 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         "population": tabulate([_line(row, source) for row in numbers["told"]], meaning=_meaning(numbers)),
         "population_scaling": tabulate(
             [first | _line(row, source) for first, row in zip(scaling, numbers["scaling"], strict=True)],
-            meaning=f"Networks trained for {numbers['steps_n']} steps each, from the same initial weights, on the "
-            "first skins of one population (column `training skins`: their number). All rows use the same map and the "
-            "same likelihood powers, which were chosen with the network of the most skins.",
+            meaning=f"All networks were trained for {numbers['steps_n']} steps, from the same initial weights, on the "
+            "first skins of one population. Column `training skins` contains the number of these skins. All rows use "
+            "the same map and the same likelihood powers (exponents of the likelihood, which set how wide the stated "
+            "intervals are). The powers were chosen with the network that was trained on the most skins.",
         ),
     }
     if "fresh" in numbers:  # absent from results of earlier versions
         meaning = (
-            "Newly drawn skins of the population, used neither for training nor for choosing likelihood powers. "
-            "[low, high]: 95 % confidence interval over n skins. The population has wider spreads than the scene's "
-            f"{numbers['skins_asked_n']} skins."
+            "Coverage on newly drawn skins of the population, which were used neither for training nor for the choice "
+            "of likelihood powers. [low, high]: 95 % confidence interval over n skins. The skins of the population "
+            f"vary more than the {numbers['skins_asked_n']} skins of the scene."
         )
         shown["population_fresh"] = tabulate(_fresh_lines(numbers["fresh"], source), meaning=meaning)
     return shown
@@ -551,7 +555,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         axes.set_ylabel("readings with an error above 1 mm / %")
         axes.legend(frameon=False)
         boards_n = rows["accuracy_pct"].iloc[0]["n"]
-        axes.set_title(f"{numbers['steps_n']} steps each, skins of {boards_n} boards ({source})", fontsize=9)
+        title = f"Networks trained for {numbers['steps_n']} steps, tested on skins of {boards_n} boards ({source})"
+        axes.set_title(title, fontsize=9)
         return {"population_scaling.svg": svg(figure)}
 
 
@@ -574,13 +579,16 @@ def _fresh_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[st
 def _meaning(numbers: Mapping[str, Any]) -> str:
     coverage = ", ".join(f"{NAMES[way]} {pct:.3g} %" for way, pct in numbers["coverage_further_pct"].items())
     return (
-        "Models built from simulated skins that are drawn around the skin as designed and include none of the scene's "
-        f"{numbers['skins_asked_n']} skins; tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled "
-        f"pokes: one at each of the {numbers['pool_n']} places of the grid, at any of its depths, or the first of "
-        "these; the labelled pokes are among them. One known weight: among the first passes' presses nearest to the "
-        f"middle, the one whose force is nearest to {numbers['weight_N']:g} N is used; its force is known to within "
-        f"{100 * numbers['weight_sd']:g} %. One factor per skin: the best factor, computed from all true forces; no "
-        "other common factor can do better. Likelihood powers, and the share of the weight's error by which all "
-        "forces are corrected, were chosen on further skins of the population; on those, 90 % intervals cover: "
-        f"{coverage}."
+        "The models are built from simulated skins, which are drawn at random around the skin as designed. None of the "
+        f"scene's {numbers['skins_asked_n']} skins is used for building. The models are tested on "
+        f"{numbers['rows_asked_n']:,} rows of later passes over the scene's skins. Unlabelled pokes: at most one poke "
+        f"at each of the {numbers['pool_n']} places of the grid, at any depth. The labelled pokes are the first of "
+        "these pokes. One known weight: a press that is treated as a known weight. Among the presses of the first "
+        "passes that are nearest to the skin's middle, it is the press whose force is nearest to "
+        f"{numbers['weight_N']:g} N. Its force is assumed to be known to within {100 * numbers['weight_sd']:g} %. Best "
+        "factor per skin: the forces are multiplied by the factor that fits all true forces best. This shows how much "
+        "any common factor can correct; in practice, the factor is unknown. Two settings were chosen on further "
+        "simulated skins: the likelihood powers (exponents of the likelihood, which set how wide the stated intervals "
+        "are), and how much of the force error at the known weight is corrected at all other presses. On these further "
+        f"skins, the 90 % intervals contain this percentage of the true coordinates: {coverage}."
     )

@@ -61,7 +61,7 @@ class Prepared:
 class Trial:
     """One simulated skin on its board, and the indentations of this skin, sorted by depth.
 
-    `depths_mm` are the depths to which the rig is told to press. `pokes_m` has a row (x, y, depth) for each
+    `depths_mm` are the depths that the rig is commanded to reach. `pokes_m` has a row (x, y, depth) for each
     indentation.
     """
 
@@ -185,7 +185,7 @@ def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
     been run to compute its error, so the times include neither compilation nor filling of caches.
     """
     if repeats_n < 1:
-        raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase it.")
+        raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase runtime.repeats_n.")
     times_s = np.empty((repeats_n, len(calls)))
     for round_i in range(repeats_n):
         # Every second round runs in reverse order, so that a call does not always follow the same call.
@@ -252,7 +252,7 @@ def study_quadratures(
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
-        raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Correct the rules.")
+        raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Correct runtime.quadratures.rules.")
     truths_T = [_reference(trial, reference.finer, reference.per_cell_n).call() for trial in trials]
     coarser = [_reference(trial, reference.coarser, reference.per_cell_n) for trial in trials]
     found_T = [prepared.call() for prepared in coarser]
@@ -295,8 +295,8 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
-# Ratio of the absolute to the relative tolerance of the solvers. The peak elastic force is 1, and the states of which
-# the tolerance is compared are a few percent of it.
+# Ratio of the absolute to the relative tolerance of the solvers. The absolute tolerance must be small compared with the
+# states that are integrated. These states are a few percent of the peak elastic force, which is 1.
 ATOL = 1e-3
 DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
@@ -351,7 +351,7 @@ class Counter:
 
         def rates(_: float, state: State) -> State:
             if self.calls_n == self.calls_max_n:
-                raise Failed(f"stopped after {self.calls_max_n} right-hand sides")
+                raise Failed(f"stopped after {self.calls_max_n} evaluations of the right-hand side")
             self.calls_n += 1
             return driven - state / prony.tau_s
 
@@ -459,7 +459,7 @@ def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str
         return None, str(failure)
     with np.errstate(over="ignore", invalid="ignore"):
         error = float(np.linalg.norm(relaxed - truth) / np.linalg.norm(truth))
-    return (error, None) if error < DIVERGED else (None, f"diverged: error {error:.0e} of the force")
+    return (error, None) if error < DIVERGED else (None, f"diverged: the error is {error:.0e} times the force")
 
 
 RADII_N, HEIGHTS_N = 56, 16  # knots of the displacement splines; twice as many knots change dB by 0.1 %
@@ -663,7 +663,7 @@ def draw_trial(
     pokes_m[:, :2] += skin.seat_m
     if not (pokes_m[:, 2] + skin.depth_zero_m > 0).all():
         got = f"{pokes_m[:, 2].min() + skin.depth_zero_m:.3g} m"
-        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Use larger depths.")
+        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Increase depths_mm.")
     return Trial(board, design, skin, pokes.depths_mm, pokes_m)
 
 
@@ -748,8 +748,8 @@ def runtime(settings: Settings, section: RunTime, results: Path) -> None:
     io.write_json(results, content)
     failed_n = sum(row.failure is not None for row in [*rows, *integrator_rows])
     say(
-        f"{settings.scene}: {len(rows) + len(integrator_rows)} settings tried, {failed_n} failed; "
-        f"cheapest quadrature: {choice.setting}"
+        f"{settings.scene}: tried {len(rows) + len(integrator_rows)} settings, of which {failed_n} failed; "
+        f"cheapest acceptable quadrature rule: {choice.setting}"
     )
 
 

@@ -46,7 +46,7 @@ def group_by_level(
     if len(stops) != fillings_n * levels_n or len(lengths) != 1:
         got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
         rule = f"each filling needs {levels_n} stops, all with the same number of readings"
-        raise SchemaError(f"{where}: {rule}; got {got}. Simulate and ingest it again.")
+        raise SchemaError(f"{where}: {rule}; got {got}. Run stages simulate and ingest_simulated again.")
     return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 
@@ -169,16 +169,18 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     numbers, plot_data = analyse_levels(levels_uT, weight_N)
     write_results(results, numbers, plot_data, read_losses(indentations, {}))
     resolved = ", ".join(f"{step_N:.3g} N ({READINGS[name]})" for name, step_N in numbers["smallest_step_N"].items())
-    say(f"{settings.scene}: smallest resolved step: {resolved or 'none'}; {numbers['fillings_n']} fillings")
+    fillings = f"{numbers['fillings_n']} fillings of the glass"
+    say(f"{settings.scene}: smallest resolved weight difference: {resolved or 'none'}, from {fillings}")
 
 
 MEANING = (  # the experiment's numbers are inserted by `str.format`
-    "The weight on the skin's centre increases step by step; the flat foot of the glass is simulated as the rig's "
-    "round tip. A difference of weight is resolved if, for this and all larger differences, at least {told_pct:g} % of "
-    "the pairs of readings within a held-out filling are in the order of their weights. The response is the component "
-    "of the change of field along its mean direction in the other half of the fillings. Monotonicity is tested at the "
-    "smallest step whose mean rise exceeds the noise of one filling (mean of a stop's readings) in {told_pct:g} % of "
-    "cases: at finer steps, noise alone can make the response fall."
+    "The weight on the skin's centre increases in equal steps. The flat foot of the glass is simulated as the rig's "
+    "round tip. The response of a reading is the component of its change of field along a fixed direction, which is "
+    "the mean direction in one half of the fillings. The other half is held out. A difference of weight is resolved "
+    "if, for this and all larger differences, the reading under the larger weight has the larger response in at least "
+    "{told_pct:g} % of the pairs of readings of a held-out filling. Whether the response always rises is tested with "
+    "the smallest step at which the mean rise exceeds the noise of one filling (of the mean of a stop's readings) in "
+    "{told_pct:g} % of cases. With smaller steps, noise alone can make the response fall."
 )
 READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
 
@@ -194,13 +196,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                 f"< {paper.SENSITIVITY_N:g}",
             ),
             (f"smallest resolved step, {title}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
-            (f"the same from |dB| alone, {title}, N", _show(numbers["by_length_N"], name, numbers), "–"),
+            (f"smallest resolved step from |dB| alone, {title}, N", _show(numbers["by_length_N"], name, numbers), "–"),
         ]
     rise = numbers["monotonic"]
     rows += [
         ("mean response rises at every step above the noise", _rises(rise), paper.MONOTONIC),
-        (f"falls from level to level, {numbers['step_N']:g} N apart", _falls(rise["neighbours"], numbers), "–"),
-        ("gain, straight line, µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
+        (f"falls between neighbouring levels, {numbers['step_N']:g} N apart", _falls(rise["neighbours"], numbers), "–"),
+        ("gain (slope of a fitted line), µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
         ("noise of one reading along the response, µT", f"{numbers['noise_uT']:.2g}", "–"),
     ]
     table = pd.DataFrame(
@@ -237,11 +239,12 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _rises(rise: Mapping[str, Any]) -> str:
     ranks = f"rank correlation {rise['spearman']:.4f}"
     if "step_N" not in rise:
-        return f"{UNDECIDED}: no step is above the noise; {ranks}"
+        return f"{UNDECIDED}: the rise exceeds the noise at no step; {ranks}"
     verb = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
     return (
-        f"{FEW_BOARDS}; {verb} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+        f"{FEW_BOARDS}; {verb} on this board: it rises in {rises_n} of {rise['pairs_n']} pairs of levels that are "
+        f"{rise['step_N']:.3g} N apart, {ranks}"
     )
 
 

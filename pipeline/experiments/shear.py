@@ -150,11 +150,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         lines.append(line | {"n": str(scores["accuracy_pct"]["n"])})
     rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
     meaning = (
-        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: "
-        f"each held-out line has the same path as a line in {numbers['passes_n'] - 1} other passes. Our forces are "
-        f"{rms_N} rms. The paper does not state its forces, and an MSE grows with the square of the force; explained "
-        "variance, 1 - MSE / variance, does not. Our MSE_Fxy is a mean over two axes; the paper does not say whether "
-        "it sums or averages over axes."
+        f"The data are {numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in "
+        f"{numbers['passes_n']} passes. All passes drag along the same paths, so each held-out line has the same path "
+        f"as a line in each of the {numbers['passes_n'] - 1} other passes. The rms values of our forces are {rms_N}. "
+        "The paper does not state its forces. Errors of different forces are hard to compare, because an MSE grows "
+        "with the square of the force. The explained variance (1 - MSE / variance) does not grow with the force. Our "
+        "MSE_Fxy is the mean over two axes. The paper does not state whether its MSE is a mean or a sum over axes."
     )
     spread = (
         "± is the standard deviation over n random splits; the score of a split is the mean over "
@@ -176,7 +177,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.locator_params(nbins=4)
         explained = {part: _show_explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
         title = (
-            f"Forces on held-out dragged lines ({source}); points: first of {numbers['seeds_n']} networks\n"
+            f"Forces on held-out dragged lines ({source}); points: first of {numbers['seeds_n']} network seeds\n"
             f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)

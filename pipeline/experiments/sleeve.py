@@ -38,7 +38,8 @@ Stats = dict[str, dict[str, float]]  # for each metric: mean, n and, for several
 class Sleeve(SectionWithTraining):
     """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # this fraction of each capture's pokes, at its end, is held out
+    # Fraction of the pokes of each capture that is held out. The held-out pokes are the last pokes of the capture.
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 
@@ -128,8 +129,10 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
         indentations = np.unique(rows.indentation[in_capture])  # in order of time
         test_n = round(test_fraction * len(indentations))
         if not 0 < test_n < len(indentations):
-            what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out: one side is empty"
-            raise ParamsError(f"experiment sleeve: {what}. Use a capture with more pokes.")
+            what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out"
+            rule = "but training and test need at least one poke each"
+            remedy = "Change sleeve.test_fraction, or use a capture with more pokes."
+            raise ParamsError(f"experiment sleeve: {what}, {rule}. {remedy}")
         held_out |= in_capture & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
@@ -160,9 +163,9 @@ def rate_hz(captures: Sequence[Readings]) -> float:
         steps_n += int(same.sum())
         steps_s += float(np.diff(capture.t_s)[same].sum())
     if not steps_s > 0:
-        what = "the frame rate needs successive readings of the same indentation with increasing times"
+        what = "the frame rate is computed from successive readings of the same indentation, whose times must increase"
         raise ParamsError(
-            f"experiment sleeve: {what}; got {steps_n} pairs of them. Record more readings per indentation."
+            f"experiment sleeve: {what}; got {steps_n} pairs of such readings. Record more readings per indentation."
         )
     return steps_n / steps_s
 
@@ -228,9 +231,9 @@ def draw_errors(
     return rounded | borders | {"area_mm": list(area.sides_mm)}
 
 
-PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
-PARTS = {"near_seam": "median near a border between boards, mm", "inside": "median elsewhere, mm"}
-NO_NUMBER = "none: a demonstration"
+PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % of errors below, mm"}
+PARTS = {"near_seam": "median error near a border, mm", "inside": "median error elsewhere, mm"}
+NO_NUMBER = "none, only a demonstration"
 SPREAD = "± is the standard deviation over the network seeds; column `seeds` gives their number."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
 
@@ -244,9 +247,9 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     ]
     near_n, inside_n = (numbers[part]["pokes_n"] if part in numbers else 0 for part in PARTS)
     meaning = (
-        f"Trained on the first {numbers['trained_n']} pokes of one skin, tested on its last {numbers['tested_n']}: "
-        f"{near_n} of them less than {numbers['near_mm']:g} mm from a border between two boards, {inside_n} elsewhere. "
-        f"The paper prints no number here: {SLEEVE_WORDS}."
+        f"The methods are trained on the first {numbers['trained_n']} pokes of one skin, and tested on its last "
+        f"{numbers['tested_n']} pokes. Of the tested pokes, {near_n} are less than {numbers['near_mm']:g} mm from a "
+        f"border between two boards, and {inside_n} are elsewhere. The paper states no number here: {SLEEVE_WORDS}."
     )
     return {"sleeve": tabulate(lines, meaning=meaning, spread=SPREAD), "sleeve_set_up": _set_up(numbers, source)}
 

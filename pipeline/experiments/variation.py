@@ -82,9 +82,10 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
     """Return the visits of one place at one depth; raise `ParamsError` if there are none."""
     selected = _at(readings, place_mm, depth_mm)
     if not selected.any():
-        what = f"{place_mm[0]:g}, {place_mm[1]:g} mm is never visited at a depth of {depth_mm:g} mm"
+        place = f"place {place_mm[0]:g}, {place_mm[1]:g} mm (variation.places_mm)"
+        what = f"{place} is never pressed to a depth of {depth_mm:g} mm (variation.depth_mm)"
         where = f"experiment variation, capture {readings.capture}"
-        raise ParamsError(f"{where}: {what} (variation.places_mm, depth_mm). {_visited(readings, place_mm)}")
+        raise ParamsError(f"{where}: {what}. {_visited(readings, place_mm)}")
     b_uT = readings.b_uT[selected]
     visit_i, n_contacts = rank(readings.indentation[selected]), readings.n_contacts[selected]
     _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
@@ -108,11 +109,11 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 
     at_place = _at(readings, place_mm, None)
     if at_place.any():
-        return f"Visited depths there: {join(np.unique(readings.depth_mm[at_place]))} mm."
+        return f"Choose one of the depths at this place: {join(np.unique(readings.depth_mm[at_place]))} mm."
     places = np.unique(np.stack([readings.x_mm, readings.y_mm], axis=1), axis=0)
     examples = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
     depths = join(np.unique(readings.depth_mm))
-    return f"Visited: depths {depths} mm, and {len(places)} places, among them {examples} mm."
+    return f"Choose from depths {depths} mm and from {len(places)} places, among them {examples} mm."
 
 
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -179,14 +180,14 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
         order[boards[skin]] += 1
     if skins_n > len(ranked):
         rule = f"at most the {len(ranked)} skins of the main captures"
-        raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Reduce it.")
+        raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Reduce variation.skins_n.")
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
 
 
 MEANING = (
-    "Difference between equal pokes: rms over the channels, and as a percentage of the change of field that the poke "
-    "causes. Field as read: nothing is subtracted. Change of field: the no-load reading of the same indentation is "
-    "subtracted, as in the inputs of a model."
+    "Differences between pokes with the same place and depth: rms over the channels, and as a percentage of the change "
+    "of field that a poke causes. Field as read: no no-load reading is subtracted. Change of field: the no-load "
+    "reading of the same indentation is subtracted, as in the inputs of a model."
 )
 
 
@@ -196,7 +197,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     for place in numbers["places"]:
         time, skins = place["time"], place["skins"]
         place_cells = {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "depth, mm": f"{numbers['depth_mm']:g}"}
-        over = f"over {time['contacts_n']:,} contacts of {numbers['worn_skin']}, {time['visits_n']} visits"
+        over = f"over {time['contacts_n']:,} contacts of {numbers['worn_skin']} ({time['visits_n']} pokes here)"
         rows = [
             (f"{over}: field as read", time["raw_change_uT"], time["raw_change_pct"]),
             (f"{over}: change of field", time["db_change_uT"], time["db_change_pct"]),
@@ -210,8 +211,9 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     meaning = f"{MEANING} {describe_pace(numbers, source)}"
     if "shown_s" in numbers and "warmer_K" in numbers:
         meaning += (
-            f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the chips' temperature "
-            f"changes by {numbers['warmer_K']:+.2g} K: the field changes with temperature as well as with wear."
+            f" The contacts that are compared over time take {numbers['shown_s']:,.0f} s. In this time, the "
+            f"temperature of the chips changes by {numbers['warmer_K']:+.2g} K, so the field changes with temperature "
+            "as well as with wear."
         )
     return {"variation": tabulate(lines, meaning=f"{meaning} Paper: {FIGURE_4}.")}
 

@@ -1,7 +1,7 @@
 """Find which properties of simulated skins determine the scores of the paper's table 2 (not in the paper).
 
 The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from the
-settings of the scene in one factor, such as how much skins vary, or how large an error of the simulation is.
+settings of the scene in one factor. Two of the factors are the variation of skins and the error of the simulation.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -289,15 +289,18 @@ DEFAULT_WORLD = "default"
 FACTORS = {
     "residual": "error of the simulation, relative to |dB|",
     "skin_modulus": "spread of stiffness (sd of the logarithm)",
-    "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction under the tip",
+    "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction between skin and tip",
 }  # fmt: skip
 DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 MEANING = (
-    "Each world differs from the default in one factor; skins, indentations, noise and folds are the same. Error "
-    "of the simulation: a smooth random error that is added to the fields, relative to |dB|. Its largest size is the "
-    "error on recorded boards (scene lab, 1 - explained); it is correlated over {residual_length_mm:g} mm, and "
-    "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
-    "error. {folds_n} boards are held out in turn; one network per row, fold and world, trained for {steps_n} steps."
+    "A world is a simulation that differs from the default simulation in one factor. All worlds have the same "
+    "indentations, noise and folds, and the same random draws of skins. Error of the simulation: a smooth random error "
+    "that is added to the changes of field. Its rms size is given relative to |dB|. The largest size is the error of "
+    "the simulation on recorded boards: the square root of (1 - explained), where `explained` is the fraction of "
+    "|dB|² that the simulation explains (scene lab). The error is correlated over {residual_length_mm:g} mm, and "
+    "{residual_own_share:.0%} of its variance is specific to a skin. The simulated skins of all other scenes have no "
+    "such error. {folds_n} boards are held out in turn. One network is trained for each row of table 2, fold and "
+    "world, for {steps_n} steps."
 )
 # Values of two factors in the default world. The values of the other factors are in the experiment's numbers.
 DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}
@@ -327,7 +330,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             panels[row][0].set_ylabel(COLUMNS[metric].replace(", ", " / "))
         handles = panels[0][0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-        title = f"What decides table 2 ({source}; dotted: the default, dashed: the paper)"
+        title = f"Scores of table 2 in each world ({source}; dotted: default world, dashed: the paper's scores)"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"worlds.svg": svg(figure)}
 

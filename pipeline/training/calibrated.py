@@ -56,15 +56,17 @@ class Frame:
 def read_model(file: Path, layout: BoardLayout | None, settings: Settings) -> Universal:
     """Read the model; raise `ParamsError` if it was made for a layout other than the scene's."""
     if layout is None:
-        raise ParamsError(f"{settings.where}: experiment calibrated needs key layout in section compare. Add it there.")
+        raise ParamsError(
+            f"{settings.where}: experiment calibrated needs compare.layout. Add key layout to section compare."
+        )
     model = load_universal(file=file)
     if replace_name(model.layout, layout.name) != layout:
         own, other = layout.model_dump(), model.layout.model_dump()
         differing = ", ".join(key for key in own if key != "name" and own[key] != other[key])
-        remedy = f"Make a model: reskin model make --layout {settings.where} --out NEW.safetensors"
+        remedy = f"Make a model for this layout: reskin model make --layout {settings.where} --out NEW.safetensors"
         raise ParamsError(
             f"{file}: the model was made for layout {model.layout.name}, which differs from compare.layout of "
-            f"{settings.where} in {differing}. {remedy}, and name it in section calibrated."
+            f"{settings.where} in {differing}. {remedy}. Then set calibrated.model to the new file."
         )
     return model
 
@@ -87,8 +89,8 @@ def score_fold(
 ) -> list[dict[str, Any]]:
     """Calibrate the model to each skin of the held-out board; score it for every number of labels.
 
-    The calibration to a skin uses its no-load field, all presses in the fold's pool without their labels, and the
-    labels of the given number of these presses.
+    The calibration to a skin uses its no-load field and the presses of the fold's pool, which are reserved for
+    calibration. All presses are used without labels; the given number of them is used with labels, too.
     """
     points = []
     presses, tested = pool_rows(data, fold), data.rows.skin[fold.test]

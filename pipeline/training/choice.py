@@ -5,8 +5,8 @@ budget, which is the number of training steps, is not chosen, because each scene
 the same budgets, and its errors are averaged over the budgets, so that no candidate wins by training longer. Settings
 with a collapsed training run (a network whose predictions are nearly constant) are not chosen.
 
-The triplet term of the loss only increases the error of a network, unless this network is adapted later. The weight of
-the triplet term is therefore chosen together with the settings of the adaptation.
+Unless a network is adapted later, the triplet term of the loss only increases its error. The weight of the triplet term
+is therefore chosen together with the settings of the adaptation.
 
 The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with the
 fingerprint that the current code computes.
@@ -62,7 +62,7 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     chosen_triplet = {
         "recipe_name": settings_of(best)["base"],
         "settings": without_budget(best["recipe"]),
-        "by": "MSE_xy of the networks adapted from it",
+        "by": "MSE_xy of the networks that were adapted from networks of this recipe",
         "candidates": _candidates(triplet),
     }
     return {"train_multi": chosen_multi, "adapt": chosen_adapt, "train_triplet": chosen_triplet}
@@ -98,17 +98,18 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     """Find the eligible card with the smallest error; return it, the choice, and the errors by recipe."""
     what = f"candidates of {stage}"
     if not eligible:
-        raise ParamsError(f"{WHERE}: no {what}. Run experiments lobo, triplet and adapt.")
+        raise ParamsError(f"{WHERE}: no {what}. Run experiments lobo, triplet and adapt in this scene.")
     _check_budgets(cards, stage)
     collapsed = [_key(card) for card in cards if _has_collapsed(card)]
     stable = [card for card in eligible if _key(card) not in collapsed]
     if not stable:
-        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower learning rates.")
+        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Add candidates with a smaller rate_max.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
     chosen = {"recipe_name": best["recipe_name"], "settings": without_budget(settings_of(best))}
-    return best, chosen | {"by": "MSE_xy, mean over all budgets of steps", "candidates": candidates}, errors
+    by = "mean of MSE_xy over all numbers of training steps"
+    return best, chosen | {"by": by, "candidates": candidates}, errors
 
 
 def _has_collapsed(card: Card) -> bool:
@@ -122,7 +123,7 @@ def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, 
 
     def over_budgets(key: Mapping[str, Any]) -> float:
         by_budget = {budget: errors[name] for name, (other, budget) in settings.items() if other == key}
-        return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
+        return float(np.mean(list(by_budget.values())))  # two recipes with equal settings and steps count only once
 
     return {name: over_budgets(key) for name, (key, _) in settings.items()}
 
@@ -135,13 +136,13 @@ def _check_budgets(cards: Cards, stage: str) -> None:
     all_budgets = set().union(*budgets_by_name.values())
     for name, budgets in budgets_by_name.items():
         if budgets != all_budgets:
-            what, tried = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
-            remedy = "Try every candidate with every number of steps."
-            raise ParamsError(f"{WHERE}: {what} differ between candidates: {tried}. {remedy}")
+            what = f"candidate {name} of {stage} was trained with numbers of steps (training, adaptation)"
+            tried = f"{sorted(budgets)}, but all candidates together with {sorted(all_budgets)}"
+            raise ParamsError(f"{WHERE}: {what} {tried}. Train every candidate with every number of steps.")
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without budget; for an adaptation, also those of the pretrained network."""
+    """Return the settings without budget; for an adaptation, also the settings of the pretrained network."""
     return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
@@ -151,7 +152,8 @@ def _budget(card: Card) -> tuple[int, int]:
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # the first card of each recipe
+    # The order is reversed, so that the settings of the first card of each recipe are kept.
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}
     return [
         {
             "recipe_name": name,
@@ -162,9 +164,9 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     ]
 
 
-# --- Fingerprint of the simulation: unchanged as long as equal indentations give equal fields and forces ---
+# --- Fingerprint of the simulation: it changes only if the simulated fields or forces of given indentations change ---
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # same as in scene quick
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # scene quick uses the same rule
 BOARD = BoardDesign(
     chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
     chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),
@@ -172,7 +174,7 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant digits, which changes of the physics change, but rounding errors do not
+DIGITS = 4  # number of significant digits; a change of the physics changes these digits, but rounding errors do not
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:

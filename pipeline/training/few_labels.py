@@ -150,7 +150,7 @@ def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, "
     order = labelling_order(study.rows, fold, study.seed)
     if max(labels_n) > len(order):
         rule = f"at most the {len(order)} indentations for calibration"
-        remedy = "Reduce labels_n, or increase split.labels_pool_n."
+        remedy = "Reduce few_labels.labels_n, or increase split.labels_pool_n."
         raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 

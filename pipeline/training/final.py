@@ -23,7 +23,8 @@ from reskin.models.trained import SUFFIX
 EXPERIMENT = "final"
 FILE = f"{EXPERIMENT}{SUFFIX}"  # in folder data/models/SCENE/final
 NOT_TESTED = (
-    "no: all boards were in training. held_out: networks of the same recipe, by the board that each was tested on"
+    "no, because all boards were used for training. Entry held_out contains the scores of other networks of the same "
+    "recipe. Each of them was trained without one board, and tested on this board"
 )
 NO_ROWS = np.zeros(0, np.int64)
 F = 2  # index of the force in the array of targets

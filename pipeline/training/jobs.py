@@ -34,7 +34,7 @@ from reskin.models.trained import FORMAT
 from reskin.seeds import rng_for
 
 TRAINING_MODULE = "reskin.models.train"
-CACHE = ".reskin/cells"  # completed training runs; a cache, not an output
+CACHE = ".reskin/cells"  # folder of the cache of completed training runs, which is not an output of a stage
 
 PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe name, fold name and index of the seed
 
@@ -242,7 +242,8 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
     record_trainings(COSTS / data.scene, stage, times, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
-            say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}; its earlier weights are kept")
+            what = f"training of {job.name} diverged by step {result.stopped_step}"
+            say(f"warning: {prefix}: {what}, so its weights from before the divergence are kept")
     return results
 
 
@@ -335,8 +336,8 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
     """Score predictions over all test rows, and separately for each skin.
 
-    The scores over all test rows are computed for the predictions as they are, and also after the mean error of the
-    positions on each board was subtracted.
+    The scores over all test rows are computed twice: for the predictions as they are, and for predictions from which
+    the mean position error of their board has been subtracted.
     """
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 

@@ -76,8 +76,8 @@ MADE = {
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
     """Choose the likelihood powers of a model, for each number of presses and labels.
 
-    The powers are those for which the 90 % intervals have the right coverage on simulated skins. They are for a misfit
-    of 1; on a skin, the power is divided by the misfit of this skin.
+    The chosen powers are those for which the 90 % intervals have a coverage of 90 % on simulated skins. They are valid
+    for a skin with a misfit of 1. On any other skin, the power is divided by the misfit of this skin.
     """
     by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in CALIBRATION_ERRORS.items():
@@ -161,7 +161,8 @@ def make_model(layout: BoardLayout, inputs: Inputs, say: Callable[[str], None] =
         float(np.abs(layout.to_chips(tables.rest_uT + tables.mean_uT.reshape(-1, layout.channels_n))).max()) / 1e3
     )
     say(
-        f"fields up to {largest_mT:.1f} mT are expected on the nominal skin; the range of your chips must be twice that"
+        f"fields up to {largest_mT:.1f} mT are expected on the nominal skin; the measuring range of your chips must be "
+        "at least twice as large"
     )
     say("2 of 3: training the network on simulated skins ...")
     networks = train_networks(inputs.prior, inputs.training, inputs.seed)
@@ -185,7 +186,7 @@ def read_layout_of(file: Path) -> BoardLayout:
     given = content.get("compare", {}).get("layout")
     if given is None:
         raise ParamsError(
-            f"{file}: this scene has no layout (key layout in section compare). Give the file of a layout."
+            f"{file}: this scene has no layout (compare.layout). Add it to the scene, or pass the file of a layout."
         )
     return read_layout(given) if isinstance(given, str) else as_layout(given, f"{file}: compare.layout")
 
@@ -202,9 +203,11 @@ def make(layout_file: Path, out: Path, say: Callable[[str], None] = print) -> No
         raise ParamsError(f"--out: {out} must end in .safetensors. Try: {out.with_suffix('.safetensors')}")
     for file in (out, out.with_suffix(".json")):
         if file.exists():
-            raise ParamsError(f"--out: {file} exists. Choose another name, or delete it.")
+            raise ParamsError(f"--out: {file} exists. Choose another name, or delete this file.")
     if layout.name == paper_layout().name and layout != paper_layout():
-        raise ParamsError(f"{layout_file}: name {layout.name} is that of the paper's board. Choose another name there.")
+        raise ParamsError(
+            f"{layout_file}: name {layout.name} is reserved for the paper's board. Change the name there."
+        )
     require("torch", "model make")
     write_model(make_model(layout, read_inputs(layout=layout), say), MADE, out)
 

@@ -73,7 +73,7 @@ class Estimates(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What all folds share.
+    """Data, models and likelihood powers that are the same for all folds.
 
     - known: the recorded boards of the scene.
     - nominal: variant `nominal` of the model, made from simulated skins alone.
@@ -199,8 +199,8 @@ def score_fold(
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
     if board not in known.presses:  # if a board has several skins, the keys of `presses` name both board and skin
-        what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
-        raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
+        what = f"experiment universal needs boards with one skin each, but the scene has {', '.join(known.presses)}"
+        raise ParamsError(f"fold {fold.name}: {what}. Remove this experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
     test_uT = known.frame.field(data.rows.db_uT[fold.test])
     points = []
@@ -338,14 +338,14 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 
 
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
-    """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
+    """Choose likelihood powers for each number of labels, from the coverage of intervals on simulated skins.
 
-    When the model is used on a board, the chosen powers are divided by the misfit of this board (Birge's ratio), and by
-    the variance inflation of its labels.
+    The chosen powers are valid for a board whose misfit is 1. When the model is used on another board, the powers are
+    divided by the misfit of this board (Birge's ratio), and by the variance inflation of its labels.
 
     The simulated skins have errors of the law that are as large as in training, and errors that the map does not model
-    (see `unmodelled_error`). If there are labels, skins with twice as large errors of the law are also used, because
-    the residuals at the labels then reveal how large the errors are.
+    (see `unmodelled_error`). If there are labels, skins whose errors of the law are twice as large are also used. With
+    labels, the model can estimate the size of the errors from the residuals at the labels.
     """
     by_labels_n: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in CALIBRATION_ERRORS.items():

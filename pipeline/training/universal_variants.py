@@ -147,7 +147,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit a model of the laws' errors, to the relative errors of each law on the board to which the law was fitted."""
+    """Fit a model of the errors of laws. The data are the relative errors of each law on the board of its fit."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -165,9 +165,8 @@ def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarr
     """
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
-    rows_by_press = own[
-        first[:, None] + np.arange(READINGS_N) % counts[:, None]
-    ]  # the readings of a press are adjacent
+    # The readings of a press are adjacent in `own`: the first has index `first`.
+    rows_by_press = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]
     db_uT = frame.field(rows.db_uT[rows_by_press.ravel()]).reshape(*rows_by_press.shape, -1)
     place_mm = frame.place(rows.target[rows_by_press[:, 0], :2].astype(float))
     parts = db_uT, rest_uT, place_mm, rows.target[rows_by_press, 2]
@@ -200,7 +199,7 @@ def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str
         "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,
         "skins_n": settings.skins_n, "steps_n": settings.steps_n, "networks_n": len(variant.model.networks),
         "centre": asdict(prior.centre), "spreads": dict(prior.spreads), "recorded_boards_n": len(prior.recorded),
-        "inputs": "change of field (uT, board's axes), field at rest, any number of unlabelled pokes",
-        "outputs": "x, y over 8 mm; log F over 3; log sd of each",
-        "not_for": "other boards' layouts, skins of another polarity, two contacts at once, shear",
+        "inputs": "change of field (uT, in the board's axes), field at rest, and any number of unlabelled pokes",
+        "outputs": "x and y divided by 8 mm, log F divided by 3, and the logarithm of the standard deviation of each",
+        "not_for": "boards of another layout, skins of another polarity, two contacts at once, shear",
     }  # fmt: skip

@@ -30,12 +30,8 @@ from reskin.models.job import TrainingJob
 from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
-FORCE = 2  # column of the force
-BEFORE, AFTER, CONTROL = (
-    "before",
-    "after",
-    "control",
-)  # names of the variants
+FORCE = 2  # column of the force in true and predicted values
+BEFORE, AFTER, CONTROL = "before", "after", "control"  # names of the variants
 # A function that takes true and predicted values (columns x_mm, y_mm, F_N) and returns scores by name.
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]
 

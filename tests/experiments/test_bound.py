@@ -140,7 +140,7 @@ def test_depths_at_which_the_tip_does_not_touch_the_skin_are_marked():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
     assert reach_skin(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
-    with pytest.raises(ParamsError, match="depths_mm are at most 0.6"):
+    with pytest.raises(ParamsError, match="the largest of depths_mm is 0.6 mm"):
         reach_skin(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
 
 
@@ -164,7 +164,7 @@ def test_table_compares_the_network_with_the_bound():
     table = tables(NUMBERS, "simulated")["bound"]
     assert table["depth, mm"].tolist() == ["0.2", "1.2", "all"]
     assert table["MSE_xy, mm² (bound)"].tolist() == ["0.01"] * 3
-    assert table["MSE_xy, mm² (bound, labels' errors added)"].tolist() == ["0.04"] * 3
+    assert table["MSE_xy, mm² (bound with label errors)"].tolist() == ["0.04"] * 3
     assert table["MSE_xy, mm² (network)"].tolist() == ["–", "–", "1.00 ± 0.50"]
     assert set(table["source"]) == {"simulated"}
 

@@ -153,7 +153,7 @@ NUMBERS = {
 def test_dynamics_table_has_a_column_for_each_filter():
     table = tables(NUMBERS, "simulated")["dynamics"]
     judged = table[LESS] != ""
-    assert list(table.loc[judged, "estimated from"].unique()) == ["mean of the last five"]
+    assert list(table.loc[judged, "estimated from"].unique()) == ["mean of the last five readings"]
     assert set(table.loc[judged, LESS]) == {"not judged (fewer than 4 boards): -0.25"}
     assert list(table["lag / ms"][-3:]) == ["0.9", "–", "–"]
     assert table["MSE_F / N²"][0] == "0.5 ± 0.1"

@@ -301,7 +301,7 @@ def test_shear_table_has_both_splits_of_the_data():
 
 def test_manual_table_has_all_variants_and_their_differences():
     table = manual.tables(MANUAL_NUMBERS, "simulated")["manual"].set_index("networks")
-    for variant, name in (("before", "before"), ("after", "adapted with hand pokes")):
+    for variant, name in (("before", "before adaptation"), ("after", "adapted with hand pokes")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[variant]['accuracy_pct']:g}"
     difference = table.loc["with hand pokes minus before, on the same skin", "accuracy, % (ours)"]
     assert difference == "not judged (fewer than 4 boards): +2.00 ± 0.10 ± 0.02 (seeds)"
@@ -316,7 +316,8 @@ def test_manual_table_has_all_variants_and_their_differences():
 def test_flexible_table_has_biases_and_differences():
     text = to_markdown(flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"])
     assert f"{FLEXIBLE['mse_xy_mm2']:g}" in text
-    assert "30 % less; in the paper it is 80 % less" in text
+    assert "30 % smaller on flexible boards" in text
+    assert "In the paper, it is 80 % smaller" in text
     table = flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"]
     assert table["bias of F, N"].tolist() == [f"{mean} ± 0.10 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
     assert "over 3 network seeds" in text

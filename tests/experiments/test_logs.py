@@ -249,13 +249,13 @@ def test_log_of_a_pitched_board_has_a_table():
     assert list(table["true contacts"]) == ["3", "3"]
     assert list(table["accuracy / %"]) == ["50", "unknown"]
     assert set(table["source"]) == {"simulated"}
-    assert "once per step (0.7 s) in the earth's field of 50 µT" in table.attrs["meaning"]
+    assert "in the earth's field of 50 µT" in table.attrs["meaning"]
     assert "logs_turning" not in tables(NUMBERS, "recorded")
 
 
 def test_caption_states_the_frame_rate_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
-    assert "A log at 133 Hz with" in table.attrs["meaning"]
+    assert "a rate of 133 Hz" in table.attrs["meaning"]
     assert "The board does not rotate" in table.attrs["meaning"]
 
 

@@ -143,4 +143,4 @@ def test_table_lists_the_protocols_of_each_effect():
 
 
 def test_caption_names_the_main_protocol():
-    assert "under the main protocol" in neglected_effects_table(TABLE_ROWS, "simulated").attrs["meaning"]
+    assert "the main protocol of this scene" in neglected_effects_table(TABLE_ROWS, "simulated").attrs["meaning"]

@@ -437,7 +437,7 @@ def test_euler_method_diverges_if_steps_exceed_twice_the_shortest_relaxation_tim
         assert euler.error < 1e-2
     else:
         assert euler.error is None
-        assert euler.failure.startswith("diverged: error")
+        assert euler.failure.startswith("diverged: the error")
         assert euler.key not in {one.key for one in calls}
 
 
@@ -450,7 +450,7 @@ def test_solver_that_needs_too_many_calls_is_stopped(method):
     rows, _ = study_integrators(settings(ratios=(1e6,), calls_per_poke_max_n=20))
     for stopped in select(rows, 1e6, method):
         assert (stopped.error, stopped.work_n) == (None, 20)
-        assert stopped.failure == "stopped after 20 right-hand sides"
+        assert stopped.failure == "stopped after 20 evaluations of the right-hand side"
 
 
 def test_at_high_stiffness_only_the_explicit_solver_is_stopped(relaxations):

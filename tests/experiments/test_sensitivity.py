@@ -200,14 +200,14 @@ def test_table_states_that_no_step_is_resolved():
     table = tables(glass(1e3)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "none up to 1"
     assert table["ours"][1] == "none"
-    assert "undecided: no step is above the noise" in table.set_index("what")["ours"][RISES]
+    assert "undecided: the rise exceeds the noise at no step" in table.set_index("what")["ours"][RISES]
 
 
 def test_table_states_the_step_at_which_monotonicity_is_judged():
     table = tables(glass(0.0)[0], "simulated")["sensitivity"]
     found = table.set_index("what")["ours"]
-    assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this one: 10 of 10 pairs 0.1 N apart")
-    assert found["falls from level to level, 0.1 N apart"] == "0 of 10"  # Without noise, there are no falls.
+    assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this board: it rises in 10 of 10 pairs")
+    assert found["falls between neighbouring levels, 0.1 N apart"] == "0 of 10"  # Without noise, there are no falls.
     assert "at least 95 % of the pairs" in table.attrs["meaning"]
 
 

@@ -96,7 +96,7 @@ def test_last_indentations_of_each_capture_are_held_out(pokes_n, test_fraction):
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
 def test_split_without_training_or_test_rows_is_refused(test_fraction):
-    with pytest.raises(ParamsError, match="would be held out: one side is empty"):
+    with pytest.raises(ParamsError, match="would be held out, but training and test need"):
         hold_out_last(rows_of(9), test_fraction)
 
 
@@ -110,7 +110,7 @@ def test_frame_rate_is_measured_within_indentations(rate, pause_s):
 
 
 def test_frame_rate_cannot_be_measured_from_single_readings():
-    with pytest.raises(ParamsError, match="needs successive readings of the same indentation"):
+    with pytest.raises(ParamsError, match="is computed from successive readings of the same indentation"):
         rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
 
@@ -182,14 +182,14 @@ def test_table_lists_methods_and_source_and_has_no_number_of_the_paper():
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
     assert set(table["source"]) == {"simulated"}
-    assert set(table["paper"]) == {"none: a demonstration"}
+    assert set(table["paper"]) == {"none, only a demonstration"}
     assert table["seeds"].tolist() == ["1", "2", "1"]
     assert "±" in table["accuracy, %"][1]
     assert "column `seeds` gives their number" in table.attrs["spread"]
     # The table gives three digits.
     assert float(table["median error, mm"][0]) == pytest.approx(numbers["median_error_mm"]["mean"], rel=5e-3)
     near = numbers["near_seam"]["median_error_mm"]["mean"]
-    assert float(table["median near a border between boards, mm"][0]) == pytest.approx(near, rel=5e-3)
+    assert float(table["median error near a border, mm"][0]) == pytest.approx(near, rel=5e-3)
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
@@ -197,8 +197,8 @@ def test_score_of_an_area_without_presses_is_a_dash():
     numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]
-    assert table["median near a border between boards, mm"][0] == "–"
-    assert "0 of them less than" in table.attrs["meaning"]
+    assert table["median error near a border, mm"][0] == "–"
+    assert "0 are less than" in table.attrs["meaning"]
 
 
 def test_table_compares_our_skin_and_boards_with_those_of_the_paper():

@@ -61,7 +61,7 @@ def test_visits_to_a_place_equal_a_loop_over_readings():
 @pytest.mark.parametrize(
     ("place_mm", "depth_mm", "listed"),
     [
-        ((2.0, 2.0), 0.9, "Visited depths there: 0.6, 1.2 mm"),
+        ((2.0, 2.0), 0.9, "Choose one of the depths at this place: 0.6, 1.2 mm"),
         ((3.0, 2.0), 1.2, "3 places, among them 0, 2; 2, 2; 4, 2"),
     ],
 )
@@ -152,11 +152,11 @@ def test_table_has_the_change_over_time_and_the_spread_of_each_place():
 
 def test_notes_state_the_time_per_contact_and_the_warming():
     text = to_markdown(tables(numbers(), "simulated")["variation"])
-    assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
-    assert "A real rig takes seconds per contact" in text
-    assert "take 575 s, in which the chips' temperature changes by +1.9 K" in text
+    assert "to the next is 0.0575 s, and the longest capture lasts 1,166 s." in text
+    assert "A real rig takes several seconds per contact" in text
+    assert "take 575 s. In this time, the temperature of the chips changes by +1.9 K" in text
     cold = {name: value for name, value in numbers().items() if name != "warmer_K"}
-    assert "temperature changes" not in to_markdown(tables(cold, "recorded")["variation"])
+    assert "temperature of the chips" not in to_markdown(tables(cold, "recorded")["variation"])
 
 
 def test_single_skin_has_no_spread_between_skins():

@@ -80,7 +80,7 @@ def test_each_world_has_the_rows_of_table_2(decide_settings, tmp_path):
     assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
     assert len(table) == 8
     svg = show.figures(numbers, {}, "simulated")["worlds.svg"]
-    for scene in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
+    for scene in ("Scores of table 2 in each world (simulated", "friction between skin and tip", "adapted"):
         assert scene in texts_of(svg)
 
 

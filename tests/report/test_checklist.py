@@ -294,7 +294,7 @@ def test_reasons_about_the_simulation_are_shown_only_in_simulated_scenes():
 
 
 def test_reason_contains_the_numbers_of_the_run():
-    assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
+    assert "80 % nearer to the skin, and ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
 def test_equal_numbers_are_not_given_as_a_reason():

@@ -174,7 +174,7 @@ def test_candidates_must_have_the_same_number_of_steps():
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]
     unfair = [slow, fast, with_steps(slow, 900, mse_xy_mm2=0.1)]
-    with pytest.raises(ParamsError, match="steps of train_multi's fast differ between candidates"):
+    with pytest.raises(ParamsError, match="candidate fast of train_multi was trained with numbers of steps"):
         choose([*unfair, *others])
     chosen = choose([*unfair, with_steps(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
     # The mean error is 0.275 for `fast`, and 0.3 for `slow`.

@@ -185,7 +185,7 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
     assert variants == {"train_single", "train_multi", "train_triplet", "adapt"}
     # Only the paper's random split has a leak.
     assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]
-    assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
+    assert f"tiny: {len(checks)} checks found no leak. In addition, 1 known" in capsys.readouterr().err
 
 
 def test_settings_that_affect_only_speed_need_no_record_of_their_choice(scene):
@@ -297,7 +297,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
         ),
         (
             {"train_multi": CHOICE["chosen"]["train_multi"]},
-            "train_triplet", "not chosen by the study: it chose no recipe for this stage",
+            "train_triplet", "not chosen by the study: the study chose no recipe for this stage",
         ),
     ],
     ids=["another rate", "no choice"],

@@ -341,7 +341,8 @@ def test_scaler_fitted_to_both_sides_is_detected_even_if_it_is_close():
     arrays = fit(DB_uT, TARGET)  # The scaler is fitted to all rows, those of the training side and of the test side.
     check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
     assert check.found == (
-        "relative difference 3.6e-08 from a scaler of the training rows, 0 from one of training and test rows"
+        "relative difference 3.6e-08 from a scaler fitted to the training rows, and 0 from a scaler fitted to "
+        "training and test rows"
     )
     assert not check.holds
 
@@ -398,6 +399,6 @@ def test_recipe_that_differs_from_the_chosen_settings_is_reported(recipe, found)
 def test_missing_record_of_the_choice_is_reported_and_a_broken_one_is_refused():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
-    assert checks[-1].found == "not chosen by the study: it chose no recipe for this stage"
+    assert checks[-1].found == "not chosen by the study: the study chose no recipe for this stage"
     with pytest.raises(ParamsError, match="skins is missing"):
         choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})

@@ -120,7 +120,7 @@ def test_on_a_drifting_skin_the_no_load_reading_from_the_start_has_the_largest_e
 
 def test_adding_a_random_walk_to_recordings_is_refused(scene, tmp_path):
     wear = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
-    with pytest.raises(ParamsError, match="drift.wander_uT is .* but a recorded scene"):
+    with pytest.raises(ParamsError, match="drift.wander_uT is .* a recorded scene already contains real drift"):
         drift(section=drift_section(scene), indentations=wear, **scene)
 
 
