@@ -31,9 +31,10 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
-    """Return the ingest counts of each capture in a folder, which include lost readings, and the counts `left_out`.
+    """Return the losses of an experiment: the ingest counts of each capture in a folder, and the counts `left_out`.
 
-    left_out: the number of rows that the experiment excluded, by reason.
+    The ingest counts contain the numbers of lost readings. left_out: the number of rows that the experiment excluded,
+    by reason.
     """
     accounts = [io.read_ingest_counts(file) for file in sorted(indentations.glob("*.parquet"))]
     return {"accounts": accounts, "left_out": dict(left_out)}

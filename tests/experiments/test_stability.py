@@ -105,7 +105,7 @@ def test_wrong_layer_compliance_is_detected_for_all_tips(monkeypatch):
     for one in kept:
         one.cache_clear()
     sizes = ("0.1", "1", "10")
-    assert failed(tips(DESIGN.skin.base)) == {f"a tip whose radius is {size} thicknesses" for size in sizes}
+    assert failed(tips(DESIGN.skin.base)) == {f"a tip whose radius is {size} times the thickness" for size in sizes}
     for one in kept:
         one.cache_clear()
 

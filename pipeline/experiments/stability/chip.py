@@ -84,7 +84,7 @@ def _stuck(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
         _marked("a chip that repeats one reading while others change", faults.stuck_chips(stuck_uT), expected,
                 should=f"this chip is marked from its {faults.STUCK_FRAMES_MIN_N}th equal reading on, and no others"),
         _marked("a board at rest whose chips all have no noise", faults.stuck_chips(resting), np.zeros_like(expected),
-                should="nothing is marked, because all chips repeat their readings if the board is at rest"),
+                should="nothing is marked: if all chips repeat their readings, the board is at rest, not faulty"),
     ]  # fmt: skip
 
 

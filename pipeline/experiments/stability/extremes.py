@@ -74,7 +74,7 @@ def tips(base: layer.Base) -> list[Case]:
         truth_N = ring_force_N(depth_m, thickness_m, tip_m, 1e6, base, reach_m=1.15 * contact.radius_m)
         error = abs(found_N / truth_N - 1)
         cases.append(
-            error_case(AREA, f"a tip whose radius is {size:g} thicknesses",
+            error_case(AREA, f"a tip whose radius is {size:g} times the thickness",
                        should=f"the same force as {RINGS_N} rings of pressure under the tip",
                        happened=f"{found_N:.4g} N, rings {truth_N:.4g} N: relative error {error:.1e}",
                        error=float(error), limit=0.01)

@@ -206,7 +206,7 @@ def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
         trained = _train(job, replace(rows, target=_scale(rows.target, scale)))
         rescaled = score(true, _scale(trained.predicted, 1 / scale))
         error = max(abs(rescaled[name] / unscaled[name] - 1) for name in METRICS)
-        observed = ", ".join(f"{name} {rescaled[name]:.4g}, unscaled {unscaled[name]:.4g}" for name in METRICS)
+        observed = "; ".join(f"{name} {rescaled[name]:.4g}, unscaled {unscaled[name]:.4g}" for name in METRICS)
         cases.append(error_case(AREA, f"labels multiplied by 2^{power}",
                                 should="predictions, scaled back, have exactly the same scores as without scaling",
                                 happened=observed, error=error, limit=0.0))  # fmt: skip

@@ -18,7 +18,7 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # index of the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # memory use is compared between streams of this many blocks and of four times as many
+BLOCKS_N = 3  # the memory for a stream of this many blocks is compared with the memory for four times as many
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
         Damage("two frames merged, with as many bytes missing as a frame has",
                "at most one false frame, which cannot be detected because no format has a checksum or a counter",
                [whole[:middle] + whole[same:]], lost_n=2, false_n=1),
-        Damage("other bytes inside a frame", "at most two frames are lost, and all bytes are counted",
+        Damage("unrelated bytes inserted into a frame", "at most two frames are lost, and all bytes are counted",
                [whole[:middle], GARBAGE, whole[middle:]], lost_n=2),
         Damage("stream arrives byte by byte", "the same frames as if it arrived at once",
                [whole[i : i + 1] for i in range(len(whole))]),

@@ -44,7 +44,11 @@ BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the compliance of a layer, and compare the force with published solutions up to 0.6 of the thickness."""
+    """Check the compliance of a layer, and compare the force with published solutions up to 0.6 of the thickness.
+
+    The compliance is the displacement of the surface under a wave of pressure, relative to a half-space (an infinitely
+    thick layer). It depends on the product of the wave number k and the thickness h.
+    """
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
@@ -219,7 +223,8 @@ def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: 
               scaled_error(force_N(3 * depth_m, larger), 9 * once_N), "1", 1e-9,
               "The nodes of the force curve, which is a spline, depend on a root search that stops at 1e-12."),
         Check(SKIN_FORCE, "interpolated over the depth by a spline", "the force without interpolation, at each depth",
-              scaled_error(once_N, np.array(exact_N)), "1", 1e-6, "The cubic spline has 48 nodes."),
+              scaled_error(once_N, np.array(exact_N)), "1", 1e-6,
+              "The cubic spline through 48 nodes is not exact between the nodes."),
     ]  # fmt: skip
 
 
@@ -267,8 +272,8 @@ def straight_drag(
 
 
 STEPS_N = 12  # number of depth steps of an indentation; for a depth of 1.2 mm, each step is 0.1 mm
-STEP_M = 1e-7  # half-width of central differences
-HELD = {"bonded": "does not move", "slipping": "keeps its height"}
+STEP_M = 1e-7  # distance from a place to each of its two neighbours in central differences
+HELD = {"bonded": "does not move", "slipping": "keeps its height"}  # how the base constrains the material on it
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
@@ -310,7 +315,7 @@ def one_small_step(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
         Check(name, "gradient of the displacement u", differences,
               max_error(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric), "1", 1e-6, length),
         Check(name, f"material on the {press.base} base {HELD[press.base]}", "0 m", _off(base.r_m, base.z_m, press),
-              "m", 1e-17, "Only rounding errors occur, of 1e-14 of the depth."),
+              "m", 1e-17, "Rounding errors are about 1e-14 of the depth."),
         Check(name, "surface in the contact has the shape of the tip", "a sphere",
               max_error(sunken.z_m, sphere_m) / depth_m, "of the depth", 0.005,
               "The pressure is a sum of waves. Waves shorter than 1/6 of the thickness are omitted, so that the shape "
@@ -357,13 +362,12 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     end = deformation.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
     above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
     touches = end.r_m < 0.95 * radius_m
+    reason = "In each step, the pressure is a sum of only six basis pressures, so that the surface is no exact sphere."
     return [
         Check("deformation in steps", "surface in the contact has the shape of the tip", "a sphere",
-              max_error(above_m[touches], 0.0) / depth_m, "of the depth", 0.02,
-              "In each step, the pressure is a sum of only six basis pressures."),
+              max_error(above_m[touches], 0.0) / depth_m, "of the depth", 0.02, reason),
         Check("deformation in steps", "surface beside the contact does not enter the tip", "a sphere",
-              max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02,
-              "In each step, the pressure is a sum of only six basis pressures."),
+              max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02, reason),
     ]  # fmt: skip
 
 

@@ -36,7 +36,7 @@ TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter t
 
 
 def check_field(skin: SkinDesign, seed: int) -> list[Check]:
-    """Check the fields of cuboids, of the magnetising array, and of dipoles at rest and displaced."""
+    """Check the fields of cuboids, of dipoles, and of the magnetising array (the magnets that magnetise a skin)."""
     return [*boxes(seed), octupole(), *array(skin.polarity, skin.thickness_mm * milli, seed), *dipoles(seed)]
 
 
@@ -257,7 +257,8 @@ def temperature(seed: int) -> Check:
 
 
 FRAMES_N = 300
-CRLF_degC = 34.513275  # temperature whose float32 bytes contain CR LF
+# A temperature whose float32 bytes contain CR LF, the two bytes that end each frame in a stream.
+CRLF_degC = 34.513275
 CRLF_SHARE = 0.05  # fraction of temperatures that have this value
 
 
@@ -338,7 +339,7 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
 # Number of indentations, time from one indentation to the next, and times of lowering and of holding the tip.
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7
 NAME = "relaxation of the force"
-STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
+STATE = np.array([0.7, -0.2, 0.4])  # state of the relaxation before a time step, one value per relaxation time
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest / fastest relaxation time; the fastest is 1 ms
 STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time step / fastest relaxation time
 ROUNDING = 1e-14  # relative rounding error of a few dozen operations on doubles
