@@ -21,7 +21,7 @@ NONE_YET = "No entries yet."
 
 
 def entry_file(dataset: str, method: str, folder: Path | None = None) -> Path:
-    """Return the path of an entry in a folder of a benchmark; its name consists of the dataset and the method.
+    """Return the path of an entry in a folder of a benchmark; the file name consists of dataset and method.
 
     >>> entry_file("lab", "nearest label").name
     'lab.nearest-label.json'
@@ -35,11 +35,11 @@ def score_and_write(
 ) -> tuple[Entry, Path]:
     """Score a file of predictions; write the scores beside it or, if `enter`, to benchmark/entries; return the path.
 
-    about: fields of `About`, all of which an entry needs; None for a field that is not given.
+    about: values of the fields of `About`; None for a field that is not given. An entry needs all fields.
     """
     missing = [name.replace("_", "-") for name, text in about.items() if not text]
     if enter and missing:
-        raise ParamsError(f"reskin score --enter: --{missing[0]} is missing. An entry needs {', '.join(about)}.")
+        raise ParamsError(f"reskin score --enter: --{missing[0]} is missing. An entry must state {', '.join(about)}.")
     defaults = {"method": predictions.stem} | {name: text for name, text in about.items() if text}
     entry = score_file(predictions, parse(About, dict.fromkeys(about, NOT_STATED) | defaults, "reskin score"), data)
     return entry, write_entry(entry, None if enter else predictions.with_suffix(".scores.json"))
@@ -59,7 +59,7 @@ def read_entries(folder: Path) -> list[Entry]:
         entry = parse(Entry, io.read_json(file), str(file))
         folds = read_folds(entry.dataset, entry.version)
         if folds.source != entry.source:
-            raise SchemaError(file, "source", folds.source, entry.source, "Score the predictions again.")
+            raise SchemaError(file, "source", folds.source, entry.source, "Run `reskin score --enter` again.")
         name = entry_file(entry.dataset, entry.about.method, folder).name
         if file.name != name:
             raise SchemaError(f"{file}: an entry of this dataset and method must be called {name}. Rename the file.")
@@ -99,7 +99,7 @@ def compare_with_experiments(entries: Sequence[Entry], numbers: Mapping[str, Any
             for name in ("accuracy_pct", "r2_f"):
                 title = METRICS[name]
                 line |= {f"{title}, entry": show(task.scores[name]), f"{title}, experiment": show(row[name])}
-            lines.append(line | {"sd over draws, %": f"({'; '.join(sd)})"})
+            lines.append(line | {"standard deviation over draws, %": f"({'; '.join(sd)})"})
     return to_markdown(tabulate(lines)) if lines else NONE_YET
 
 

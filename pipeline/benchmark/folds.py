@@ -112,7 +112,7 @@ class FoldFile(Strict):
 
 @dataclass(frozen=True)
 class Presses:
-    """A table of presses, each as the mean over its readings, or a table of the single readings of presses.
+    """A table with one row per press (the mean over its readings), or with one row per reading of the presses.
 
     - board: board of each row.
     - press: number of the press on its board.
@@ -204,8 +204,8 @@ class Task:
     def _checked(self, name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
         array = np.asarray(values, float)
         if array.shape != shape:
-            remedy = "Predict each row of tests_uT."
-            raise SchemaError(f"fold {self.fold}: {name} has shape {array.shape}; it needs {shape}. {remedy}")
+            remedy = "Make one prediction for each row of tests_uT."
+            raise SchemaError(f"fold {self.fold}: {name} has shape {array.shape}, but must have {shape}. {remedy}")
         return array
 
 
@@ -289,11 +289,12 @@ def read_folds(dataset: str, version: str = VERSION) -> FoldFile:
     """Read a fold file of the benchmark."""
     versions = sorted(folder.name for folder in FOLDER.iterdir() if folder.is_dir() and folder.name != ENTRIES)
     if version not in versions:
-        raise ParamsError(f"benchmark: no version {version!r}; it has {', '.join(versions)}.")
+        raise ParamsError(f"benchmark: version {version!r} does not exist. Existing versions: {', '.join(versions)}.")
     names = sorted(file.stem for file in (FOLDER / version).glob("*.json"))
     if dataset not in names:
         guess = did_you_mean(dataset, names)
-        raise ParamsError(f"benchmark {version}: no dataset {dataset!r}; it has {', '.join(names) or 'none'}.{guess}")
+        known = f"Existing datasets: {', '.join(names) or 'none'}."
+        raise ParamsError(f"benchmark {version}: dataset {dataset!r} does not exist. {known}{guess}")
     file = FOLDER / version / f"{dataset}.json"
     return parse(FoldFile, io.read_json(file), str(file))
 
@@ -306,7 +307,8 @@ def read_dataset(dataset: str, data: Path | str | None = None, *, version: str =
     found_n = {board: len(own) for board, own in presses.items()}
     if found_n != folds.presses_n:
         rule = f"{folds.presses_n} as in benchmark {version}"
-        raise SchemaError(folder, "the number of presses", rule, found_n, "Use the code of the version's release.")
+        remedy = "Use the release of this project that published these folds."
+        raise SchemaError(folder, "the number of presses", rule, found_n, remedy)
     return Dataset(folds, presses, readings)
 
 
@@ -350,11 +352,17 @@ def join_presses(parts: Sequence[Presses]) -> Presses:
 
 def _check_file(path: Path, digest: str) -> None:
     if not path.is_file():
-        remedy = "Run `reskin fetch` for recordings, or give their folder; restore simulated presses with git."
+        remedy = (
+            "Run `reskin fetch` to download recordings, or state their folder with `--data`. The file of simulated "
+            "presses is part of the repository: restore it with git."
+        )
         raise SchemaError(f"{path}: file not found. {remedy}")
     if io.sha256(path) != digest:
-        remedy = "Run `reskin fetch` for recordings; restore simulated presses with git."
-        raise SchemaError(f"{path}: the file is not the one of the benchmark (another SHA-256). {remedy}")
+        remedy = (
+            "Run `reskin fetch` to download recordings again. The file of simulated presses is part of the repository: "
+            "restore it with git."
+        )
+        raise SchemaError(f"{path}: the file is not the one of the benchmark, because its SHA-256 differs. {remedy}")
 
 
 def _read_recording(folder: Path, recording: Recording) -> Presses:

@@ -24,11 +24,13 @@ DECIMALS = 4  # written decimals of predictions: 0.1 um and 0.1 mN
 FIRST_LINE_N = 2  # number of the line with the first row of a CSV file
 SHOWN_N = 5  # number of missing presses that an error lists
 HELP = "See docs/benchmark.md."
-# Beyond these limits, predictions probably have a wrong unit or another origin. Even the predictions of poor methods
-# are within these limits.
-# Upper limit of the distance from the median place to the middle of the pressed area / the area's width
+# Beyond the following limits, predictions probably have a wrong unit or another origin. Even the predictions of poor
+# methods are within the limits.
+# Upper limit of the distance from the median predicted place to the middle of the pressed area, divided by the width of
+# the area.
 OFF_MIDDLE = 0.4
-PLACE_MIN = 0.15  # lower limit of the largest predicted coordinate / the largest coordinate of the pressed area
+# Lower limit of the largest predicted coordinate, divided by the largest coordinate of the pressed area.
+PLACE_MIN = 0.15
 # Lower limit of the largest predicted force, and upper limit of the median predicted force, both divided by the largest
 # true force.
 FORCE_MIN, FORCE_MAX = 0.01, 10.0
@@ -76,7 +78,7 @@ def read_predictions(file: Path) -> Predictions:
     folds = _folds_of(rows)
     _check_presses(rows, folds)
     if folds.forces != (FORCE in rows.table.column_names):
-        what = f"column {FORCE} is missing" if folds.forces else f"column {FORCE} is given, but no force is known there"
+        what = f"column {FORCE} is missing" if folds.forces else f"column {FORCE} is not allowed"
         raise rows.error(None, f"{what}. Dataset {folds.dataset} {'has' if folds.forces else 'has no'} forces. {HELP}")
     quantities = [*PLACE, *([FORCE] if folds.forces else [])]
     for name in rows.table.column_names[2:]:
@@ -102,7 +104,7 @@ def check_units(file: Path, predictions: Predictions, dataset: Dataset) -> None:
     median_mm = np.median(place_mm, axis=0)
     if (np.abs(median_mm - (least + most) / 2) > OFF_MIDDLE * (most - least)).any():
         problem = f"the median place is ({median_mm[0]:.4g}, {median_mm[1]:.4g}), but the presses have {area}"
-        raise SchemaError(f"{file}: {problem}. Are places in mm, with the origin of the labels? {HELP}")
+        raise SchemaError(f"{file}: {problem}. Are places in mm, with the same origin as the labels? {HELP}")
     if predictions.force_N is not None:
         most_N, median_N = max(presses.force_N.max() for presses in boards), float(np.median(predictions.force_N))
         largest_N = float(np.abs(predictions.force_N).max())
@@ -143,7 +145,7 @@ class _Rows:
         if bad.any():
             row_i = int(bad.argmax())
             more_n = int(bad.sum()) - 1
-            more = f" The same holds for {more_n} more rows." if more_n else ""
+            more = f" The same error occurs in {more_n} more rows." if more_n else ""
             described = problem if isinstance(problem, str) else problem(row_i)
             end = "" if described.endswith("?") else "."
             raise self.error(row_i, f"{described}{end}{more} {HELP}")
@@ -164,7 +166,7 @@ def _read_table(file: Path) -> pa.Table:
     if _suffix(file) == ".csv":
         head = io.read_bytes(file).partition(b"\n")[0].decode("utf-8-sig", errors="replace")
         if not head.strip():
-            raise SchemaError(f"{file}: line 1 is empty; it must have the names of the columns. {HELP}")
+            raise SchemaError(f"{file}: line 1 is empty, but must contain the names of the columns. {HELP}")
         if "," not in head and (";" in head or "\t" in head):
             raise SchemaError(f"{file}: line 1 has no comma. Separate columns by commas. {HELP}")
         _check_columns(file, names := [name.strip() for name in head.split(",")], list(types), optional)
@@ -191,7 +193,8 @@ def _read_table(file: Path) -> pa.Table:
 def _check_columns(file: Path, names: Sequence[str], known: Sequence[str], optional: Sequence[str]) -> None:
     for name in names:
         if not name:
-            raise SchemaError(f"{file}: a column has no name. pandas: to_csv(..., index=False). {HELP}")
+            remedy = "With pandas, write the file with to_csv(..., index=False)."
+            raise SchemaError(f"{file}: a column has no name. {remedy} {HELP}")
         if name not in known:
             raise SchemaError(f"{file}: column {name[:40]!r} is unknown.{did_you_mean(name, known)} {HELP}")
         if names.count(name) > 1:
@@ -209,7 +212,8 @@ def _folds_of(rows: _Rows) -> FoldFile:
         raise rows.error(0, f"fold {str(rows.fold[0])[:80]!r} is unknown: {error} {HELP}") from None
     prefix = f"{version}.{dataset}."
     foreign = np.array([not name.startswith(prefix) for name in rows.fold])
-    rows.check(foreign, lambda i: f"fold {rows.fold[i]} is not in {version}.{dataset}. Write one file per dataset")
+    rows.check(foreign, lambda i: f"fold {rows.fold[i]} is not in {version}.{dataset}, to which the first row belongs. "
+               "Write one file per dataset")  # fmt: skip
     unknown = ~np.isin(rows.fold, list(folds.folds))
     rows.check(unknown, lambda i: f"fold {rows.fold[i]} is unknown.{did_you_mean(rows.fold[i], folds.folds)}")
     return folds
@@ -232,11 +236,11 @@ def _check_presses(rows: _Rows, folds: FoldFile) -> None:
         if labels_n in predicted and (missing := sorted(press for press in tests[name] if (name, press) not in first)):
             shown = ", ".join(map(str, missing[:SHOWN_N])) + (", ..." if len(missing) > SHOWN_N else "")
             what = f"{len(missing)} of {len(tests[name])} tested presses of fold {name} are missing: {shown}"
-            raise rows.error(None, f"{what}. Predict all folds with {labels_n} labels or none of them. {HELP}")
+            raise rows.error(None, f"{what}. Predict either all folds with {labels_n} labels or none. {HELP}")
 
 
 def _role(folds: FoldFile, fold: str, press: int) -> str:
-    """Describe the role that a press, which is not tested, has in a fold; empty if it has none."""
+    """Describe the role in a fold of a press that is not tested; empty if the press has no role."""
     draw, labels_n = folds.folds[fold]
     if press in draw.labels[:labels_n]:
         return ", where it is labelled"
@@ -249,7 +253,8 @@ def _interval(rows: _Rows, quantity: str) -> Float[np.ndarray, "n 2"] | None:
     given = [name for name in limits if name in names]
     if sd in names:
         if given:
-            raise rows.error(None, f"both {sd} and {given[0]} are given. Give one kind of uncertainty. {HELP}")
+            remedy = "Give either standard deviations or limits."
+            raise rows.error(None, f"both {sd} and {given[0]} are given. {remedy} {HELP}")
         values = rows.number(sd)
         rows.check(values < 0, f"{sd} is negative")
         half_width = NORMAL_90 * values

@@ -27,8 +27,10 @@ METRICS = {
 MEANING = (
     "Each number is the mean over boards; the value of a board is the mean over its draws of presses. [low, high] is "
     "the 95 % interval over boards (Student's t); with fewer than four boards, (a; b) are the values of the boards. "
-    "Within 1 mm: both x and y. MSE_xy: averaged over x and y. Interval score: mean width of the 90 % intervals plus "
-    "20 times the distance of true values outside; smaller is better."
+    "Within 1 mm: percentage of presses whose predicted x and y are both within 1 mm of the true place. MSE_xy: mean "
+    "squared error of x and y, averaged over both. MSE_F: mean squared error of the force F. Interval score: mean "
+    "width of the 90 % intervals, plus 20 times the mean distance of the true values from their intervals, which is 0 "
+    "inside an interval; smaller is better."
 )
 Text = Annotated[str, Field(min_length=1, max_length=300)]
 
@@ -56,8 +58,9 @@ class Prediction(Strict):
 class TaskScores(Strict):
     """Scores with one number of labels.
 
-    scores: for each metric, a statistic over boards (`pipeline.statistics.statistic`). by_board: for each board and
-    metric, the mean over draws, the number of draws and, for several draws, the standard deviation over draws.
+    scores: for each metric, mean and spread over boards, as computed by `pipeline.statistics.statistic`. by_board:
+    for each board and metric, the mean over draws, the number of draws and, for several draws, the standard deviation
+    over draws.
     """
 
     labels_n: Annotated[int, Field(ge=0)]

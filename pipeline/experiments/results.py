@@ -9,7 +9,7 @@ from reskin.errors import SchemaError
 from reskin.schema import Readings
 
 Capture = TypeVar("Capture")
-# Losses for experiments without captures of their own; the losses of the main captures are in other results.
+# The losses of an experiment without captures of its own. The losses of the main captures are in other results.
 NO_LOSSES: Mapping[str, Any] = {"accounts": [], "left_out": {}}
 
 
@@ -17,22 +17,24 @@ def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readi
     """Read the named captures of the folder `indentations` in alphabetical order; without names, read all of them."""
     files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
     if not files:
-        raise SchemaError(f"{indentations}: no captures in this folder. Run the ingest stages of this scene again.")
+        remedy = "Run the stages ingest or ingest_many of this scene again with `dvc repro`."
+        raise SchemaError(f"{indentations}: no captures in this folder. {remedy}")
     return [io.read_readings(file) for file in files]
 
 
 def only(captures: Sequence[Capture], folder: Path) -> Capture:
     """Return the only capture in `captures`, which were read from `folder`; raise `SchemaError` unless there is one."""
     if len(captures) != 1:
-        remedy = "Set skins_n: 1 for the experiment's protocol, and simulate the captures again."
+        remedy = "Set skins_n: 1 for the protocol of the experiment in the scene's file, and run `dvc repro`."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
     return captures[0]
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
-    """Return the ingest counts of each capture in a folder, which include lost readings, and the counts `left_out`.
+    """Return the losses of an experiment: the ingest counts of each capture in a folder, and the counts `left_out`.
 
-    left_out: the number of rows that the experiment excluded, by reason.
+    The ingest counts contain the numbers of lost readings. left_out: the number of rows that the experiment excluded,
+    by reason.
     """
     accounts = [io.read_ingest_counts(file) for file in sorted(indentations.glob("*.parquet"))]
     return {"accounts": accounts, "left_out": dict(left_out)}

@@ -64,8 +64,8 @@ def sliding():
 def test_base_without_damping_is_detected(monkeypatch):
     monkeypatch.setattr(contact, "_in_series", lambda layer_N_per_m, _: layer_N_per_m[:, None, None] * np.eye(2))
     assert failed(sliding()) == {
-        "a drag with friction 10 on a skin that slides",
-        "a tip that pulls the skin and is lifted there",
+        "a drag with a coefficient of friction of 10 on a sliding skin",
+        "a tip that drags the skin and is then lifted",
     }
 
 
@@ -78,8 +78,8 @@ def test_slide_without_rotation_and_linear_depth_are_detected(monkeypatch):
     monkeypatch.setattr(slide, "rigid_motion", lambda *args: replace(rigid(*args), spin_rad=np.zeros(len(args[0]))))
     monkeypatch.setattr(slide, "depth_at", straight)
     assert failed(sliding()) == {
-        "the slide of a skin that is poked at its free edge",
-        "pressed to 0.72 of the thickness by force, and let go",
+        "motion of a skin that is poked near its free edge",
+        "force control up to a depth of 0.72 of the thickness, and back to 0",
     }
 
 
@@ -104,7 +104,8 @@ def test_wrong_layer_compliance_is_detected_for_all_tips(monkeypatch):
     monkeypatch.setattr(layer, "slipping_compliance", lambda kh: compliance(1.5 * kh))
     for one in kept:
         one.cache_clear()
-    assert failed(tips(DESIGN.skin.base)) == {f"a tip of {size} thicknesses" for size in ("0.1", "1", "10")}
+    sizes = ("0.1", "1", "10")
+    assert failed(tips(DESIGN.skin.base)) == {f"a tip whose radius is {size} times the thickness" for size in sizes}
     for one in kept:
         one.cache_clear()
 
@@ -117,7 +118,9 @@ def test_cells_as_wide_as_the_gap_are_detected(monkeypatch):
 def test_fixed_stiffening_thickness_is_detected(monkeypatch):
     monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
     monkeypatch.setattr(slide, "stiffening", lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3)
-    assert failed(extremes()) == {"a skin of 0.2 mm", "a skin of 20 mm"}
+    assert failed(extremes()) == {
+        f"a skin of {size} mm thickness, with all other lengths scaled too" for size in ("0.2", "20")
+    }
 
 
 def test_skin_without_springs_has_no_sliding_cases():
@@ -134,7 +137,7 @@ def test_case_without_the_expected_error_and_nan_fail():
     def raises():
         raise CaptureError("here: a thing must be so; got nothing. Mend it.")
 
-    assert rejection_case("wire", "a", should="b", attempt=raises).happened.startswith("refused: here: a thing")
+    assert rejection_case("wire", "a", should="b", attempt=raises).happened.startswith("error: here: a thing")
     assert not rejection_case("wire", "a", should="b", attempt=lambda: None).holds
     assert not error_case("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
 
@@ -184,8 +187,8 @@ def test_missing_chip_saturation_is_detected(monkeypatch):
 @pytest.mark.parametrize(
     ("guard", "disabled", "case"),
     [
-        ("failed_reads", lambda b_uT, _: np.zeros((len(b_uT), 5), bool), "50 dropped readings of one chip"),
-        ("stuck_chips", lambda b_uT: np.zeros((len(b_uT), 5), bool), "a chip that stops while the board moves"),
+        ("failed_reads", lambda b_uT, _: np.zeros((len(b_uT), 5), bool), "50 failed readings of one chip"),
+        ("stuck_chips", lambda b_uT: np.zeros((len(b_uT), 5), bool), "a chip that repeats one reading"),
         ("reset_chips", lambda *_: np.zeros(5, bool), "chip 3 lost its settings"),
     ],
 )

@@ -47,13 +47,13 @@ def test_outcomes_of_cases_are_reproducible(cases):
 @pytest.mark.filterwarnings("ignore:divide by zero encountered")
 def test_scaler_without_a_minimum_scale_is_detected(monkeypatch):
     monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(0))
-    constant = {"a channel that never moves", "no channel ever moves, as without a magnet"}
+    constant = {"a constant channel", "all channels are constant, as without a magnet"}
     assert failed(scaling_cases(SEED)) == constant
 
 
 def test_scaler_with_a_too_large_minimum_scale_is_detected(monkeypatch):
     monkeypatch.setattr(inputs, "SCALE_FLOOR", np.float32(1e-3))
-    assert failed(scaling_cases(SEED)) == {"labels times 2^-20"}
+    assert failed(scaling_cases(SEED)) == {"labels multiplied by 2^-20"}
 
 
 def test_triplet_loss_of_distances_that_are_not_squared_is_detected(monkeypatch):
@@ -62,13 +62,13 @@ def test_triplet_loss_of_distances_that_are_not_squared_is_detected(monkeypatch)
         return torch.relu(nearer - farther + 1e-3).mean(-1)
 
     monkeypatch.setattr(train, "triplet_loss", triplet_loss_of_roots)
-    assert failed(triplet_cases(SEED)) == {"triplets of identical readings, weighed 1000"}
+    assert failed(triplet_cases(SEED)) == {"triplet loss of identical readings, with a weight of 1000"}
 
 
 def test_triplets_with_equal_distances_are_detected(monkeypatch):
     monkeypatch.setattr(losses, "_find_anchors", lambda place: np.ones(len(place), bool))
     monkeypatch.setattr(batches, "draw_triplets", lambda points, anchor, rng: (anchor, anchor))
-    assert failed(triplet_cases(SEED)) == {"two pokes a skin: from each, only the other one"}
+    assert failed(triplet_cases(SEED)) == {"triplets if each skin has only two pokes"}
 
 
 def test_training_that_does_not_check_the_loss_is_detected(monkeypatch):

@@ -80,7 +80,7 @@ def test_field_with_the_wrong_sign_inside_magnets_is_detected(monkeypatch):
     original = magnet._corner
     monkeypatch.setattr(magnet, "_corner", lambda from_m: -original(from_m))
     wrong = failed(check_field(DESIGN.skin, SEED))
-    assert "field of a box: inside, J included" in wrong
+    assert "field of a box: inside, including the polarisation J" in wrong
     assert f"magnetising array, {DESIGN.skin.polarity}: field in the skin" in wrong
 
 
@@ -97,7 +97,7 @@ def test_magnetic_constant_with_a_relative_error_of_1e_minus_10_is_detected(monk
     monkeypatch.setattr(change, "MU0_4PI", 1.001e-7)
     assert failed(check_field(DESIGN.skin, SEED)) == {
         "change of field: dipoles that move and turn",
-        "dipole for a cube: error falls with (side / r)^4",
+        "dipole instead of a cube: relative error decreases with the distance r as (side / r)^4",
         "field of dipoles: at rest",
     }
 
@@ -123,8 +123,8 @@ def test_stretch_that_does_not_conserve_volume_is_detected(monkeypatch):
 
     monkeypatch.setattr(layer, "displacement", stretched)
     wrong = failed(one_small_step(IndentedLayer(2e-3, 3e-3, DESIGN.skin.base), DEPTHS_M[-1]))
-    assert "one small step: div u = 0" in wrong
-    assert "one small step: the surface lies on the tip" in wrong
+    assert "one linear step of the deformation: volume is conserved: div u = 0 (displacement u)" in wrong
+    assert "one linear step of the deformation: surface in the contact has the shape of the tip" in wrong
 
 
 def test_moments_that_do_not_rotate_are_detected(monkeypatch):
@@ -153,26 +153,26 @@ def test_wrong_step_of_chip_readings_is_detected(monkeypatch):
     # These are the steps for another value of HALLCONF in the data sheet.
     monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))
     wrong = failed(check_electronics(DESIGN.chip, SEED))
-    assert "chip: uT a count, GAIN_SEL 6 and 7" in wrong
-    assert "chip: past its range, GAIN_SEL 7, to 50 mT" in wrong
+    assert "chip: field per count, GAIN_SEL 6 and 7" in wrong
+    assert "chip: readings of fields beyond the range, up to 50 mT, GAIN_SEL 7" in wrong
 
 
 def test_noise_that_differs_from_recorded_noise_is_detected():
     quiet = DESIGN.chip.model_copy(update={"noise_xy_uT": 1.0})
-    assert any("outside the recorded" in law for law in failed(check_electronics(quiet, SEED)))
+    assert any("range of recorded noise" in law for law in failed(check_electronics(quiet, SEED)))
 
 
 def test_wrong_order_of_channels_in_frames_is_detected(monkeypatch):
     encode, original = wire.encode, stream.FrameStream.feed
     monkeypatch.setattr(wire, "encode", lambda frames, layout: encode(rotate_chips(frames), layout))
     assert {law.split(": ")[1] for law in failed(check_frames(DESIGN.chip.gain_sel, 5, SEED))} == {
-        "what is written", "what struct reads of it",
+        "bytes that the simulator encodes", "values that struct decodes from the simulator's bytes",
     }  # fmt: skip
     monkeypatch.setattr(wire, "encode", encode)
     monkeypatch.setattr(stream.FrameStream, "feed", lambda self, data: rotate_chips(original(self, data)))
     wrong = failed(check_frames(DESIGN.chip.gain_sel, 5, SEED))
     assert len(wrong) == 4
-    assert all(": what is read" in law for law in wrong)
+    assert all(": values that our decoder reads" in law for law in wrong)
 
 
 def rotate_chips(frames):

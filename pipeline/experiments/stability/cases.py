@@ -42,7 +42,7 @@ def rejection_case(area: str, case: str, *, should: str, attempt: Callable[[], o
     try:
         attempt()
     except ReskinError as error:
-        return condition_case(area, case, should=should, happened=f"refused: {error}", holds=True)
+        return condition_case(area, case, should=should, happened=f"error: {error}", holds=True)
     return condition_case(area, case, should=should, happened="no error was raised", holds=False)
 
 

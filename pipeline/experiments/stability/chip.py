@@ -33,10 +33,12 @@ def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
 def _range() -> list[Case]:
     past_uT, beyond_uT = np.array([[5000.0, -4000.0, -8500.0]]), np.array([[60e3, -4e3, -70e3]])
     return [
-        out_of_range(past_uT, "5, -4 and -8.5 mT at GAIN_SEL 7 (range 4.915 and 7.93 mT)",
-                     "the two past the range wrap as int16, and are counted", wrapped_n=2, clipped_n=0),
-        out_of_range(beyond_uT, "60, -4 and -70 mT at GAIN_SEL 7", "held at 50 mT, which wraps; both counted",
-                     wrapped_n=2, clipped_n=2),
+        out_of_range(past_uT, "5, -4 and -8.5 mT at GAIN_SEL 7 (range 4.915 mT in x and y, 7.93 mT in z)",
+                     "the two values beyond the range overflow an int16 and wrap around, and are counted as wrapped",
+                     wrapped_n=2, clipped_n=0),
+        out_of_range(beyond_uT, "60, -4 and -70 mT at GAIN_SEL 7",
+                     "60 and -70 mT are clipped to 50 and -50 mT, which then wrap around; both are counted as clipped "
+                     "and as wrapped", wrapped_n=2, clipped_n=2),
     ]  # fmt: skip
 
 
@@ -63,12 +65,12 @@ def _failed(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]
     one_chip[100:150, broken_i] = True
     cases = []
     every_chip = np.ones_like(one_chip)
-    for case, dropped in (("50 dropped readings of one chip", one_chip), ("every chip dropped", every_chip)):
+    for case, dropped in (("50 failed readings of one chip", one_chip), ("all readings failed", every_chip)):
         b_uT = np.where(dropped[..., None], faults.FAILED_B_uT, intact_uT.reshape(*dropped.shape, 3))
         b_uT = b_uT.reshape(intact_uT.shape)
         marked = faults.failed_reads(b_uT, np.where(dropped, faults.FAILED_TEMPERATURE_degC, 25.0))
-        case += ": 8028.16, 5194.00, 12943.36 uT, -880.49 degC"
-        cases.append(_marked(case, marked, dropped, should="every such reading marked, and no other"))
+        case += ", with 8028.16, 5194.00, 12943.36 uT and -880.49 degC"
+        cases.append(_marked(case, marked, dropped, should="all failed readings are marked, and no others"))
     return cases
 
 
@@ -79,17 +81,17 @@ def _stuck(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
     expected[from_i + faults.STUCK_FRAMES_MIN_N - 1 :, broken_i] = True
     resting = np.tile(intact_uT[:1], (FRAMES_N, 1))
     return [
-        _marked("a chip that stops while the board moves", faults.stuck_chips(stuck_uT), expected,
-                should=f"marked from its {faults.STUCK_FRAMES_MIN_N}th equal reading on, and no other"),
-        _marked("a whole board without noise, at rest", faults.stuck_chips(resting), np.zeros_like(expected),
-                should="nothing marked: a board at rest is not broken"),
+        _marked("a chip that repeats one reading while others change", faults.stuck_chips(stuck_uT), expected,
+                should=f"this chip is marked from its {faults.STUCK_FRAMES_MIN_N}th equal reading on, and no others"),
+        _marked("a board at rest whose chips all have no noise", faults.stuck_chips(resting), np.zeros_like(expected),
+                should="nothing is marked: if all chips repeat their readings, the board is at rest, not faulty"),
     ]  # fmt: skip
 
 
 def _marked(case: str, marked: Bool[np.ndarray, "f k"], expected: Bool[np.ndarray, "f k"], *, should: str) -> Case:
     hits_n, false_n = int((marked & expected).sum()), int((marked & ~expected).sum())
     observed = (
-        f"{hits_n} of {int(expected.sum())} readings marked, and {false_n} of the {int((~expected).sum())} others"
+        f"{hits_n} of {int(expected.sum())} faulty readings marked, and {false_n} of {int((~expected).sum())} others"
     )
     return condition_case(AREA, case, should=should, happened=observed, holds=bool((marked == expected).all()))
 
@@ -103,18 +105,18 @@ def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int)
     flagged, flagged_intact = (
         np.flatnonzero(faults.reset_chips(b_uT, None)).tolist() for b_uT in (reset_uT, intact_uT)
     )
-    known = {f"GAIN_SEL {gain_sel} in the header": gain_sel, "no settings in the header": None}
+    known = {f"GAIN_SEL {gain_sel} in the file header": gain_sel, "no settings in the file header": None}
     return [
-        condition_case(AREA, f"chip {broken_i} lost its settings: its LSB is 0.98 and 1.58 uT",
-                       should="that chip flagged, no other",
-                       happened=f"flagged: {flagged}; LSB found {found_uT[0]:.2f} and {found_uT[1]:.2f} uT",
+        condition_case(AREA, f"chip {broken_i} lost its settings: its step is 0.98 uT in x and y, 1.58 uT in z",
+                       should="only this chip is flagged",
+                       happened=f"flagged: {flagged}; steps found: {found_uT[0]:.2f} and {found_uT[1]:.2f} uT",
                        holds=flagged == [broken_i]),
-        condition_case(AREA, "no chip lost its settings", should="none flagged",
+        condition_case(AREA, "no chip lost its settings", should="no chip is flagged",
                        happened=f"flagged: {flagged_intact}", holds=not flagged_intact),
         *(
             rejection_case(AREA, f"a chip loses its settings while it is recorded, {of_header}",
                            attempt=partial(_detect, np.concatenate([intact_uT, reset_uT]), gain_of_header),
-                           should="reported by the ingest, with the chip and the frame")
+                           should="an error that states the chip and the frame")
             for of_header, gain_of_header in known.items()
         ),
     ]  # fmt: skip

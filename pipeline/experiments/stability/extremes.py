@@ -22,13 +22,13 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-# Nodes of both the simulation and its reference, so that errors of quadrature cancel.
+# The simulation and its reference use the same nodes, so that the errors of the quadrature cancel.
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
-PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation, where no node is on the tip's axis
+PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation; no node is on the tip's axis there
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # depths / thickness
 FINER = 4  # number of steps of the reference / number of steps of the simulator
 STEPS_N = 40  # steps of the simulator over a depth of one thickness
-RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest product wave number * outer radius
+RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest value of wave number * outer radius
 SIZES = (0.1, 1.0, 10.0)  # tip radius / thickness
 PRESSED = 0.4  # depth / min(thickness, tip radius)
 GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips; cell size / gap
@@ -45,7 +45,7 @@ def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def deep(board: Board, skin: Skin) -> list[Case]:
-    """Run cases of deep indentations: compare the simulator's dB with dB from finer steps without tables."""
+    """Run cases of deep indentations: compare the field change dB with dB computed in finer steps without tables."""
     cases = []
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
@@ -56,7 +56,7 @@ def deep(board: Board, skin: Skin) -> list[Case]:
         error = _error(found_T, truth_T)
         cases.append(
             error_case(AREA, f"dB of a press to {share:g} of the thickness",
-                       should=f"that of {FINER} times as many steps, without tables",
+                       should=f"the same dB as with {FINER} times as many depth steps and without tables",
                        happened=f"relative error {error:.1e}", error=error, limit=0.02)
         )  # fmt: skip
     return cases
@@ -74,8 +74,9 @@ def tips(base: layer.Base) -> list[Case]:
         truth_N = ring_force_N(depth_m, thickness_m, tip_m, 1e6, base, reach_m=1.15 * contact.radius_m)
         error = abs(found_N / truth_N - 1)
         cases.append(
-            error_case(AREA, f"a tip of {size:g} thicknesses", should="the force of rings of pressure that touch it",
-                       happened=f"{found_N:.4g} N, by rings {truth_N:.4g} N: relative error {error:.1e}",
+            error_case(AREA, f"a tip whose radius is {size:g} times the thickness",
+                       should=f"the same force as {RINGS_N} rings of pressure under the tip",
+                       happened=f"{found_N:.4g} N, rings {truth_N:.4g} N: relative error {error:.1e}",
                        error=float(error), limit=0.01)
         )  # fmt: skip
     return cases
@@ -131,8 +132,8 @@ def near(skin: SkinDesign) -> list[Case]:
         truth_T = box.getB(chips_m - middle_m - (SLID_M, 0.0, 0.0)) - box.getB(chips_m - middle_m)
         error = _error(found_T, truth_T)
         cases.append(
-            error_case(AREA, f"chips {gap_mm:g} mm under a skin that slides {SLID_M / milli:g} mm",
-                       should=f"dB of a box in closed form (magpylib), with cells of {CELL_SHARE:g} of the gap",
+            error_case(AREA, f"chips {gap_mm:g} mm under a skin that slides by {SLID_M / milli:g} mm",
+                       should=f"the same dB as a magnetised box (magpylib), for cells {CELL_SHARE:g} of the gap wide",
                        happened=f"{len(moments)} dipoles, relative error {error:.1e}", error=error, limit=0.03)
         )  # fmt: skip
     return cases
@@ -150,8 +151,8 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
         _, (other_T,) = changes_of_field(chips, other, scale * poke_m)
         error = max(_error(other_T, change_T), abs(float(other_N / (scale**2 * force_N)) - 1))
         cases.append(
-            error_case(AREA, f"a skin of {thickness_mm:g} mm",
-                       should="equal dB where all lengths scale, force as their square",
+            error_case(AREA, f"a skin of {thickness_mm:g} mm thickness, with all other lengths scaled too",
+                       should="dB is unchanged, and force is proportional to length squared",
                        happened=f"{other_N:.3g} N, relative error {error:.1e}", error=error, limit=1e-6)
         )  # fmt: skip
     return cases

@@ -44,8 +44,8 @@ def scaling_cases(seed: int) -> list[Case]:
     """Run cases of constant channels, and of labels multiplied by large and small factors."""
     job, rows = _job(seed), _rows(seed)
     return [
-        _constant(job, rows, [7], "a channel that never moves"),
-        _constant(job, rows, list(range(CHANNELS_N)), "no channel ever moves, as without a magnet"),
+        _constant(job, rows, [7], "a constant channel"),
+        _constant(job, rows, list(range(CHANNELS_N)), "all channels are constant, as without a magnet"),
         *_label_scales(job, rows),
     ]
 
@@ -71,12 +71,16 @@ def fold_cases() -> list[Case]:
     """Run cases of folds that need more boards or skins than the data have."""
     boards = ["b1", "b2", "b3"]
     folds = {
-        "one board, to be left out": ("lobo", boards[:1], Split()),
-        "two boards, of which two are trained on to test others": ("transfer", boards[:2], Split(transfer_skins_n=2)),
-        "three skins to train on where two are": ("sensors", boards, Split(sensors_skins_n=(3,), sensors_draws_n=1)),
+        "one board, which is left out for testing": ("lobo", boards[:1], Split()),
+        "two boards, both for training, and none left for testing": ("transfer", boards[:2], Split(transfer_skins_n=2)),
+        "three training skins required, but only two available": (
+            "sensors",
+            boards,
+            Split(sensors_skins_n=(3,), sensors_draws_n=1),
+        ),
     }
     return [
-        rejection_case(AREA, case, should="refused, with what there is",
+        rejection_case(AREA, case, should="an error that states how many there are",
                        attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [experiment], split, 0))
         for case, (experiment, groups, split) in folds.items()
     ]  # fmt: skip
@@ -99,9 +103,11 @@ def _constant(job: TrainingJob, rows: TrainingData, channels: list[int], case: s
     scaler = trained.scaler
     largest_input = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
     observed = (
-        f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {largest_input:g} seen; {_outcome(trained)}"
+        f"scale {scaler.input_scale[channels].min():.0e} uT, scaled inputs at most {largest_input:g}; "
+        f"{_outcome(trained)}"
     )
-    return error_case(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=observed,
+    return error_case(AREA, case, should="the scale has a minimum, so that the scaled input is 0; training succeeds",
+                      happened=observed,
                       error=largest_input if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
@@ -109,10 +115,10 @@ def _identical(job: TrainingJob, rows: TrainingData) -> Case:
     identical = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
     plain, pulled = (_train(_with(job, triplet_weight=weight), identical) for weight in (0.0, 1e3))
     distance = _distance(plain.weights, pulled.weights)
-    observed = f"weights {distance:g} apart from those without triplets after {STEPS_N} steps; {_outcome(pulled)}"
-    should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
-    return error_case(AREA, "triplets of identical readings, weighed 1000", should=should, happened=observed,
-                      error=distance if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
+    observed = f"{STEPS_N} steps; weights differ by {distance:g} from those without triplet loss; {_outcome(pulled)}"
+    should = "the triplet loss has a gradient of exactly 0, so that the weights equal those without triplet loss"
+    return error_case(AREA, "triplet loss of identical readings, with a weight of 1000", should=should,
+                      happened=observed, error=distance if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
 def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
@@ -120,10 +126,10 @@ def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
     target = rows.target.copy()
     target[:, :2] = MIDDLE[:2]
     attempts = {
-        "all pokes of a skin on one place": (job, replace(rows, target=target)),
-        "two pokes a skin: from each, only the other one": (replace(job, train=np.arange(4)), rows),
+        "triplets if all pokes of a skin are at the same place": (job, replace(rows, target=target)),
+        "triplets if each skin has only two pokes": (replace(job, train=np.arange(4)), rows),
     }
-    should = "refused: nothing is nearer than anything, and no sampler is endless"
+    should = "an error instead of an endless search, because no poke has a nearer and a farther neighbour"
     return [
         rejection_case(AREA, case, should=should, attempt=partial(_train, *arguments))
         for case, arguments in attempts.items()
@@ -134,12 +140,13 @@ def _exploding_weights(job: TrainingJob, rows: TrainingData, rate: float) -> Cas
     start, steps_n = _start(job, rows, 1e3), 3 * STEPS_N
     trained = _train(_tuned(job, start, steps_n=steps_n, rate_max=rate), rows)
     kept_step = curve_steps(steps_n)[len(trained.curve) - 1] if trained.curve else 0
-    stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
-    losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
+    stopped = "never stopped" if trained.stopped_step is None else f"diverged at step {trained.stopped_step}"
+    losses = f"; largest loss {max(trained.curve):.1e}, last loss {trained.curve[-1]:.2g}" if trained.curve else ""
     sound = all(np.isfinite(value).all() for value in trained.weights.values())
     observed = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
-    case = f"bottleneck scaled 1e3, learning rate {rate:g}"
-    return condition_case(AREA, case, should="stops, says where, and keeps the last finite weights", happened=observed,
+    case = f"weights of the bottleneck multiplied by 1e3, learning rate {rate:g}"
+    should = "training stops, reports the step, and keeps the last finite weights"
+    return condition_case(AREA, case, should=should, happened=observed,
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
@@ -148,9 +155,12 @@ def _overflowing_neighbour(job: TrainingJob, rows: TrainingData) -> Case:
     alone = _train(sound, rows)
     beside, overflowing = train_stack([sound, broken], rows)
     change = _distance(alone.weights, beside.weights)
-    observed = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {change:g} from what it becomes alone"
+    observed = (
+        f"{_outcome(overflowing)}; other network: {_outcome(beside)}, weights differ by {change:g} from training alone"
+    )
     holds = _is_sound(beside) and overflowing.stopped_step == STEPS_N
-    return error_case(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
+    return error_case(AREA, "a network that overflows, trained together with another network",
+                      should="the other network is the same as if it were trained alone",
                       happened=observed, limit=ROUNDING,
                       error=change if holds else np.inf)  # fmt: skip
 
@@ -162,11 +172,12 @@ def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
     )
     spread = float(np.ptp(dead.predicted, axis=0).max())
     observed = (
-        f"{_outcome(dead)}, which differ by {spread:.1g}; explains {dead.explained_min:.2g} of its training rows, "
-        f"{'counted as collapsed' if dead.collapsed else 'taken as sound'}; the same network alive: "
-        f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'taken as sound'}"
+        f"{_outcome(dead)}, predictions differ by {spread:.1g}; explained variance {dead.explained_min:.2g}, "
+        f"{'counted as collapsed' if dead.collapsed else 'not counted as collapsed'}; with the original weights: "
+        f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'not counted as collapsed'}"
     )
-    return condition_case(AREA, "a network that died, with a finite loss", should="counted as collapsed, and it alone",
+    return condition_case(AREA, "a network that predicts a constant, with a finite loss",
+                          should="counted as collapsed; the network with the original weights is not",
                           happened=observed,
                           holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
@@ -176,12 +187,12 @@ def _few_rows(job: TrainingJob, rows: TrainingData) -> list[Case]:
     error = float(np.abs(single.predicted - rows.target[job.train[:1]]).max())
     by_one = _train(_with(job, batch_n=1), rows)
     return [
-        condition_case(AREA, "batches of one row", should="trained as ever", happened=_outcome(by_one),
+        condition_case(AREA, "batches of one row", should="training succeeds", happened=_outcome(by_one),
                        holds=_is_sound(by_one)),
-        error_case(AREA, "one training row", should="answers that row's place and force",
-                   happened=f"off by {error:.1e} (mm, mm, N); {_outcome(single)}",
+        error_case(AREA, "one training row", should="predicts the place and the force of this row",
+                   happened=f"largest error {error:.1e} (x, y in mm, force in N); {_outcome(single)}",
                    error=error if _is_sound(single) else np.inf, limit=ROUNDING),
-        rejection_case(AREA, "one training row, with triplets", should="refused: no triplet is in it",
+        rejection_case(AREA, "one training row, with triplets", should="an error, because one row contains no triplet",
                        attempt=partial(_train, _with(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
     ]  # fmt: skip
 
@@ -195,8 +206,9 @@ def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
         trained = _train(job, replace(rows, target=_scale(rows.target, scale)))
         rescaled = score(true, _scale(trained.predicted, 1 / scale))
         error = max(abs(rescaled[name] / unscaled[name] - 1) for name in METRICS)
-        observed = ", ".join(f"{name} {rescaled[name]:.4g}, was {unscaled[name]:.4g}" for name in METRICS)
-        cases.append(error_case(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
+        observed = "; ".join(f"{name} {rescaled[name]:.4g}, unscaled {unscaled[name]:.4g}" for name in METRICS)
+        cases.append(error_case(AREA, f"labels multiplied by 2^{power}",
+                                should="predictions, scaled back, have exactly the same scores as without scaling",
                                 happened=observed, error=error, limit=0.0))  # fmt: skip
     return cases
 
@@ -211,9 +223,11 @@ def _same_seed(job: TrainingJob, rows: TrainingData) -> Case:
     identical_n = sum(value.tobytes() == other.tobytes() for value, other in pairs)
     seed_distance = _distance(first.weights, _train(replace(job, seed_i=1), rows).weights)
     observed = (
-        f"{identical_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {seed_distance:.2g} away"
+        f"{identical_n} of {len(pairs)} arrays identical bit for bit; weights with another seed differ by "
+        f"{seed_distance:.2g}"
     )
-    return condition_case(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
+    return condition_case(AREA, "two training runs with the same seed",
+                should="weights and predictions are identical; another seed gives other weights",
                 happened=observed, holds=identical_n == len(pairs) and seed_distance > 0)  # fmt: skip
 
 
@@ -256,6 +270,6 @@ def _is_sound(trained: TrainingResult) -> bool:
 
 def _outcome(trained: TrainingResult) -> str:
     if trained.stopped_step is not None:
-        return f"not finite at step {trained.stopped_step}"
+        return f"diverged at step {trained.stopped_step}"
     finite_n = int(np.isfinite(trained.predicted).all(axis=1).sum())
-    return f"loss {trained.curve[-1]:.2g}, {finite_n} of {len(trained.predicted)} answers finite"
+    return f"loss {trained.curve[-1]:.2g}, {finite_n} of {len(trained.predicted)} predictions finite"

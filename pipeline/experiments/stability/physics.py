@@ -28,7 +28,7 @@ PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # depth / thickness of the indentations
 FLAGGED_DEPTH = 0.6  # depth / thickness; published solutions do not cover larger depths, which are therefore flagged
 POKES_N = 2000
-BYTES_MAX_N = 1000  # memory limit in bytes per poke, or 1 GB for 1e6 pokes; the result alone takes 120 bytes per poke
+BYTES_MAX_N = 1000  # largest memory per poke in bytes (1 GB for 1e6 pokes); the result alone takes 120 bytes
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # displacements at the stops of a straight drag
 STICKY = 1e6  # friction coefficient at which the tip never slips
 STIFF = signals.stiff(1e8)  # its slowest relaxation time is 1e8 times its fastest
@@ -39,12 +39,13 @@ def time_cases() -> list[Case]:
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN_RELAXATION).view(np.int64) == state.view(np.int64)))
     return [
-        _step("tau_max / tau_min 1e8, dt / tau_min 1e8", 1e8, "as in 50 digits (mpmath), and finite"),
-        _step("dt / tau_min 1e-16", 1e-16, "as in 50 digits: (1 - exp(-x)) / x by expm1; plainly it is 11 % off"),
-        condition_case("time", "dt = 0", should="the state, bit for bit",
+        _step("tau_max / tau_min 1e8, dt / tau_min 1e8", 1e8, "finite, and the same as with 50 digits (mpmath)"),
+        _step("dt / tau_min 1e-16", 1e-16,
+              "the same as with 50 digits, because expm1 is used; 1 - exp(-x) would cause an error of 11 %"),
+        condition_case("time", "dt = 0", should="the state is unchanged, bit for bit",
                        happened=f"{same_n} of {len(state)} values identical bit for bit", holds=same_n == len(state)),
         *(
-            rejection_case("time", f"a time step of {dt_s:g} s", should="refused, with the step named",
+            rejection_case("time", f"a time step of {dt_s:g} s", should="an error that states the time step",
                            attempt=partial(advance, signals.STATE, 1.0, dt_s, STIFF))
             for dt_s in (-1 * micro, np.nan, np.inf)
         ),
@@ -101,12 +102,13 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
     soft_off_T, hard_off_T = float(np.abs(soft_T - free_T).max()), float(np.abs(hard_T - firm_T).max())
     clipped = clipped_n == len(hard_N) and bool((read_N[:, 2] == FORCE_RANGE_N[2]).all())
     return [
-        condition_case(AREA, "a skin of no stiffness, E = 0",
-                       should="no force, so no slide: dB of the layer's flow alone",
+        condition_case(AREA, "a skin without stiffness, E = 0",
+                       should="no force, so that the skin does not slide: dB only from the layer's deformation",
                        happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
                        holds=not soft_N.any() and soft_off_T == 0),
         condition_case(AREA, "a stiff skin, E = 1 GPa",
-                       should="dB of a tip that never slips; force held at the sensor's range, and counted",
+                       should="dB as if the tip never slipped; force clipped to the sensor's range and counted as "
+                              "clipped",
                        happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as "
                                 f"{read_N[:, 2].max():g} N, {clipped_n} of {len(hard_N)} counted as clipped",
                        holds=hard_off_T == 0 and clipped),
@@ -116,7 +118,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
 def thickness(usual: Skin) -> list[Case]:
     """Run cases of skins whose thickness is zero or negative."""
     return [
-        rejection_case(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
+        rejection_case(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="an error",
                        attempt=partial(forces, skin, np.array([1e-4])))
         for skin in (replace(usual, thickness_m=sign * usual.thickness_m) for sign in (0, -1))
     ]  # fmt: skip
@@ -133,12 +135,12 @@ def depth(board: Board, skin: Skin) -> list[Case]:
         condition_case(AREA, "a tip above the skin, depth < 0", should="dB and force exactly 0",
                        happened=f"dB {lifted_T:g} T, force {lifted_N:g} N", holds=lifted_T == 0 and lifted_N == 0),
         condition_case(AREA, "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
-                       should="flagged from 0.6 on, where no published solution vouches; the force is given "
-                              "all the same",
+                       should="depths of 0.6 or more are flagged, because published solutions do not cover them; the "
+                              "force is computed anyway",
                        happened=f"flagged: {', '.join(f'{s:g}' for s in shares[flagged])}; forces "
                                 f"{', '.join(f'{n:.3g}' for n in given_N)} N",
                        holds=bool((flagged == (shares >= FLAGGED_DEPTH)).all() and np.isfinite(given_N).all())),
-        rejection_case(AREA, "a poke through the skin, depth 1.5 of the thickness", should="refused",
+        rejection_case(AREA, "a poke through the skin, depth 1.5 of the thickness", should="an error",
                        attempt=lambda: poke(board, skin, 1.5)),
         _almost_through(board, skin),
     ]  # fmt: skip
@@ -148,11 +150,12 @@ def _almost_through(board: Board, skin: Skin) -> Case:
     case, attempt = "a poke to 0.95 of the thickness", partial(poke, board, skin, 0.95)
     followed_m = skin.thickness_m * depth_scale(skin.tip_radius_m / skin.thickness_m)
     if skin.base == "bonded" or 0.95 * skin.thickness_m + skin.depth_zero_m > followed_m:
-        return rejection_case(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
+        should = "an error, because the deformation cannot be computed"
+        return rejection_case(AREA, case, should=should, attempt=attempt)
     largest_uT = float(np.abs(attempt()).max() / micro)
     beyond = bool(layer.beyond_verified(np.array([0.95 * skin.thickness_m]), skin.thickness_m).all())
-    return condition_case(AREA, case, should="finite, for a sliding skin keeps its volume there; counted as beyond 0.6",
-                          happened=f"dB of at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
+    return condition_case(AREA, case, should="finite on a sliding base; counted as deeper than 0.6 of the thickness",
+                          happened=f"dB at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
                           holds=beyond and 0 < largest_uT < np.inf)  # fmt: skip
 
 
@@ -164,11 +167,11 @@ def place(board: Board, skin: Skin) -> list[Case]:
     on_dipoles = replace(board, chips_m=skin.nodes_m[: len(board.chips_m)].copy())
     return [
         rejection_case(AREA, "a poke beside the skin, 0.2 mm past its edge",
-                       should="refused, never extrapolated: a flagged reading would need a field",
+                       should="an error, because no field can be computed there",
                        attempt=lambda: changes_of_field(board, skin, beside_m)),
-        error_case(AREA, "a place inside a magnet of the array", should="the field of the box, J included: as magpylib",
+        error_case(AREA, "a place inside a magnet of the array", should="the same field as magpylib",
                    happened=f"{len(inside_m)} places, relative error {error:.1e}", error=error, limit=1e-12),
-        rejection_case(AREA, "a chip on a dipole, r = 0", should="refused", attempt=lambda: poke(on_dipoles, skin)),
+        rejection_case(AREA, "a chip on a dipole, r = 0", should="an error", attempt=lambda: poke(on_dipoles, skin)),
     ]  # fmt: skip
 
 
@@ -177,10 +180,10 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
     once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
     error, left_T = scaled_error(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
-        condition_case(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
+        condition_case(AREA, "a skin without magnetisation", should="dB is exactly 0", happened=f"at most {left_T:g} T",
                        holds=left_T == 0),
-        error_case(AREA, "five times the magnetisation", should="five times dB", happened=f"relative error {error:.1e}",
-                   error=error, limit=1e-12),
+        error_case(AREA, "five times the magnetisation", should="dB is five times as large",
+                   happened=f"relative error {error:.1e}", error=error, limit=1e-12),
     ]  # fmt: skip
 
 
@@ -196,8 +199,10 @@ def single_precision(board: Board, fine: Skin) -> Case:
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
-    observed = f"{single_T.dtype}, {len(x)} dipoles: {error_uT:.1e} uT off, of {np.abs(double_T).max() / micro:.3g} uT"
-    return error_case(AREA, "dB in single precision", should="within 0.25 uT of double: a tenth of a chip's noise",
+    largest_uT = np.abs(double_T).max() / micro
+    observed = f"{single_T.dtype}, {len(x)} dipoles: error {error_uT:.1e} uT, largest dB {largest_uT:.3g} uT"
+    should = "within 0.25 uT of double precision, which is a tenth of a chip's noise"
+    return error_case(AREA, "dB in single precision", should=should,
                       happened=observed, error=error_uT, limit=0.25)  # fmt: skip
 
 
@@ -206,8 +211,9 @@ def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
     bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
     same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
-    return condition_case(AREA, "the same seed and name", should="the same bytes; another skin for another name",
-                          happened=f"drawn again: {words[same]}; by another name: {words[not differs]}",
+    return condition_case(AREA, "a skin drawn twice with the same seed and name",
+                          should="the same skin, bit for bit; another skin for another name",
+                          happened=f"same name: {words[same]}; another name: {words[not differs]}",
                           holds=same and differs)  # fmt: skip
 
 
@@ -217,14 +223,14 @@ def memory(board: Board, skin: Skin) -> Case:
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not count
+    changes_of_field(board, skin, pokes_m[:1])  # computes and caches tables, whose memory must not be counted
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
-    per_poke_n = float(round((many_n - few_n) / (3 * POKES_N)))  # a run differs from another by some bytes in total
+    per_poke_n = float(round((many_n - few_n) / (3 * POKES_N)))  # rounded, because the total varies by a few bytes
     observed = (
-        f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {per_poke_n:.0f} bytes a "
-        f"poke, results included, {per_poke_n:.0f} MB for 1e6"
+        f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {per_poke_n:.0f} bytes per "
+        f"poke including the results, or {per_poke_n:.0f} MB for 1e6 pokes"
     )
-    return error_case(AREA, "1e6 pokes", should=f"memory grows by no more than {BYTES_MAX_N} bytes a poke",
+    return error_case(AREA, "memory for 1e6 pokes", should=f"memory grows by at most {BYTES_MAX_N} bytes per poke",
                       happened=observed, error=per_poke_n, limit=float(BYTES_MAX_N))  # fmt: skip
 
 
@@ -240,9 +246,10 @@ def drag_cases(skin: SkinDesign) -> list[Case]:
     )
     error = float(np.abs(sticky[:, 0] - stiffness * path_m[:, 0]).max() / sticky.max())
     return [
-        condition_case(AREA, "a drag without friction", should="no force sideways at all",
+        condition_case(AREA, "a drag without friction", should="the tangential force is exactly 0",
                        happened=f"at most {np.abs(smooth).max():g} N over {PATH_MM[-1]:g} mm", holds=not smooth.any()),
-        error_case(AREA, f"a drag with friction {STICKY:g}", should="sticks: force is stiffness times the way",
+        error_case(AREA, f"a drag with a coefficient of friction of {STICKY:g}",
+                   should="the tip sticks: force is stiffness times displacement",
                    happened=f"{sticky.max():.3g} N over {PATH_MM[-1]:g} mm, relative error {error:.1e}",
                    error=error, limit=1e-12),
     ]  # fmt: skip

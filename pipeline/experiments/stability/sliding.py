@@ -20,12 +20,12 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, f
 from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
-DEPTH = 0.35  # depth / thickness, of the deepest drag of any scene, which has the largest shear
+DEPTH = 0.35  # depth / thickness; no drag of any scene is deeper, and shear increases with the depth
 PLACE_M = np.array([5.0, -3.0]) * milli  # relative to the skin's centre; a drag at this place also rotates the skin
 WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli  # displacements along x at the stops of a drag
 HELD_M = 0.1 * milli  # displacement of the tip before it is lifted
 LIFTS_N = (3, 30)  # numbers of stops while the tip is lifted
-EDGE_M = 0.1 * milli  # distance of the indentations from the skin's edge
+EDGE_M = 0.1 * milli  # distance of the indentations near the edge from the skin's edge
 STICKY, SMOOTH = 10.0, 1e-9  # friction coefficients
 ROUNDING = 1e-12
 PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # depth / thickness
@@ -55,26 +55,27 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    # With this low friction, neither a press nor a drag slides the skin noticeably.
+    # With this low friction, neither a press nor a drag moves the skin on its base noticeably.
     slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # Layer and springs are in series. Without slip, their displacements therefore add up to the path of the tip.
+    # The layer and the springs that hold the skin are in series. If the tip does not slip, their displacements add up
+    # to the displacement of the tip.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
     left_m = np.abs(taken_m[:, 0] - WAY_M).max() + np.abs(taken_m[:, 1]).max()
     return [
-        error_case(AREA, f"a drag with friction {SMOOTH:g} on a skin that slides",
-                   should="slips at once: friction times the normal force, and dB that of pressing alone",
-                   happened=f"{drawn_N.max():.2g} N, relative error {off_N:.1e}; dB {off_T:.1e} of its size off",
+        error_case(AREA, f"a drag with a coefficient of friction of {SMOOTH:g} on a sliding skin",
+                   should="the tip slips at once: force is coefficient times normal force; dB as without a drag",
+                   happened=f"{drawn_N.max():.2g} N, relative error {off_N:.1e}; relative error of dB {off_T:.1e}",
                    error=max(off_N, off_T), limit=1e-6),
-        error_case(AREA, f"a drag with friction {STICKY:g} on a skin that slides",
-                   should="sticks: layer and base, one after the other, give way by as much as the tip goes",
-                   happened=f"{np.abs(pulled_N).max():.3g} N over {WAY_M[-1] / milli:g} mm; "
-                            f"{left_m / WAY_M[-1]:.1e} of the way unaccounted for",
+        error_case(AREA, f"a drag with a coefficient of friction of {STICKY:g} on a sliding skin",
+                   should="the tip sticks: displacements of layer and skin add up to the displacement of the tip",
+                   happened=f"{np.abs(pulled_N).max():.3g} N over {WAY_M[-1] / milli:g} mm; relative error of the sum "
+                            f"{left_m / WAY_M[-1]:.1e}",
                    error=float(left_m / WAY_M[-1]), limit=1e-9),
     ]  # fmt: skip
 
@@ -82,8 +83,8 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
 def lift(board: Board, skin: Skin) -> Case:
     """Run a case of a drag at the skin's centre, after which the tip is lifted.
 
-    While the tip is lifted, the normal force decreases. It limits the friction, so the tangential force must decrease
-    too.
+    While the tip is lifted, the normal force decreases, and with it the friction limit, so the tangential force must
+    decrease too.
     """
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
@@ -98,10 +99,12 @@ def lift(board: Board, skin: Skin) -> Case:
         errors.append(np.abs(pulled_N[1:-1, 0] - reach_m / give_m_per_N).max() / limit_N[0])
         last_N.append(np.abs(pulled_N[-1]).max())
     observed = (
-        f"in {LIFTS_N[0]} and {LIFTS_N[1]} stops: {max(errors):.1e} of the first friction off; {max(last_N):g} N left"
+        f"in {LIFTS_N[0]} and {LIFTS_N[1]} stops: error {max(errors):.1e} of the first friction limit; "
+        f"{max(last_N):g} N left at the end"
     )
-    return error_case(AREA, "a tip that pulls the skin and is lifted there",
-                      should="the least of spring and friction so far, in any number of stops; no force once it is off",
+    return error_case(AREA, "a tip that drags the skin and is then lifted",
+                      should="the tangential force is limited by the springs and by the smallest friction limit so "
+                             "far, for any number of stops; it is 0 at the end",
                       happened=observed, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
 
 
@@ -124,16 +127,17 @@ def edge(board: Board, skin: Skin) -> list[Case]:
     friction_used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
     sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
     return [
-        condition_case(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
-                       should="finite dB, and some: half of what the tip would press is not there, and is not made up",
+        condition_case(AREA, f"pokes {EDGE_M / milli:g} mm from the skin's free edge, at a side and at a corner",
+                       should="dB is finite and not 0, although a part of the tip is beside the skin",
                        happened=f"at most {sizes_uT} uT",
                        holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
-        error_case(AREA, "the slide of a skin that is poked at its free edge",
-                   should="the place goes where the press takes it, turn and motion together",
+        error_case(AREA, "motion of a skin that is poked near its free edge",
+                   should="translation and rotation together displace the poked place in the direction of the press",
                    happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {error:.1e}", error=error,
                    limit=ROUNDING),
-        condition_case(AREA, "the force that this slide takes", should="some, and no more than friction holds",
-                       happened=f"at most {friction_used.max():.3g} of the tip's friction",
+        condition_case(AREA, "force that is needed for this motion",
+                       should="above 0, and at most the friction of the tip",
+                       happened=f"at most {friction_used.max():.3g} of the friction of the tip",
                        holds=bool((friction_used > 0).all() and (friction_used <= 1).all())),
     ]  # fmt: skip
 
@@ -149,12 +153,13 @@ def force_control(skin: Skin) -> list[Case]:
     held_m, counted_n = slide.depth_at(beyond_N, **sizes), slide.count_clipped(beyond_N, **sizes)
     deepest = held_m / (slide.DEEPEST * skin.thickness_m)
     return [
-        error_case(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
-                   should="the depth of each force is the depth that gives it, down and up, without a remainder",
-                   happened=f"{force_N.max():.3g} N at most; {error:.1e} of the thickness off", error=error,
+        error_case(AREA, f"force control up to a depth of {slide.DEEPEST:g} of the thickness, and back to 0",
+                   should="the depth computed from a force is the depth that causes this force, in both directions",
+                   happened=f"{force_N.max():.3g} N at most; error {error:.1e} of the thickness", error=error,
                    limit=1e-6),
-        condition_case(AREA, "a force that no allowed depth gives", should="held at the deepest, and counted",
-                       happened=f"{beyond_N[-1]:.2g} N held at {deepest[-1]:.6f} of the deepest; {counted_n} counted",
+        condition_case(AREA, "a force that would need more than the greatest allowed depth",
+                       should="the depth is limited to the greatest allowed depth, and this is counted",
+                       happened=f"{beyond_N[-1]:.2g} N: {deepest[-1]:.6f} of the greatest depth; {counted_n} counted",
                        holds=bool(np.abs(deepest - 1).max() < ROUNDING and counted_n == 2)),
     ]  # fmt: skip
 

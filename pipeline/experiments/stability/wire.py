@@ -18,7 +18,7 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # index of the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # memory use is compared between streams of this many blocks and of four times as many
+BLOCKS_N = 3  # the memory for a stream of this many blocks is compared with the memory for four times as many
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,20 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
     begin, middle, end = ends[CUT_I - 1], (ends[CUT_I - 1] + ends[CUT_I]) // 2, ends[CUT_I]
     late, same = end + 3 * (middle - begin) // 2, ends[CUT_I + 1] - (end - middle)
     return [
-        Damage("joined in the middle of a frame", "that frame lost and counted", [whole[ends[0] // 2 :]], lost_n=1),
-        Damage("last frame truncated", "that frame lost, its bytes counted", [whole[:-5]], lost_n=1),
-        Damage("two frames merged", "those two lost and counted", [whole[:middle] + whole[late:]], lost_n=2),
-        Damage("two frames merged, exactly a frame's bytes missing",
-               "at most one false frame: no format has a checksum or a counter, so nothing tells it from a true one",
+        Damage("stream starts in the middle of a frame", "only this frame is lost, and its bytes are counted",
+               [whole[ends[0] // 2 :]], lost_n=1),
+        Damage("last frame truncated", "only this frame is lost, and its bytes are counted", [whole[:-5]], lost_n=1),
+        Damage("two frames merged", "only these two are lost, and their bytes are counted",
+               [whole[:middle] + whole[late:]], lost_n=2),
+        Damage("two frames merged, with as many bytes missing as a frame has",
+               "at most one false frame, which cannot be detected because no format has a checksum or a counter",
                [whole[:middle] + whole[same:]], lost_n=2, false_n=1),
-        Damage("rubbish inside a frame", "no more than two lost, all bytes accounted for",
+        Damage("unrelated bytes inserted into a frame", "at most two frames are lost, and all bytes are counted",
                [whole[:middle], GARBAGE, whole[middle:]], lost_n=2),
-        Damage("byte by byte", "the same frames as in one piece", [whole[i : i + 1] for i in range(len(whole))]),
-        Damage("NaN in one frame, Inf in another", "both lost, counted as not finite", [_with_not_finite(frames, wire)],
-               lost_n=2, not_finite_n=2),
+        Damage("stream arrives byte by byte", "the same frames as if it arrived at once",
+               [whole[i : i + 1] for i in range(len(whole))]),
+        Damage("NaN in one frame, Inf in another", "both are lost, and counted as not finite",
+               [_with_not_finite(frames, wire)], lost_n=2, not_finite_n=2),
     ]  # fmt: skip
 
 
@@ -73,7 +76,8 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
     """Return a stream without the first fraction `where` of its first frame."""
     data = encode(frames, wire)
     first_end = _clean(data, wire, frames).end_byte.tolist()[0]
-    case, should = "CR LF inside every temperature, joined in the middle", "in step again: that frame lost, no other"
+    case = "bytes CR LF inside every temperature, stream starts in the middle of a frame"
+    should = "only this frame is lost: the decoder finds the ends of the next frames"
     return Damage(case, should, [data[int(where * first_end) :]], lost_n=1)
 
 
@@ -86,8 +90,8 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
     unaccounted_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n
     not_finite_n = account["not_finite_frames_n"]
     observed = (
-        f"{got.total() - false_n} of {sent.total()} frames back, {false_n} false, {not_finite_n} not finite; "
-        f"{skipped_n} bytes counted as lost, {unaccounted_n} unaccounted for"
+        f"{got.total() - false_n} of {sent.total()} frames decoded, {false_n} false, {not_finite_n} not finite; "
+        f"{skipped_n} bytes counted as lost, {unaccounted_n} not counted"
     )
     holds = missing_n <= damage.lost_n and false_n <= damage.false_n and unaccounted_n == 0
     holds = holds and account["bytes_n"] == sum(map(len, damage.portions))
@@ -97,13 +101,14 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # The float32 of 25 degC does not contain the bytes CR LF. If it did, a frame of another length could end at these
-    # bytes.
+    # All temperatures are 25 degC, because the bytes of this float32 number do not contain CR LF. At CR LF inside a
+    # temperature, a decoder for another number of chips could wrongly find the end of a frame.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
+    suggestion = "an error that suggests the right settings"
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
-        "a stream without a byte": (b"", "binary", chips_n, "refused"),
-        "a stream read for one chip more than it has": (data, "binary", chips_n + 1, "refused, with what would fit"),
-        "binary read as text": (data, "text-xyzt", chips_n, "refused, with what would fit"),
+        "an empty stream": (b"", "binary", chips_n, "an error"),
+        "a stream decoded with one chip too many": (data, "binary", chips_n + 1, suggestion),
+        "a binary stream decoded as text": (data, "text-xyzt", chips_n, suggestion),
     }
     return [
         rejection_case(AREA, case, should=should, attempt=partial(decode_all, octets, wire, n, "stream.bin"))
@@ -124,9 +129,9 @@ def _memory(frames: Frames, wire: Wire) -> Case:
     few_n, many_n = (peak_bytes(partial(decode, n)) for n in (BLOCKS_N, 4 * BLOCKS_N))
     frames_n = BLOCK_FRAMES_N // len(frames) * len(frames)
     observed = (
-        f"blocks of {frames_n} frames: {BLOCKS_N} need {few_n / 1e6:.1f} MB, {4 * BLOCKS_N} need {many_n / 1e6:.1f} MB"
+        f"{BLOCKS_N} blocks of {frames_n} frames need {few_n / 1e6:.1f} MB, {4 * BLOCKS_N} blocks {many_n / 1e6:.1f} MB"
     )
-    return error_case(AREA, f"a stream of any length ({wire})", should="no more memory for a longer stream, within 2 %",
+    return error_case(AREA, f"memory for a longer stream ({wire})", should="the same memory for any length, within 2 %",
                       happened=observed, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
 
 

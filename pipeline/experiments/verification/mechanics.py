@@ -1,7 +1,8 @@
 """Checks of the simulator's mechanics: contact, force, friction and deformation of indentations, and the resulting dB.
 
-dB is the change of the field. The references are closed forms, published fits, an approximation of the contact by rings
-of uniform pressure, finite differences, computations in finer steps, and symmetries.
+dB is the change of the magnetic field at the chips due to an indentation (also called a poke).
+The references are closed forms, published fits, an approximation of the contact by rings of uniform pressure, finite
+differences, computations in finer steps, and symmetries.
 """
 
 from collections.abc import Callable
@@ -31,17 +32,23 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # under a tip of a few millimetres, a layer of this thickness behaves like a half-space
-A0 = 1.770  # integral of (1 - compliance) over k h; Dimitriadis et al. 2002 fitted 1.780
-BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
+HALF_SPACE_M = 100.0  # under a tip of a few millimetres, a layer of this thickness behaves as if infinitely thick
+A0 = 1.770  # integral of (1 - compliance) over kh; the value that Dimitriadis et al. (2002) fitted is 1.780
+# Coefficients of the power series in chi = sqrt(R d) / h, by which Dimitriadis et al. (2002) multiply Hertz's force
+BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
 FRICTION = 0.8  # coefficient of friction
-BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number k * thickness h
+# Values of wave number k * thickness h at which the compliance of a layer is checked
+BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the compliance of a layer, and the force at depths up to 0.6 of the thickness (published solutions)."""
+    """Check the compliance of a layer, and compare the force with published solutions up to 0.6 of the thickness.
+
+    The compliance is the displacement of the surface under a wave of pressure, relative to a half-space (an infinitely
+    thick layer). It depends on the product of the wave number k and the thickness h.
+    """
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
@@ -71,23 +78,26 @@ def bonded_compliance(kh: Float[np.ndarray, " w"] = BONDED_KH) -> Check:
             float((mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1))
             for a in map(mpmath.mpf, kh.tolist())
         ]
-    return Check("bonded layer", "compliance, kh 1e-3-300", "its formula in 50 digits (mpmath)",
+    return Check("bonded layer", "compliance for kh (wave number * thickness) from 1e-3 to 300",
+                 "the same formula, evaluated with 50 digits (mpmath)",
                  relative_error(layer.bonded_compliance(kh), np.array(truth)), "1", 3e-12,
-                 "the series' next term, and 1 - 1 + ... at kh = 1/4, which costs 3 digits")  # fmt: skip
+                 "Up to kh = 1/4, the simulator sums a series, whose omitted terms cause an error. Just above 1/4, it "
+                 "subtracts almost equal numbers, so that 3 of 16 digits are lost.")  # fmt: skip
 
 
 def compliance_integral() -> Check:
     missing, _ = quad(lambda a: 1 - layer.bonded_compliance(np.array([a]))[0], 0, 40)
-    return Check("bonded layer", "a0: what a half-space lacks adds up", f"{A0:.3f}", abs(missing - A0),
-                 "1", 5e-4, "three printed decimals")  # fmt: skip
+    return Check("bonded layer", "a0, the integral of (1 - compliance) over kh", f"{A0:.3f}",
+                 abs(missing - A0), "1", 5e-4, "The reference value has three decimals.")  # fmt: skip
 
 
 def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
     with mpmath.workdps(50):
         truth = [float(dense_profile(mpmath.mpf(a))(mpmath.mpf(a))) for a in kh.tolist()]
-    return Check("sliding layer", "compliance, kh 0.01-30", "a dense solve of four conditions, 50 digits (mpmath)",
+    return Check("sliding layer", "compliance for kh (wave number * thickness) from 0.01 to 30",
+                 "solution of the four boundary conditions with 50 digits (mpmath)",
                  relative_error(layer.slipping_compliance(kh), np.array(truth)), "1", 1e-12,
-                 "rounding, 1 - 1 + ... at small kh")  # fmt: skip
+                 "Rounding errors are largest at small kh, where almost equal numbers are subtracted.")  # fmt: skip
 
 
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
@@ -109,12 +119,15 @@ def dense_profile(kh: Any) -> Callable[[Any], Any]:
 def hertz(base: layer.Base, tip_m: float) -> Check:
     depth_m = tip_m * np.array([1e-6, 1e-5])
     law, reason = {
-        "bonded": ("Hertz's, d / R to 1e-5", "the base is felt as sqrt(R d) / h, 2e-7; a sphere is no paraboloid: "
-                   "d / R, 1e-5; the curve is a spline"),
-        "slipping": ("Hertz's, on a sliding base too", "as on a bonded one"),
+        "bonded": ("Hertz's law on a bonded base, for depths d up to 1e-5 of the tip radius R",
+                   "Three small effects cause an error: the finite thickness h (sqrt(R d) / h, below 2e-7), Hertz's "
+                   "approximation of the sphere by a paraboloid (d / R, 1e-5), and the interpolation of the force by "
+                   "a spline."),
+        "slipping": ("Hertz's law on a sliding base, for depths d up to 1e-5 of the tip radius R",
+                     "The same three effects as on a bonded base cause an error."),
     }[base]  # fmt: skip
     error = relative_error(force_N(depth_m, IndentedLayer(HALF_SPACE_M, tip_m, base)), hertz_N(depth_m, tip_m))
-    return Check("force, thick layer", law, "16/9 E sqrt(R) d^1.5 (Hertz 1882)", error, "1", 1e-4, reason)
+    return Check("force of a thick layer", law, "16/9 E sqrt(R) d^1.5 (Hertz 1882)", error, "1", 1e-4, reason)
 
 
 def sneddon(radii_m: Float[np.ndarray, " n"], press: IndentedLayer) -> list[Check]:
@@ -125,15 +138,18 @@ def sneddon(radii_m: Float[np.ndarray, " n"], press: IndentedLayer) -> list[Chec
     sneddon_N = 4 / 3 * ((radii_m**2 + tip_m**2) / 2 * log - radii_m * tip_m)
     found_N = np.array([4 * np.pi / 3 * contact.weights_m2.sum() for contact in contacts])
     found_m = np.array([contact.depth_m for contact in contacts])
-    law, base = "a sphere's, contact radius to 0.7 R", "the base is felt as a / h, 2e-5"
+    law = "Sneddon's law of a sphere, for contact radii a up to 0.7 of the tip radius"
+    base = "The reference is for a half-space. The finite thickness h changes the result by a / h, which is below 2e-5."
     return [
-        Check("force, thick layer", law, "Sneddon 1965", relative_error(found_N, sneddon_N), "1", 1e-4, base),
-        Check("depth, thick layer", law, "Sneddon 1965", relative_error(found_m, radii_m * log / 2), "1", 1e-4, base),
+        Check("force of a thick layer", law, "Sneddon 1965", relative_error(found_N, sneddon_N), "1", 1e-4, base),
+        Check(
+            "depth in a thick layer", law, "Sneddon 1965", relative_error(found_m, radii_m * log / 2), "1", 1e-4, base
+        ),
     ]
 
 
 def _to_depths(depth_m: Float[np.ndarray, " n"]) -> str:
-    return f"bonded layer, {depth_m.min() / milli:g}-{depth_m.max() / milli:g} mm"
+    return f"bonded layer, depths from {depth_m.min() / milli:g} to {depth_m.max() / milli:g} mm"
 
 
 def dimitriadis(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check:
@@ -141,7 +157,8 @@ def dimitriadis(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check
     bonded_N = hertz_N(depth_m, press.tip_radius_m) * np.polynomial.polynomial.polyval(chi, BONDED)
     return Check(SKIN_FORCE, _to_depths(depth_m), "Dimitriadis et al. 2002, bonded",
                  relative_error(force_N(depth_m, press), bonded_N), "1", 0.10,
-                 "a series in chi = sqrt(R d) / h, from chi^2 on low: 8 % at chi = 0.5 against rings of pressure"
+                 "The reference is a power series in chi = sqrt(R d) / h, whose terms from chi^2 on are too small. At "
+                 "chi = 0.5, its force is 8 % below the force of the check that uses rings of pressure."
                  )  # fmt: skip
 
 
@@ -152,15 +169,17 @@ def long_2011(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Check:
     psi = (1 + 2.3 * omega) / (1 + 1.15 * np.cbrt(omega) + alpha * omega + beta * omega**2)
     return Check(SKIN_FORCE, _to_depths(depth_m), "Long et al. 2011",
                  relative_error(force_N(depth_m, press), hertz_N(depth_m, tip_m) / psi), "1", 0.05,
-                 "a fit to finite elements of large deformation, made for 0.3 <= R/h <= 12.7, d/h <= 0.6")  # fmt: skip
+                 "The reference is a formula that was fitted to finite-element simulations of large deformations, for "
+                 "0.3 <= R/h <= 12.7 and d/h <= 0.6 (tip radius R, thickness h, depth d).")  # fmt: skip
 
 
 def rings(depth_m: float, press: IndentedLayer) -> Check:
     edges_m, pressure = ring_pressures(depth_m, press)
     rings_N = float(2 / 3 * np.pi * (pressure * np.diff(edges_m**2)).sum())
-    return Check(SKIN_FORCE, f"{press.base} layer, {depth_m / milli:g} mm", f"{RINGS_N} rings of even pressure",
+    return Check(SKIN_FORCE, f"{press.base} layer, depth of {depth_m / milli:g} mm",
+                 f"{RINGS_N} rings of uniform pressure in the contact",
                  abs(float(force_N(np.array([depth_m]), press)[0]) / rings_N - 1), "1", 0.01,
-                 "a ring is 2.5 % of the contact's radius")  # fmt: skip
+                 "Rings can only approximate the pressure. Each ring is 2.5 % of the contact radius wide.")  # fmt: skip
 
 
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
@@ -196,13 +215,16 @@ def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: 
     larger = IndentedLayer(3 * press.thickness_m, 3 * press.tip_radius_m, press.base)
     exact_N = [4 * np.pi / 3 * press.contact(float(d)).weights_m2.sum() for d in depth_m]
     return [
-        Check(SKIN_FORCE, "proportional to E", "itself, at 1 Pa",
-              scaled_error(force_N(depth_m, press, modulus_Pa), modulus_Pa * once_N), "1", 1e-13, "rounding"),
-        Check(SKIN_FORCE, "three times the size, nine times the force", "itself, scaled",
+        Check(SKIN_FORCE, "proportional to Young's modulus E", "the force for E = 1 Pa, multiplied by E",
+              scaled_error(force_N(depth_m, press, modulus_Pa), modulus_Pa * once_N), "1", 1e-13,
+              "Only rounding errors occur."),
+        Check(SKIN_FORCE, "nine times as large if all lengths are three times as large",
+              "the force before scaling, multiplied by nine",
               scaled_error(force_N(3 * depth_m, larger), 9 * once_N), "1", 1e-9,
-              "the spline's knots are found by a root search to 1e-12"),
-        Check(SKIN_FORCE, "the curve passes through each contact", "the contact itself",
-              scaled_error(once_N, np.array(exact_N)), "1", 1e-6, "a cubic spline over 48 contacts"),
+              "The nodes of the force curve, which is a spline, depend on a root search that stops at 1e-12."),
+        Check(SKIN_FORCE, "interpolated over the depth by a spline", "the force without interpolation, at each depth",
+              scaled_error(once_N, np.array(exact_N)), "1", 1e-6,
+              "The cubic spline through 48 nodes is not exact between the nodes."),
     ]  # fmt: skip
 
 
@@ -219,16 +241,21 @@ def check_sideways(skin: SkinDesign) -> list[Check]:
 
 def sticking(radius_m: float) -> Check:
     ratio = shear.tangential_stiffness_m(shear.stick_traction(radius_m, HALF_SPACE_M), HALF_SPACE_M) / radius_m
-    return Check("sideways stiffness, thick layer", "a tip that sticks: 16/3 G a", "Mindlin 1949, nu = 1/2",
-                 abs(ratio / (16 / 3) - 1), "1", 1e-3, "the base is felt as a / h, 3e-6; sums over the contact"
+    return Check("tangential stiffness of a thick layer", "tip that sticks: 16/3 * shear modulus * contact radius a",
+                 "Mindlin 1949, Poisson's ratio 1/2", abs(ratio / (16 / 3) - 1), "1", 1e-3,
+                 "The integral over the contact is computed as a sum. In addition, the finite thickness h changes the "
+                 "stiffness by a / h, which is below 3e-6."
                  )  # fmt: skip
 
 
 def sliding(radius_m: float, tip_m: float, base: layer.Base) -> Check:
     contact = layer.contact_of_radius(radius_m, thickness_m=HALF_SPACE_M, tip_radius_m=tip_m, base=base)
     ratio = shear.tangential_stiffness_m(shear.slip_traction(contact), HALF_SPACE_M) / radius_m
-    return Check("sideways stiffness, thick layer", "q = mu p of Hertz: 40/9 G a", "Cerruti's integral in closed form",
-                 abs(ratio / (40 / 9) - 1), "1", 2e-3, "contact radius R / 10: a sphere is no paraboloid")  # fmt: skip
+    return Check("tangential stiffness of a thick layer", "tip that slides: 40/9 * shear modulus * contact radius",
+                 "Cerruti's integral of a shear stress proportional to Hertz's pressure, in closed form",
+                 abs(ratio / (40 / 9) - 1), "1", 2e-3,
+                 "Hertz approximates the sphere by a paraboloid. At a contact radius of a tenth of the tip radius, "
+                 "this changes the pressure a little.")  # fmt: skip
 
 
 def straight_drag(
@@ -237,14 +264,16 @@ def straight_drag(
     places_m, normal_N = np.column_stack([path_m, np.zeros_like(path_m)]), np.full_like(path_m, limit_N / coefficient)
     drag = shear.drag_force(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
     truth_N = np.minimum(stiffness_N_per_m * path_m, limit_N)
-    return Check("friction", "Q = min(k s, mu F) along a straight drag", "itself, by hand",
-                 float(np.abs(drag.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
+    return Check("friction", "tangential force of a straight drag",
+                 "the smaller of stiffness * distance and coefficient of friction * normal force",
+                 float(np.abs(drag.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12,
+                 "Only the rounding errors of 30 steps occur."
                  )  # fmt: skip
 
 
 STEPS_N = 12  # number of depth steps of an indentation; for a depth of 1.2 mm, each step is 0.1 mm
-STEP_M = 1e-7  # half-width of central differences
-HELD = {"bonded": "stays", "slipping": "keeps its height"}
+STEP_M = 1e-7  # distance from a place to each of its two neighbours in central differences
+HELD = {"bonded": "does not move", "slipping": "keeps its height"}  # how the base constrains the material on it
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
@@ -275,16 +304,22 @@ def one_small_step(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     under_m = 0.95 * contact.radius_m * np.linspace(0, 1, 30)
     sunken = layer.displacement(under_m, np.full(30, h_m), waves)
     sphere_m = tip_m - np.sqrt(tip_m**2 - under_m**2) - depth_m
-    name, differences = "one small step", "central differences over 0.1 um"
-    length = "of strains near 1: step squared over length squared"
+    name, differences = "one linear step of the deformation", "central differences with steps of 0.1 um"
+    length = (
+        "The strains are near 1. The relative error of central differences is the square of step / length, where "
+        "length is the distance over which the strains change."
+    )
     return [
-        Check(name, "div u = 0", differences, max_error(numeric[0] + numeric[3] + numeric[4], 0.0), "1", 1e-6, length),
-        Check(name, "gradient of u", differences, max_error(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric),
-              "1", 1e-6, length),
-        Check(name, f"the {press.base} base {HELD[press.base]}", "0 m", _off(base.r_m, base.z_m, press), "m", 1e-17,
-              "rounding: 1e-14 of the depth"),
-        Check(name, "the surface lies on the tip", "a sphere", max_error(sunken.z_m, sphere_m) / depth_m,
-              "of the depth", 0.005, "waves shorter than 1/6 of the thickness are cut"),
+        Check(name, "volume is conserved: div u = 0 (displacement u)", differences,
+              max_error(numeric[0] + numeric[3] + numeric[4], 0.0), "1", 1e-6, length),
+        Check(name, "gradient of the displacement u", differences,
+              max_error(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric), "1", 1e-6, length),
+        Check(name, f"material on the {press.base} base {HELD[press.base]}", "0 m", _off(base.r_m, base.z_m, press),
+              "m", 1e-17, "Rounding errors are about 1e-14 of the depth."),
+        Check(name, "surface in the contact has the shape of the tip", "a sphere",
+              max_error(sunken.z_m, sphere_m) / depth_m, "of the depth", 0.005,
+              "The pressure is a sum of waves. Waves shorter than 1/6 of the thickness are omitted, so that the shape "
+              "of the surface is not exact."),
     ]  # fmt: skip
 
 
@@ -309,12 +344,16 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     f, hoop = end.f[:inside], end.hoop[:inside]
     gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[:inside] / r_m))
     return [
-        Check("flow", f"det F = 1 in {STEPS_N} steps", "1", max_error(np.linalg.det(f) * hoop, 1.0), "1", 0.02,
-              "second order in the steps; worst at the contact's edge"),
-        Check("flow", "F is the gradient of the map", "central differences over 0.1 um", gradient, "1", 1e-5,
-              "of stretches near 1: step squared over length squared"),
-        Check("flow", f"the {press.base} base {HELD[press.base]}", "0 m", _off(base[0] - base_m, base[1], press), "m",
-              1e-16, f"rounding of {len(depths_m) - 1} steps; its table is 0 there to the last bit"),
+        Check("deformation in steps", f"volume is conserved in {STEPS_N} steps: det F = 1 (deformation gradient F)",
+              "1", max_error(np.linalg.det(f) * hoop, 1.0), "1", 0.02,
+              "The error is of second order in the size of the steps, and is largest at the edge of the contact."),
+        Check("deformation in steps", "F is the gradient of the positions after the deformation",
+              "central differences with steps of 0.1 um", gradient, "1", 1e-5,
+              "The stretches are near 1. The relative error of central differences is the square of step / length, "
+              "where length is the distance over which the stretches change."),
+        Check("deformation in steps", f"material on the {press.base} base {HELD[press.base]}", "0 m",
+              _off(base[0] - base_m, base[1], press), "m", 1e-16,
+              f"Only the rounding errors of {len(depths_m) - 1} steps occur."),
     ]  # fmt: skip
 
 
@@ -323,11 +362,12 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     end = deformation.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
     above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
     touches = end.r_m < 0.95 * radius_m
+    reason = "In each step, the pressure is a sum of only six basis pressures, so that the surface is no exact sphere."
     return [
-        Check("flow", "the sunken surface lies on the tip", "a sphere", max_error(above_m[touches], 0.0) / depth_m,
-              "of the depth", 0.02, "six pressures a step"),
-        Check("flow", "nothing beside the contact pierces the tip", "a sphere",
-              max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02, "as above"),
+        Check("deformation in steps", "surface in the contact has the shape of the tip", "a sphere",
+              max_error(above_m[touches], 0.0) / depth_m, "of the depth", 0.02, reason),
+        Check("deformation in steps", "surface beside the contact does not enter the tip", "a sphere",
+              max(0.0, float(above_m.max() / depth_m)), "of the depth", 0.02, reason),
     ]  # fmt: skip
 
 
@@ -342,9 +382,11 @@ def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
     end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
     grown_m2 = end.r_m**2 - r_m**2
     return [
-        Check("flow", "far out all heights move by what the tip displaces", "the mean over heights and circles",
+        Check("deformation in steps", "far from the tip, the squared distance r^2 grows by the same amount everywhere",
+              "the mean over all heights and distances",
               scaled_error(grown_m2, np.full_like(grown_m2, grown_m2.mean())), "1", 0.03,
-              "waves fade as exp(-pi r / h) past the contact; the map goes on in closed form from 5 thicknesses on"),
+              "Waves that decay as exp(-pi r / h) disturb this rule near the contact. The simulator relies on the rule "
+              "only outside its tables, which end 5 thicknesses h beyond the contact."),
     ]  # fmt: skip
 
 
@@ -378,13 +420,18 @@ def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[
     return slide.apply(slides, 0, after, skin.seat_m)
 
 
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for any quadrature rule
-DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
+# A skin is simulated by dipoles at the nodes of a quadrature rule.
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # rule for checks whose result does not depend on the rule
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # rule for checks of the errors due to tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
 REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
-# Errors of this size are not visible in readings. They are a third of a chip's noise, and increase the rms by only 5 %.
+# Errors of this size are not visible in readings: they are a third of a chip's noise, so that noise and error together
+# have an rms that is only 5 % larger than the rms of the noise.
 UNSEEN_uT = 1.0
-PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # at these places, no node is on the tip's axis
+DB = "field change dB of pokes"
+TOTAL_ERROR = "A total error of 2 % is accepted for the field change of a poke."
+# Places of indentations at which no node is on the tip's axis, where the outward direction would be undefined
+PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli
 Places = Float[np.ndarray, "p 2"]
 
 
@@ -403,7 +450,7 @@ def check_indentations(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # The compliance of the rig depends on direction, so dB has the symmetries only with a rigid rig.
+    # The rig yields differently along x and y, so dB is symmetric only if the rig is rigid.
     rigid = (
         skin
         if skin.hold is None
@@ -438,16 +485,19 @@ def quadrature(
     size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)
     allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
     used, cells, layers = rules
-    narrower = f"cells of {cells.cell_m / milli:g} mm for {used.cell_m / milli:g} mm"
+    narrower = f"cells of {cells.cell_m / milli:g} mm instead of {used.cell_m / milli:g} mm"
     few = f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol"
     return [
-        Check("dB of pokes", f"quadrature, {few}, all depths", narrower, norm_error(found_T, cells_T), "1", 0.02,
-              "2 % is what an indentation may be wrong by in all"),
-        Check("dB of pokes", f"quadrature, {few}, each channel of each poke", narrower,
-              float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed", 1.0,
-              f"2 % of the poke's dB, or {unseen_uT:g} uT where that is more: a third of a chip's noise"),
-        Check("dB of pokes", f"quadrature, {few}, all depths", f"{layers.layers_n} layers for {used.layers_n}",
-              norm_error(found_T, layers_T), "1", 0.005, "Gauss nodes converge fast: a quarter of what the cells cost"),
+        Check(DB, f"skin as dipoles (quadrature), {few}, all depths", narrower, norm_error(found_T, cells_T), "1", 0.02,
+              TOTAL_ERROR),
+        Check(DB, f"skin as dipoles (quadrature), {few}, each channel of each poke", narrower,
+              float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed error", 1.0,
+              f"The allowed error is 2 % of the poke's field change, or {unseen_uT:g} uT if that is more. An error "
+              f"of {unseen_uT:g} uT is not visible in readings, because it is a third of a chip's noise."),
+        Check(DB, f"skin as dipoles (quadrature), {few}, all depths",
+              f"{layers.layers_n} layers instead of {used.layers_n}", norm_error(found_T, layers_T), "1", 0.005,
+              "Gauss quadrature over the height converges fast. The allowed error is therefore a quarter of the error "
+              "that is allowed for the cells."),
     ]  # fmt: skip
 
 
@@ -459,10 +509,9 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
     depths_m = descent(depth_m + skin.depth_zero_m, REFERENCE_STEPS_N)
     moved = [follow_dipoles(skin, place_m, depths_m) for place_m in places_m]
     truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
-    return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
-                 f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
-                 norm_error(found_T, truth_T), "1", 0.02,
-                 "2 % is what an indentation may be wrong by in all (steps, table, kernel)")  # fmt: skip
+    return Check(DB, f"tables, depth steps and field formula, {kind} depth ({depth_m / milli:g} mm)",
+                 f"each dipole moved in {REFERENCE_STEPS_N} steps without tables, rotated by SVD; magpylib's fields",
+                 norm_error(found_T, truth_T), "1", 0.02, TOTAL_ERROR)  # fmt: skip
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
@@ -479,14 +528,15 @@ def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = 
     mirrored_T = _change(board.chips_m @ mirror, skin, pokes_m @ mirror)
     shifted = replace(skin, nodes_m=skin.nodes_m + shift_m, seat_m=skin.seat_m + shift_m[:2])
     shifted_T = _change(board.chips_m + shift_m, shifted, pokes_m + shift_m)
-    rounding = "rounding; no term may know a direction"
-    name = f"dB of pokes, {polarity}"
+    rounding = "Only rounding errors occur, because the simulation must not depend on the direction."
+    name = f"{DB}, {polarity}"
     return [
-        Check(name, "a quarter turn of board and poke", "itself, turned",
+        Check(name, "a quarter turn of board and poke", "the original dB, turned (and negated for a checkerboard)",
               scaled_error(turned_T, sign * here_T @ TURN.T), "1", 1e-9, rounding),
-        Check(name, "a mirror image of board and poke", "itself, mirrored",
+        Check(name, "a mirror image of board and poke",
+              "the original dB, mirrored (and negated for a checkerboard)",
               scaled_error(mirrored_T, sign * here_T @ mirror), "1", 1e-9, rounding),
-        Check(name, "skin, poke and chips moved together", "itself",
+        Check(name, "skin, poke and chips moved together", "the original dB",
               scaled_error(shifted_T, here_T), "1", 1e-9, rounding),
     ]  # fmt: skip
 
@@ -496,8 +546,8 @@ def amplitude(
 ) -> Check:
     """Check that dB of skin `stronger`, which is magnetised `factor` times as strongly, is `factor` times as large."""
     once_T, more_T = (_change(board.chips_m, variant, pokes_m) for variant in (skin, stronger))
-    return Check("dB of pokes", "proportional to the magnetisation", f"itself, {factor:g} times",
-                 scaled_error(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip
+    return Check(DB, "proportional to the magnetisation", f"the original dB, multiplied by {factor:g}",
+                 scaled_error(more_T, factor * once_T), "1", 1e-12, "Only rounding errors occur.")  # fmt: skip
 
 
 def _change(
@@ -513,5 +563,5 @@ def _grid_m() -> Places:
 
 
 def each_depth(places_m: Places, depths_m: tuple[float, ...]) -> Float[np.ndarray, "n 3"]:
-    """Return pokes (x, y, depth) at every place to every depth, sorted by depth."""
+    """Return pokes (x, y, depth) at all places for each depth, sorted by depth."""
     return np.column_stack([np.tile(places_m, (len(depths_m), 1)), np.repeat(depths_m, len(places_m))])

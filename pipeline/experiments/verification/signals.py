@@ -28,13 +28,15 @@ from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # range of distances from the centre of a box, in side lengths of the box
-COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
-MU_0_DIGITS = 1e-8  # relative tolerance; mu_0 differs by 1e-10 to 1e-9 between CODATA years
+COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)  # its nodes are the places in the skin where the field is checked
+# Relative tolerance of comparisons with magpylib. The values of the magnetic constant mu_0 that CODATA published in
+# different years differ by 1e-10 to 1e-9.
+MU_0_DIGITS = 1e-8
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter turn about z
 
 
 def check_field(skin: SkinDesign, seed: int) -> list[Check]:
-    """Check the fields of cuboids, of the magnetising array, and of dipoles at rest and displaced."""
+    """Check the fields of cuboids, of dipoles, and of the magnetising array (the magnets that magnetise a skin)."""
     return [*boxes(seed), octupole(), *array(skin.polarity, skin.thickness_mm * milli, seed), *dipoles(seed)]
 
 
@@ -47,11 +49,14 @@ def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
     found_T, truth_T = magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m)
     relative = np.linalg.norm(found_T - truth_T, axis=1) / np.linalg.norm(truth_T, axis=1)
     return [
-        Check("field of a box", f"outside, {NEAR_CELLS:g}-{FAR_CELLS:g} sides away", "magpylib Cuboid",
+        Check("field of a box", f"outside, {NEAR_CELLS:g} to {FAR_CELLS:g} sides from the centre", "magpylib Cuboid",
               float(relative.max()), "1", 1e-8,
-              "they cancel to (side / r)^3 of J: rounding grows 1e5-fold on the way to 50 sides"),
-        Check("field of a box", "inside, J included", "magpylib Cuboid", inside_a_box(inside_m, side_m), "1", 1e-11,
-              "logarithms cancel as (side / distance to an edge)^2: eps grows 2e4-fold at 1 % of a side"),
+              "The contributions of the box's corners almost cancel at a distance r, because the field decreases as "
+              "(side / r)^3. This increases relative rounding errors 1e5-fold up to 50 sides."),
+        Check("field of a box", "inside, including the polarisation J", "magpylib Cuboid",
+              inside_a_box(inside_m, side_m), "1", 1e-11,
+              "Near an edge, logarithms almost cancel. This increases rounding errors as (side / distance)^2, which is "
+              "2e4-fold at a distance of 1 % of a side."),
     ]  # fmt: skip
 
 
@@ -72,8 +77,9 @@ def octupole() -> Check:
               magnet.cuboid_field(sides * place, 1.0, sides_m=(1.0, 1.0, 1.0)))
         for sides in (8.0, 16.0)
     )  # fmt: skip
-    return Check("dipole for a cube", "error falls with (side / r)^4", "ratio 16 for twice the distance",
-                 abs(near / far / 16 - 1), "1", 0.02, "next term: (side / r)^6, 1 % between 8 and 16 sides"
+    return Check("dipole instead of a cube", "relative error decreases with the distance r as (side / r)^4",
+                 "an error 16 times as small at twice the distance", abs(near / far / 16 - 1), "1", 0.02,
+                 "The next term of the series, (side / r)^6, changes this ratio by 1 % between 8 and 16 sides."
                  )  # fmt: skip
 
 
@@ -94,15 +100,20 @@ def array(polarity: magnet.Polarity, thickness_m: float, seed: int) -> list[Chec
     swaps = -1 if polarity == "checkerboard" else 1
     theirs_T = magpylib.getB(cuboids(polarity, thickness_m, magnet.CUBES_N), nodes_m, sumup=True)
     divergence, curl = _slopes(rng_for(seed, "verification", "array"), thickness_m, polarity)
-    differences = "central differences over 1 um, 0.25 mm and more from an edge: (1/250)^2"
+    differences = (
+        "Central differences have a relative error of about (step / distance to an edge of a magnet)^2, which is at "
+        "most (1/250)^2: steps are 1 um, distances at least 0.25 mm."
+    )
     name = f"magnetising array, {polarity}"
     return [
         Check(name, "field in the skin", "32 magpylib Cuboids", scaled_error(here_T, theirs_T), "1", 1e-12,
-              "rounding, 32 boxes that nearly cancel at the seams"),
-        Check(name, "div B = 0", "central differences", divergence, "1", 1e-4, differences),
-        Check(name, "curl B = 0", "central differences", curl, "1", 1e-4, differences),
+              "Rounding errors are increased where cubes meet, because the contributions of the 32 cubes almost cancel "
+              "there."),
+        Check(name, "div B = 0", "central differences of the field", divergence, "1", 1e-4, differences),
+        Check(name, "curl B = 0", "central differences of the field", curl, "1", 1e-4, differences),
         Check(name, "a quarter turn turns the field" + (", and swaps the poles" if swaps < 0 else ""),
-              "itself, turned", scaled_error(turned_T, swaps * here_T @ TURN.T), "1", 1e-12, "rounding, as above"),
+              "the original field, turned", scaled_error(turned_T, swaps * here_T @ TURN.T), "1", 1e-12,
+              "Rounding errors are increased where cubes meet, as for the field in the skin."),
     ]  # fmt: skip
 
 
@@ -138,15 +149,17 @@ def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     )  # fmt: skip
     change_T = change_of_field((nodes_m, moments), (moved_m, turned), observers_m)
     scaled_T = change_of_field((nodes_m, factor * moments), (moved_m, factor * turned), observers_m)
-    year = "rounding; a magpylib of another CODATA year has another mu_0"
+    year = "Only rounding errors occur, unless magpylib uses the value of mu_0 of another CODATA year."
     return [
         Check("field of dipoles", "at rest", "magpylib Dipole",
               scaled_error(magnet.field(nodes_m, moments, observers_m), before_T), "1", MU_0_DIGITS, year),
-        Check("change of field", "dipoles that move and turn", "magpylib Dipole, after less before",
+        Check("change of field", "dipoles that move and turn",
+              "magpylib Dipole, field after the motion minus field before",
               scaled_error(change_T, after_T - before_T), "1", 10 * MU_0_DIGITS,
-              f"{year}, and the difference is a tenth of the sums"),
-        Check("change of field", "linear in the moments", f"itself, {factor:g} times",
-              scaled_error(scaled_T, factor * change_T), "1", 1e-12, "rounding of a few thousand operations"),
+              f"{year} The change is a tenth of the fields, so its relative error is ten times as large."),
+        Check("change of field", "proportional to the moments", f"the original change, multiplied by {factor:g}",
+              scaled_error(scaled_T, factor * change_T), "1", 1e-12,
+              "Only the rounding errors of a few thousand operations occur."),
     ]  # fmt: skip
 
 
@@ -158,7 +171,8 @@ def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[n
     return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)
 
 
-PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count (x, y, z) by GAIN_SEL; RES 0
+# Field per count in uT (x, y, z), by the chip's setting GAIN_SEL, if its setting RES is 0
+PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}
 PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # gains for GAIN_SEL 0 to 7
 # Ranges of the noise's standard deviation in three recorded data sets, for the x and y axes, and for the z axis.
 RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))
@@ -188,10 +202,11 @@ def steps() -> list[Check]:
     ours = np.array([steps_uT(gain_sel) for gain_sel in range(8)])
     published = max(max_error(ours[gain_sel], np.array(step)) for gain_sel, step in PUBLISHED_STEPS_uT.items())
     return [
-        Check("chip", "uT a count, GAIN_SEL 6 and 7", "data sheet, as the firmware's authors publish it", published,
-              "uT", 5e-5, "four published decimals"),
-        Check("chip", "uT a count, all gains", "data sheet, 0.150 / 0.242 uT times the gain",
-              relative_error(ours, sheet), "1", 3e-4, "three published decimals of 5/3 and 4/3"),
+        Check("chip", "field per count, GAIN_SEL 6 and 7", "data sheet, as published by the firmware's authors",
+              published, "uT", 5e-5, "The published values have four decimals."),
+        Check("chip", "field per count, all gains", "data sheet, 0.150 uT (x, y) and 0.242 uT (z) times the gain",
+              relative_error(ours, sheet), "1", 3e-4,
+              "The gains 5/3 and 4/3 are published with three decimals."),
     ]  # fmt: skip
 
 
@@ -204,11 +219,12 @@ def conversion(gain_sel: int, seed: int) -> list[Check]:
     counts = np.rint(past_uT / PUBLISHED_STEPS_uT[7]).astype(np.int64)
     int16_uT = counts.astype("<i8").view("<i2")[:, ::4] * np.array(PUBLISHED_STEPS_uT[7])
     return [
-        Check("chip", f"a reading is the field, GAIN_SEL {gain_sel}, 99 % of the range", "the field",
+        Check("chip", f"readings of fields up to 99 % of the range, GAIN_SEL {gain_sel}", "the fields",
               float((np.abs(inside_uT - field_uT) / step_uT).max()), "counts", 0.51,
-              "half a count, and the rounding of float32"),
-        Check("chip", "past its range, GAIN_SEL 7, to 50 mT", "the lower 16 bits of the count",
-              float((np.abs(read_uT - int16_uT) / PUBLISHED_STEPS_uT[7]).max()), "counts", 0.01, "rounding of float32"),
+              "Rounding to whole counts causes an error of up to half a count, and float32 adds rounding errors."),
+        Check("chip", "readings of fields beyond the range, up to 50 mT, GAIN_SEL 7", "the lower 16 bits of the count",
+              float((np.abs(read_uT - int16_uT) / PUBLISHED_STEPS_uT[7]).max()), "counts", 0.01,
+              "Only rounding errors of float32 occur."),
     ]  # fmt: skip
 
 
@@ -221,11 +237,13 @@ def noise(chip: ChipDesign, seed: int) -> list[Check]:
     low_uT, high_uT = np.array([RECORDED_NOISE_uT[axis == 2] for axis in range(3)]).T
     outside_uT = np.maximum(low_uT - sd_uT, sd_uT - high_uT).clip(min=0)
     return [
-        Check("chip", "noise of a still board", "the design's sd, and a count's rounding",
+        Check("chip", "noise of a board at rest", "standard deviation in the settings, plus rounding to counts",
               relative_error(sd_uT, expected_uT), "1", 4 / np.sqrt(2 * STILL_FRAMES_N),
-              f"{STILL_FRAMES_N} frames: 4 times 1 / sqrt(2 n)"),
-        Check("chip", "noise of a still board, how far outside the recorded", "sd 3.0-3.7 uT in x, y, 4.5-7.0 uT in z",
-              float(outside_uT.max()), "uT", 0.1, "sampling, and the two digits of the recorded"),
+              f"The tolerance is four standard errors. With n = {STILL_FRAMES_N} readings, the relative standard error "
+              "of a standard deviation is 1 / sqrt(2 n)."),
+        Check("chip", "noise of a board at rest, distance from the range of recorded noise",
+              "recorded standard deviations, 3.0-3.7 uT in x and y, 4.5-7.0 uT in z", float(outside_uT.max()), "uT",
+              0.1, "The simulated value varies with the random samples, and the recorded values have two digits."),
     ]  # fmt: skip
 
 
@@ -235,11 +253,12 @@ def temperature(seed: int) -> Check:
     raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts, by the inverse of the data sheet's formula
     error_degC = max_error(read_temperature(true_degC, quiet(7), rng), 25 + (raw - 46244) / 45.2)
     return Check("chip", "temperature", "25 + (raw - 46244) / 45.2, data sheet", error_degC, "degC", 4e-6,
-                 "rounding of float32 near 60")  # fmt: skip
+                 "Only rounding errors of float32 occur, which are largest at 60 degC.")  # fmt: skip
 
 
 FRAMES_N = 300
-CRLF_degC = 34.513275  # temperature whose float32 bytes contain CR LF
+# A temperature whose float32 bytes contain CR LF, the two bytes that end each frame in a stream.
+CRLF_degC = 34.513275
 CRLF_SHARE = 0.05  # fraction of temperatures that have this value
 
 
@@ -272,14 +291,15 @@ def binary(frames: Frames, layout: Wire) -> list[Check]:
     ours = wire.encode(frames, layout)
     unpacked = np.array([row[:-2] for row in form.iter_unpack(ours)])[:, len(clock) :]
     decoded, _ = decode_all(theirs, layout, frames.temperature_degC.shape[1], "verification")
-    same = "bytes are bytes"
+    same = "Encoding and decoding must not change any bit."
     return [
-        Check(f"frames, {layout}", "what is written", f"struct {form.format!r}", _differing(ours, theirs),
-              "bytes", 0.0, same),
-        Check(f"frames, {layout}", "what struct reads of it", f"struct {form.format!r}, as the authors' reader",
-              float(np.abs(unpacked - values).max()), "uT or degC", 0.0, same),
-        Check(f"frames, {layout}", "what is read of struct's bytes, CR LF in floats included", "the values packed",
-              _missed(decoded, values), "uT or degC", 0.0, same),
+        Check(f"frames, {layout}", "bytes that the simulator encodes", f"bytes from Python's struct {form.format!r}",
+              _differing(ours, theirs), "bytes", 0.0, same),
+        Check(f"frames, {layout}", "values that struct decodes from the simulator's bytes",
+              f"the encoded values (struct {form.format!r})", float(np.abs(unpacked - values).max()),
+              "uT or degC", 0.0, same),
+        Check(f"frames, {layout}", "values that our decoder reads, also if a value contains the bytes CR LF",
+              "the values that struct encoded", _missed(decoded, values), "uT or degC", 0.0, same),
     ]  # fmt: skip
 
 
@@ -287,17 +307,18 @@ def text(frames: Frames, layout: Wire) -> list[Check]:
     values = _txyz(frames)
     numbers = values.reshape(len(frames), -1, 4)
     ordered = numbers if layout == "text-txyz" else np.roll(numbers, -1, axis=2)
-    # Layout text-txyz is that of AnySkin's firmware, which omits the tab between two chips.
+    # AnySkin's firmware sends layout text-txyz. It writes no tab between the values of two chips.
     gap = "" if layout == "text-txyz" else "\t"
     lines = [gap.join("\t".join(f"{value:.2f}" for value in chip) for chip in row) + gap for row in ordered.tolist()]
     theirs = "".join(line + "\r\n" for line in lines).encode()
     ours = wire.encode(frames, layout)
     decoded, _ = decode_all(theirs, layout, frames.temperature_degC.shape[1], "verification")
     return [
-        Check(f"frames, {layout}", "what is written", "Python's format, two decimals", _differing(ours, theirs),
-              "bytes", 0.0, "bytes are bytes"),
-        Check(f"frames, {layout}", "what is read", "the values printed", _missed(decoded, values), "uT or degC", 5.5e-3,
-              "two decimals: half of the last, and the rounding of float32"),
+        Check(f"frames, {layout}", "bytes that the simulator encodes", "text that Python formats with two decimals",
+              _differing(ours, theirs), "bytes", 0.0, "Both must write the same text."),
+        Check(f"frames, {layout}", "values that our decoder reads", "the values before they were written as text",
+              _missed(decoded, values), "uT or degC", 5.5e-3,
+              "Two decimals cause an error of up to 0.005, and float32 adds rounding errors."),
     ]  # fmt: skip
 
 
@@ -318,7 +339,7 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
 # Number of indentations, time from one indentation to the next, and times of lowering and of holding the tip.
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7
 NAME = "relaxation of the force"
-STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
+STATE = np.array([0.7, -0.2, 0.4])  # state of the relaxation before a time step, one value per relaxation time
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest / fastest relaxation time; the fastest is 1 ms
 STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time step / fastest relaxation time
 ROUNDING = 1e-14  # relative rounding error of a few dozen operations on doubles
@@ -329,8 +350,9 @@ def check_relaxation() -> list[Check]:
     steps = [step_error(1e-3 * dt, stiff(ratio)) for ratio, dt in product(RATIOS, STEPS)]
     return [
         many_pokes(),
-        Check(NAME, "one step, tau_max / tau_min 1e3-1e8, dt / tau_min 1e-16-1e8", "its formula in 50 digits (mpmath)",
-              float(np.max(steps)), "1", ROUNDING, "a few dozen operations on doubles"),
+        Check(NAME, "one step dt, with tau_max / tau_min from 1e3 to 1e8 and dt / tau_min from 1e-16 to 1e8",
+              "the same formula, evaluated with 50 digits (mpmath)", float(np.max(steps)), "1", ROUNDING,
+              "Only the rounding errors of a few dozen operations on doubles occur."),
         held(np.geomspace(1e-5, 1e6, 200) - 1e-5),
     ]  # fmt: skip
 
@@ -345,15 +367,16 @@ def many_pokes() -> Check:
     time_s = np.sort(np.concatenate([starts_s, starts_s + RAMP_S, starts_s + RAMP_S + HOLD_S]))
     elastic = np.tile([0.0, 2.0, 2.0], POKES_N)
     error = scaled_error(relax(time_s, elastic, SKIN_RELAXATION), hereditary(time_s, elastic, SKIN_RELAXATION))
-    return Check(NAME, f"{POKES_N} pokes over {POKES_N * CYCLE_S:g} s", "hereditary integral in 50 digits (mpmath)",
-                 error, "1", 1e-13, "60 exact steps add up rounding")  # fmt: skip
+    return Check(NAME, f"{POKES_N} pokes over {POKES_N * CYCLE_S:g} s", "hereditary integral with 50 digits (mpmath)",
+                 error, "1", 1e-13,
+                 "Each of the 60 steps is exact except for rounding errors, which add up.")  # fmt: skip
 
 
 def held(time_s: Float[np.ndarray, " t"]) -> Check:
     closed = 3.0 * (1 - (SKIN_RELAXATION.share * -np.expm1(-time_s[:, None] / SKIN_RELAXATION.tau_s)).sum(axis=1))
-    return Check(NAME, "a held poke, 10 us to 12 days", "1 - sum of shares (1 - exp(-t / tau))",
+    return Check(NAME, "a poke that is held, up to 12 days", "1 - sum of share * (1 - exp(-t / tau)), in closed form",
                  scaled_error(relax(time_s, np.full(len(time_s), 3.0), SKIN_RELAXATION), closed), "1", 1e-13,
-                 "200 steps add up their rounding")  # fmt: skip
+                 "Each of the 200 steps is exact except for rounding errors, which add up.")  # fmt: skip
 
 
 def step_error(dt_s: float, prony: Prony) -> float:
@@ -372,9 +395,10 @@ def hereditary(
 ) -> Float[np.ndarray, " t"]:
     """Return the relaxed force at each time, from the hereditary integral of Lee & Radok with 50 digits.
 
-    The integral is that of relaxation(t - s) d elastic(s) over all earlier times s. Between two successive times, the
-    elastic force is linear, so the integral over this interval has a closed form, and these are summed. Unlike
-    `aging.relax`, this function does not compute the state at one time from the state at the time before.
+    The integrand is relaxation(t - s) d elastic(s), and the integral is over all earlier times s. Between two
+    successive times, the elastic force is linear, so the integral over this interval has a closed form. The function
+    sums these closed forms over all intervals. Unlike `aging.relax`, it does not compute the state at one time from the
+    state at the time before.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (
