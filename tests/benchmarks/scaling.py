@@ -1,9 +1,9 @@
 """Estimate the speed-up of training by 1 to 256 workers, and what limits it, by simulating the cluster.
 
-Uses the times and sizes measured by cluster.py and the training times of each stage in reports/<scene>/provenance.json;
-writes a table and a figure. The discrete-event simulation makes three assumptions. One client sends tasks one after
-another over a shared network. Each worker loads the training rows once. The time of a task is the mean for its stage,
-multiplied by a ratio drawn from the measured task times.
+The module uses the times and sizes measured by cluster.py, and the training times of each stage in
+reports/<scene>/provenance.json. It writes a table and a figure. The discrete-event simulation makes three assumptions.
+One client sends tasks one after another over a shared network. Each worker loads the training rows once. The time of a
+task is the mean for its stage, multiplied by a ratio drawn from the measured task times.
 """
 
 import heapq
@@ -32,7 +32,7 @@ class Measurements:
     """Times and sizes that the cluster test measured."""
 
     task_s: tuple[float, ...]  # CPU time of each task
-    processes_s: tuple[float, float]  # of the whole sweep: in one process, in two processes
+    processes_s: tuple[float, float]  # time of the whole sweep in one process, and in two processes
     call_s: float  # overhead of a task: time per empty task, when empty tasks are sent one after another
     connect_s: float  # time to connect a stage to a cluster whose workers have already loaded the libraries
     rows_bytes: float  # size of the training rows, which each worker loads once

@@ -1,7 +1,8 @@
 """Write docs/growth.md and its figure from docs/measured/growth.json, which time_growth.py measures.
 
-Run `python -m tests.benchmarks.show_growth`. The page reports two exponents of cost against size: the slope in the
-log-log figure, which includes fixed costs, and the exponent of the growing part alone.
+Run `python -m tests.benchmarks.show_growth`. The page has two exponents of the growth of cost with size. The first is
+the slope of the curve in the log-log figure, which includes fixed costs. The second is the exponent p of a fit of
+a + b n^p, which separates the fixed costs a.
 """
 
 import json

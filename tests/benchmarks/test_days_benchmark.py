@@ -1,4 +1,4 @@
-"""Accuracy on a later day on which the skin slides differently, with presses of both days.
+"""Accuracy on a later day on which the skin slides on its base in another way, with presses of both days.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_days_benchmark.py` prints the tables of docs/learning.md. All
 skins are simulated: parameters and errors of the law are drawn as in training, with other seeds. On the later day,
@@ -34,7 +34,7 @@ CHOICE_SEED, SEED = 1, 2
 CHOICE_SKINS_N, SKINS_N, COVERAGE_SKINS_N = 24, size(96, 1), 24
 PRESSES_N, LABELS_N = size((0, 5, 12, 65), (5,)), size((0, 10, 40), (10,))
 CHOICE_PRESSES_N, RECORDED_PRESSES_N = (1, 3, 12), (0, 5, 12)
-# tried pairs of correlations between days: of the slide, of the law's errors
+# Pairs of correlations between the two days that are tried: that of the slide, and that of the law's errors.
 CORRELATIONS = (0.0, 0.0), (0.0, 0.5), (0.0, 0.7), (0.0, 0.85), (0.0, 1.0), (0.5, 0.7)
 LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
 WAYS = TOGETHER, ALONE, BY_DAY = "all presses together", "new presses alone", "by day"
@@ -127,10 +127,14 @@ class TwoDays:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_correlations_and_limit_in_use_are_nearly_the_best(monkeypatch):
-    """Choose the correlations, then the limit. Unchanged and changed errors of the law have equal weight."""
+def test_correlations_and_log_odds_limit_in_use_are_nearly_optimal(monkeypatch):
+    """Compare the correlations, and then the limit of the log odds above which the slide counts as unchanged.
+
+    Days with unchanged and with changed errors of the law have equal weight.
+    """
     skins = list(draw_skins(CHOICE_SKINS_N, CHOICE_SEED))
-    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)  # always assume that the slide has changed
+    # No log odds reach this limit, so the slide always counts as changed.
+    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)
     by_pair = {}
     for pair in CORRELATIONS:
         with monkeypatch.context() as settings:
@@ -173,7 +177,8 @@ def test_accuracy_on_a_later_day():
             for labels_n, days in by_labels_n.items():
                 together = days.score(change, n, TOGETHER)
                 same = days.log_odds(change, n) >= model.SAME_SLIDE_LOG_ODDS_MIN
-                by_day = together if same else days.score(change, n, BY_DAY)  # if `same`, both are equal
+                # If `same` is true, calibration by day uses all presses together.
+                by_day = together if same else days.score(change, n, BY_DAY)
                 scores.setdefault((change, labels_n, n), []).append((together, alone, by_day))
     for change, of_skins in cosines.items():
         print(f"cosine of equal presses, slide {change}: 5, 50, 95 % quantiles {np.percentile(of_skins, [5, 50, 95])}")
@@ -196,7 +201,7 @@ def test_accuracy_on_a_later_day():
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_coverage_and_force_on_a_later_day(tmp_path):
+def test_interval_coverage_and_force_errors_on_a_later_day(tmp_path):
     n, file = 12, tmp_path / "first.safetensors"
     scores: dict[tuple[str, int, str], list[tuple[float, float, float]]] = {}
     for skin, labels_n in product(draw_skins(COVERAGE_SKINS_N, SEED), LABELS_N):
@@ -242,7 +247,7 @@ def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_recorded_depths_used_as_days(shared_data, tmp_path):
+def test_accuracy_if_recorded_depths_are_used_as_days(shared_data, tmp_path):
     """Use recordings at one depth as the first day, and recordings at another depth as the later day.
 
     These recordings are not from different days, so this does not test a change from day to day. Labels are at tested
@@ -257,9 +262,8 @@ def test_recorded_depths_used_as_days(shared_data, tmp_path):
         depths, place_mm = [presses[order] for presses in depths], depths[0].place_mm[order]
         np.testing.assert_allclose([presses.place_mm for presses in depths], [place_mm] * len(depths), atol=1e-9)
         new_n = max(RECORDED_PRESSES_N)
-        presses_i = np.concatenate(
-            [np.arange(PLACES_N), np.arange(PLACES_N - new_n)]
-        )  # the last new_n presses are not tested on the later day
+        # The last `new_n` presses are not tested on the later day.
+        presses_i = np.concatenate([np.arange(PLACES_N), np.arange(PLACES_N - new_n)])
         for first, later in permutations([presses[presses_i] for presses in depths], 2):
             skin = SkinOnTwoDays(
                 np.mean(rests_uT, axis=0), first.place_mm, first.force_N, first.db_uT, {CHANGED: later.db_uT}

@@ -1,4 +1,4 @@
-"""Choice of the force estimator on simulated skins: power of the map's probabilities of forces, and default estimator.
+"""Choose the default force estimator, and the power of the map's probabilities of forces, on simulated skins.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_force_benchmark.py`, which takes four minutes. On each skin,
 the shipped model is calibrated to 65 presses at unknown places and to labels; 25 other presses are tested. Errors of
@@ -26,7 +26,7 @@ SKINS_N, TESTED_N = size(96, 1), 25
 POWERS, LABELS_N, SCALES = size((0.15, 0.3, 0.6, 1.0), (0.6,)), size((10, 40), (10,)), size((1.0, 2.0), (1.0,))
 
 
-def test_force_estimators_by_power_and_number_of_labels(monkeypatch):
+def test_default_force_estimator_and_power_have_the_highest_mean_score(monkeypatch):
     shipped = load_universal()
     model = PriorModel(new_map(shipped.tables), shipped.networks)
     prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, SETUP)

@@ -70,10 +70,10 @@ def add_independent_errors(skins: Population, rng: np.random.Generator) -> np.nd
 
 
 FAMILIES: dict[str, LawError] = {
-    "nothing missed": law_error(0.0), "0.3 of |dB|": law_error(0.3), "0.5": law_error(0.5), "0.6": law_error(0.6),
-    "0.8": law_error(0.8), "0.5 over 1.2 to 2 mm": law_error(0.5, (1.2, 2.0)),
-    "0.5 over 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "chips mixed": mix_chips, "remembered": add_memory,
-    "one by one": add_independent_errors,
+    "no error": law_error(0.0), "0.3 |dB|": law_error(0.3), "0.5 |dB|": law_error(0.5), "0.6 |dB|": law_error(0.6),
+    "0.8 |dB|": law_error(0.8), "0.5 |dB|, length scale 1.2 to 2 mm": law_error(0.5, (1.2, 2.0)),
+    "0.5 |dB|, length scale 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "random gain matrix of each chip": mix_chips,
+    "memory of another press": add_memory, "independent error of each press": add_independent_errors,
 }  # fmt: skip
 
 
@@ -88,8 +88,8 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
     print("\npowers by labels:", {n: [round(power, 2) for power in powers] for n, powers in by_labels.items()})
     widths_mm = {}
     for name, error in {
-        "of the prior": universal.law_error(),
-        "as for the choice of powers": universal.unmodelled_error(),
+        "law error as in training": universal.law_error(),
+        "law error with which the powers are chosen": universal.unmodelled_error(),
         **size(FAMILIES, dict([*FAMILIES.items()][:1])),
     }.items():
         skins = draw_prior_skins(prior, SKINS_N, SEED, "asked", error)
@@ -103,7 +103,7 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
                 for assumed, covered, mm, within in found
             ) + f" | sd of the coverage over skins: {100 * sd:.1f} points")  # fmt: skip
             widths_mm[name, n] = found[1, 2]
-    assert not FULL or widths_mm["nothing missed", 0] < widths_mm["0.5", 0] < widths_mm["0.8", 0]
+    assert not FULL or widths_mm["no error", 0] < widths_mm["0.5 |dB|", 0] < widths_mm["0.8 |dB|", 0]
 
 
 def _scores(calibration, tested, labels_n, powers):

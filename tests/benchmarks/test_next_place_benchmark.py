@@ -26,7 +26,7 @@ SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
 Choose = Callable[[Universal, list[int]], int]
 
 
-def test_errors_by_choice_of_labelled_places():
+def test_place_errors_by_strategy_of_choosing_labelled_places():
     rng, errors = rng_for(0, "next place"), {}
     design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)

@@ -99,7 +99,7 @@ def main() -> None:
         nargs="*",
         choices=SETTINGS,
         default=list(SETTINGS),
-        help="settings to run in addition to the first",
+        help=f"settings to run in addition to '{FIRST}'",
     )
     arguments = parser.parse_args()
     named = {name: setting for name, setting in SETTINGS.items() if name in (FIRST, *arguments.settings)}
@@ -138,7 +138,7 @@ def show(found: Mapping[str, Any]) -> None:
         }
         for name, run in found["runs"].items()
     ]
-    heading = f"Code {found['git']}, {found['machine']}; the first row is what the others are compared with."
+    heading = f"Code {found['git']}, {found['machine']}; the other rows are compared with the first row."
     write_block("repeat.md", "repeat", [heading, table(rows)])
 
 

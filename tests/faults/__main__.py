@@ -26,8 +26,10 @@ OUT = ROOT / "docs/faults.md"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", default=[], help="faults whose name contains one of these")
-    parser.add_argument("--work", type=Path, help="a folder to keep the finished checkout and the rows in")
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="inject only the faults whose name contains one of these words"
+    )
+    parser.add_argument("--work", type=Path, help="a folder in which the finished checkout and the table rows are kept")
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     work = (arguments.work or Path(tempfile.mkdtemp())).resolve()
