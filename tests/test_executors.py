@@ -82,7 +82,7 @@ def test_unknown_device_is_an_error(monkeypatch, value):
     )
 
 
-def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
+def test_median_call_time_does_not_include_the_first_call(monkeypatch):
     now_s, calls = [0.0], []
 
     def call() -> None:
@@ -96,7 +96,7 @@ def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
     assert median_s == (2 + job.REPEATS_N + 1) / 2  # This is the median of 2 s to 26 s.
 
 
-def test_single_slow_call_does_not_change_the_median(monkeypatch):
+def test_median_call_time_is_not_changed_by_a_single_slow_call(monkeypatch):
     now_s, durations_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
 
     def call() -> None:

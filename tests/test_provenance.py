@@ -83,17 +83,17 @@ def test_first_of_two_processors_is_named():
 
 
 @pytest.mark.parametrize("cpuinfo", ["", "\n\n", "no colon here", "model name:\nflags:"])
-def test_unknown_processor_is_named_by_python(cpuinfo):
+def test_name_of_an_unknown_processor_is_the_one_that_python_reports(cpuinfo):
     assert processor_name(cpuinfo, {}, otherwise="arm") == "arm"
     assert processor_name(cpuinfo, {}, otherwise="") == "unknown processor"
 
 
 @pytest.mark.parametrize("name", VARIABLES)
-def test_variables_that_change_sums_are_listed(name):
+def test_variables_that_change_the_results_are_listed_with_the_processor(name):
     assert f"{name}=x" in processor_name(XEON, {name: "x"}, otherwise="")
 
 
-def test_pinned_variables_are_not_listed():
+def test_variables_that_the_project_has_set_are_not_listed():
     flags = frozenset({"avx2", "avx512vl", "avx512_vbmi2"})
     assert processor_name(XEON, pinned(flags, {}), otherwise="") == processor_name(XEON, {}, otherwise="")
 
@@ -120,7 +120,7 @@ def test_costs_are_in_seconds_and_megabytes(tmp_path):
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # The peak memory of this Python process in MB.
 
 
-def test_stage_cost_includes_reused_training(tmp_path):
+def test_cost_of_a_stage_includes_training_runs_that_were_reused(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
     record_cost(tmp_path, "train", 12.0)
@@ -138,7 +138,7 @@ def test_stage_cost_includes_reused_training(tmp_path):
 
 
 @given(st.floats(0, 9), st.floats(0, 9), st.lists(st.tuples(st.floats(0, 9), st.booleans()), max_size=4))
-def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, trained):
+def test_cost_of_a_stage_is_at_least_the_time_of_its_last_run(tmp_path_factory, waited_s, other_s, trained):
     folder = tmp_path_factory.mktemp("costs")
     record_trainings(folder, "train", {str(i): one for i, one in enumerate(trained)}, waited_s)
     record_cost(folder, "train", waited_s + other_s)
@@ -146,7 +146,7 @@ def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, 
     assert total_cost_s([cost]) >= cost["seconds"] - 0.02  # Both values are rounded to 0.01 s.
 
 
-def test_repeated_training_of_a_run_counts_once(tmp_path):
+def test_training_run_that_a_stage_uses_twice_is_counted_once(tmp_path):
     clear_cost(tmp_path, "sweep")
     record_trainings(tmp_path, "sweep", {"a": (8.0, False)}, waited_s=4.0)
     record_trainings(tmp_path, "sweep", {"a": (8.0, True), "c": (1.0, True)}, waited_s=1.0)

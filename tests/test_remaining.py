@@ -133,14 +133,14 @@ def test_remaining_time_is_within_a_factor_of_two_on_other_machines(checkout, st
     assert 0.5 < minutes_left(sentence) / (71.5 * slower / 60) < 2
 
 
-def test_other_scenes_and_stages_after_the_target_do_not_count(checkout, start, monkeypatch):
+def test_remaining_time_excludes_other_scenes_and_stages_after_the_target(checkout, start, monkeypatch):
     (checkout / "dvc.lock").unlink()
     monkeypatch.setattr(remaining, "stages_in_order", lambda: [*ORDER[:2], "split@other", *ORDER[2:]])
     sentence = start(ORDER[0], 0.0, "/usr/bin/dvc repro train_multi@tiny")
     assert minutes_left(sentence) == pytest.approx(91.5 / 60, abs=0.06)
 
 
-def test_next_run_starts_anew(checkout, start):
+def test_progress_starts_again_with_the_next_run(checkout, start):
     (checkout / "dvc.lock").unlink()
     start(ORDER[0], 0.0)
     start(ORDER[1], 1.5)

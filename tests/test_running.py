@@ -36,8 +36,8 @@ def test_running_stage_is_an_error(tmp_path, locks):
         require_idle(tmp_path)
 
 
-def test_stale_lock_is_named(tmp_path, locks):
-    # A process that is not DVC.
+def test_error_names_the_lock_to_delete_if_its_process_is_not_dvc(tmp_path, locks):
+    # This process is not DVC, but the lock names it.
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         write_rwlock(locks, other.pid)
         with pytest.raises(ParamsError, match=rf"If process {other.pid} is not DVC, delete \.dvc/tmp/rwlock first"):

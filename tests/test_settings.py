@@ -180,7 +180,7 @@ def test_override_reruns_the_stages_that_read_it(root, stages, before, file, ove
     assert changed & known == {name if "@" in name else f"{name}@ci" for name in readers}
 
 
-def test_protocol_edit_simulates_only_that_protocol(root, stages, before):
+def test_edit_of_a_protocol_reruns_only_its_own_simulation(root, stages, before):
     for protocol in FURTHER_PROTOCOLS:
         with override_files(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
             after = parameter_values(root, stages)
@@ -212,7 +212,7 @@ def test_stage_checks_only_the_sections_that_it_reads(root):
             plan.check(root)
 
 
-def test_control_has_the_settings_of_its_adaptation(root):
+def test_variant_control_has_the_settings_of_its_adaptation(root):
     with override_files(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
         adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}

@@ -49,7 +49,9 @@ def run_command(*arguments: str) -> tuple[int, str]:
         ((80.0, 80.0, "ridge"), 1, "| tables | table2    | 1       | 1        |"),
     ],
 )
-def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, expected):
+def test_finished_reports_are_compared_with_those_of_the_last_commit(
+    checkout, tmp_path_factory, changed, status, expected
+):
     other = tmp_path_factory.mktemp("other")
     write(other / "quick", *changed)
     write(checkout / "reports/quick", 0.0)  # reports in the working tree must be ignored
@@ -58,7 +60,7 @@ def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factor
     assert expected in output
 
 
-def test_rerun_starts_from_the_commit_and_its_clone_is_kept(checkout, monkeypatch):
+def test_rerun_starts_without_old_reports_and_keeps_its_new_reports(checkout, monkeypatch):
     def run(clone, environment, *arguments, quiet=False):
         if arguments[0] == "dvc":
             assert not list((clone / "reports/quick").glob("*"))
