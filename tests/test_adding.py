@@ -128,7 +128,9 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
 def test_recording_is_not_compared_with_the_skin_if_the_scene_has_no_section_compare(
     root, lab_file, monkeypatch, capsys
 ):
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was called"))
+    monkeypatch.setattr(
+        "pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("find_departure must not be called")
+    )
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
 
@@ -166,7 +168,7 @@ def test_recording_that_was_added_before_is_refused_unless_copies_are_allowed(ro
     assert len(plan.check(root).stages["ingest"]) == 2
 
 
-def test_copy_of_a_recording_with_other_formatting_is_recognised(root, lab_file, tmp_path):
+def test_copy_of_a_recording_is_recognised_although_its_numbers_are_formatted_differently(root, lab_file, tmp_path):
     add_lab(root, lab_file)
     (tmp_path / "copy.csv").write_text(lab_file.read_text().replace("21.5,", "21.50,"))
     assert_refused(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
@@ -386,7 +388,7 @@ def test_capture_with_many_lost_bytes_is_an_error(root, tmp_path):
     )
 
 
-def test_command_prints_a_one_line_error(root_with_code, tmp_path):
+def test_reskin_add_prints_an_error_of_one_line(root_with_code, tmp_path):
     (tmp_path / "broken.csv").write_bytes(b"")
     arguments = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root_with_code, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
@@ -414,7 +416,7 @@ def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_command_prints_that_the_scene_was_added_to_the_plan(root_with_code, lab_file, monkeypatch):
+def test_reskin_add_prints_that_it_has_added_the_scene_to_the_plan(root_with_code, lab_file, monkeypatch):
     monkeypatch.chdir(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root_with_code, "reskin", *arguments)

@@ -10,12 +10,12 @@ from tests.conftest import CHECKED_N
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((4, 2, 3)), np.zeros((4, 2, 2), int)], ids=["wrong shape", "wrong dtype"])
-def test_wrong_array_is_an_error(wrong):
+def test_array_of_a_wrong_shape_or_dtype_raises_an_error(wrong):
     with pytest.raises(TypeCheckError, match="rotation_angle"):
         rotation_angle(wrong)
 
 
-def test_arrays_of_inconsistent_shapes_are_an_error():
+def test_arrays_whose_shapes_do_not_match_raise_an_error():
     with pytest.raises(TypeCheckError, match="Frames"):
         Frames(np.zeros((3, 15), "f4"), np.zeros((2, 5), "f4"), np.zeros(3), np.zeros(3, int))
 

@@ -31,7 +31,7 @@ PUBLISHED = {
 ABOUT = About(method="mine", by="A. Name", trained_on="labels", code="none")
 
 
-def test_published_versions_never_change():
+def test_files_of_published_versions_have_not_changed():
     found = {f"v{version}/{file.name}" for version in (1,) for file in (folds.FOLDER / f"v{version}").iterdir()}
     assert found == set(PUBLISHED)
     assert {name: io.sha256(folds.FOLDER / name) for name in PUBLISHED} == PUBLISHED
@@ -117,7 +117,7 @@ def test_example_of_the_page_writes_a_complete_file_of_predictions(tmp_path, mon
     assert errors_mm2[1] < errors_mm2[0]
 
 
-# --- A tiny dataset: boards a and b have four presses each (two are tested); board c is for training ---
+# --- Tests with a tiny dataset: boards a and b have four presses each, of which two are tested; board c is for training
 
 TRUE = {"x_mm": [0.0, 4.0, 8.0, 16.0], "y_mm": [0.0, 4.0, 8.0, 16.0], "F_N": [1.0, 3.0, 2.0, 2.0]}
 HEAD = "fold,press,x_mm,y_mm,F_N,x_low_mm,x_high_mm,y_low_mm,y_high_mm,F_sd_N\n"
@@ -341,7 +341,7 @@ def test_command_writes_the_scores_and_an_entry(tiny, tmp_path):
         entries.read_entries(tiny)
 
 
-# --- Our own methods ---
+# --- Tests of our own methods
 
 
 def test_method_nearest_label_has_its_committed_scores_on_simulated_boards(tmp_path):

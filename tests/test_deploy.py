@@ -22,7 +22,7 @@ def test_scripts_are_valid_shell(shell, script):
     subprocess.run([shell, "-n", script], cwd=ROOT, check=True)
 
 
-def test_unknown_command_is_an_error():
+def test_unknown_command_of_the_dask_script_is_an_error():
     finished = subprocess.run([*DASK, "start"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (finished.returncode, "must be scheduler, worker or run; got 'start'" in finished.stderr) == (2, True)
 

@@ -38,9 +38,8 @@ def test_description_recovers_the_fields_noise_steps_and_forces_of_synthetic_rea
     found = describe(example_readings())
     assert found["field_at_rest_chip_median_uT"] == pytest.approx((500 + np.hypot(1000, 2500)) / 2)
     assert found["field_at_rest_channel_max_uT"] == 2500
-    assert found["noise_xy_uT"] == pytest.approx(
-        3.0, rel=0.05
-    )  # with 1600 degrees of freedom, the standard error is 2 %
+    # The noise has 1600 degrees of freedom, so its standard error is 2 %.
+    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)
     assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
     assert found["step_xy_uT"] == pytest.approx(0.2, rel=1e-3)
     assert found["step_z_uT"] == pytest.approx(0.3227, rel=1e-3)

@@ -46,7 +46,7 @@ SHORT = {"steps_n": 4, "batch_n": 16}
 @pytest.mark.parametrize(
     ("estimator", "fails"),
     [(reskin.ContactRegressor(steps_n=15), CONTACT_FAILS), (reskin.UniversalRegressor(np.zeros(15)), UNIVERSAL_FAILS)],
-    ids=["contact", "universal"],
+    ids=["ContactRegressor", "UniversalRegressor"],
 )
 def test_estimators_pass_the_checks_of_scikit_learn(estimator, fails):
     with warnings.catch_warnings():
@@ -198,14 +198,15 @@ def test_universal_regressor_follows_the_conventions_of_scikit_learn(pressed, tm
     assert regressor.noload_uT is noload_uT
     assert list(regressor.feature_names_in_) == list(frame)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
-    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)  # a second fit starts from the prior
+    np.testing.assert_array_equal(
+        regressor.fit(frame, y).predict(frame), first
+    )  # a second fit does not use the first one
     np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
-    assert metrics.score(y, first)["accuracy_pct"] > 90  # accuracy on the labelled presses themselves
+    assert metrics.score(y, first)["accuracy_pct"] > 90  # the presses are those of the labels
     regressor.model_.save(tmp_path / "skin.safetensors")
     saved = reskin.load_universal(tmp_path / "skin.safetensors")
-    np.testing.assert_allclose(
-        saved.predict(X + saved.noload_uT), first, atol=1e-3
-    )  # the tolerance allows for rounding of X + noload_uT
+    # The tolerance allows for rounding of X + noload_uT.
+    np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)
 
 
 def test_universal_regressor_warns_of_mirrored_labels(pressed):

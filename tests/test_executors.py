@@ -11,7 +11,7 @@ from reskin.models import job
 from reskin.numerics import device
 
 
-def test_calls_run_in_separate_processes(monkeypatch):
+def test_calls_run_in_another_process_with_executor_processes(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
@@ -56,7 +56,7 @@ def test_unknown_executor_is_an_error(monkeypatch, value):
         make_executor(imports="json")
 
 
-def test_calls_can_run_in_this_process(monkeypatch):
+def test_calls_run_in_this_process_with_executor_here(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()

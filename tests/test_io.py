@@ -26,7 +26,7 @@ def test_readings_written_to_a_file_are_read_unchanged(tmp_path):
     assert io.read_ingest_counts(tmp_path / "c0.parquet") == {"rows_n": 6}
 
 
-def test_columns_have_units_and_the_file_a_schema_version(tmp_path):
+def test_file_of_readings_states_the_units_of_columns_and_its_schema_version(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     schema = pq.read_schema(tmp_path / "c0.parquet")
     assert {field.name: field.metadata[b"unit"].decode() for field in schema if field.name in UNITS} == UNITS
@@ -85,12 +85,12 @@ def test_os_errors_name_the_file_that_could_not_be_read_or_written(tmp_path):
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
     assert names_in_errors(source) == ("source", "source", "source")
     assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    # EIO may be caused by either file of a copy.
+    # If a file is copied, EIO may be caused by either of the two files.
     assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")
     assert names_in_errors() == ("a.txt", "a.txt", "")
 
 
-def test_read_only_disk_error_names_the_target(tmp_path, monkeypatch):
+def test_error_for_a_read_only_disk_names_the_target(tmp_path, monkeypatch):
     def refuse(path: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(path))
 
@@ -209,7 +209,7 @@ def test_flipped_bits_of_tables_are_detected(tmp_path):
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 6  # Other bytes are in headers of pages, whose bits do not affect the values.
+    assert detected_n > end // 6  # The other flipped bits are in headers of pages and do not affect the values.
 
 
 def test_tensors_without_digest_are_read(tmp_path):

@@ -79,7 +79,7 @@ def test_exponential_function_equals_numpy_in_single_precision(value):
     assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
 
 
-def test_numpy_imported_too_early_is_reported():
+def test_import_of_numpy_before_the_variables_are_set_is_reported():
     code = "import numpy; from reskin.numerics import departures; import os; print(departures(os.environ))"
     inherited = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run(
@@ -88,7 +88,7 @@ def test_numpy_imported_too_early_is_reported():
     assert (TOO_LATE in done.stdout) == ("avx2" in cpu_flags())
 
 
-def test_changed_variable_is_reported():
+def test_variables_with_other_values_than_the_project_sets_are_reported():
     assert departures(PINNED) == []
     assert departures({**PINNED, "OPENBLAS_CORETYPE": "Zen"}) == ["OPENBLAS_CORETYPE=Zen"]
 

@@ -147,7 +147,7 @@ def test_scene_runs_only_the_stages_of_its_experiments_and_protocols(unit):
     assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_all_missing_experiments_are_listed():
+def test_error_lists_all_missing_experiments():
     with pytest.raises(ParamsError, match="experiment choice needs adapt, triplet in the same scene"):
         scene("lobo", "choice")
 
@@ -219,7 +219,7 @@ def test_invalid_experiment_setting_is_an_error(changes, message):
         scene(*ALL, **changes)
 
 
-def test_all_missing_settings_are_listed():
+def test_error_lists_all_missing_settings():
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "transfer", "sensitivity"]}
     settings["split"] = {}
     settings["simulate"]["protocols"].pop("glass")

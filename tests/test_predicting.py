@@ -176,7 +176,7 @@ def test_unsuitable_inputs_raise_an_error_before_any_file_is_written(tmp_path, m
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
     ],
 )
-def test_wrong_card_is_an_error(tmp_path, model, change, message):
+def test_wrong_model_card_is_an_error(tmp_path, model, change, message):
     model.with_suffix(".json").write_text(json.dumps(CARD | change))
     with pytest.raises(ReskinError, match=message) as refused:
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -184,13 +184,13 @@ def test_wrong_card_is_an_error(tmp_path, model, change, message):
 
 
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
-def test_incomplete_card_is_an_error(tmp_path, model, lacking):
+def test_incomplete_model_card_is_an_error(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
     with pytest.raises(ReskinError, match=f"{lacking} (is missing|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_card_that_is_not_a_mapping_is_an_error(tmp_path, model):
+def test_model_card_that_is_not_a_mapping_is_an_error(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
     with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")

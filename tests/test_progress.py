@@ -50,7 +50,7 @@ def test_stage_outside_dvc_prints_nothing(monkeypatch):
     assert progress.stage_position() is None
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # libraries that DVC uses cause warnings
 def test_stages_that_table_2_needs_run_before_all_other_stages(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     plan.use(root, ["ci"])
@@ -61,5 +61,5 @@ def test_stages_that_table_2_needs_run_before_all_other_stages(tmp_path, monkeyp
     assert set(order[: order.index("table2@ci")]) == needed
     planned = read_yaml(Path("pipeline/plan.yaml"))["stages"]
     assert len(order) == 1 + sum(len(keys) for keys in planned.values())
-    monkeypatch.setattr(progress, "_ask_dvc", lambda: pytest.fail("asked DVC again"))
+    monkeypatch.setattr(progress, "_ask_dvc", lambda: pytest.fail("DVC must not be asked again"))
     assert progress.stages_in_order() == order

@@ -67,7 +67,7 @@ def test_code_version_of_modules_is_their_last_functional_change(tmp_path, monke
     assert code_version_of(["pipeline.two"]) == third
 
 
-def test_machine_is_described():
+def test_machine_states_the_processor_its_cores_and_the_version_of_python():
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
 
@@ -104,7 +104,7 @@ def test_instruction_sets_are_listed_if_available(flag, name):
     assert processor_name("Features : fp", {}, otherwise="arm") == "arm"
 
 
-def test_machine_without_cpuinfo_is_described(tmp_path, monkeypatch):
+def test_machine_is_described_although_cpuinfo_is_missing(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "CPUINFO", tmp_path / "none")
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
@@ -127,7 +127,7 @@ def test_cost_of_a_stage_includes_training_runs_that_were_reused(tmp_path):
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # The last 2 s are the rest of the stage.
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # Apart from the training, the stage took 2 s.
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
@@ -162,7 +162,9 @@ def test_training_run_used_by_two_stages_is_counted_once(tmp_path):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # The last 3 s are those of the second stage.
+    assert (
+        total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0
+    )  # The second stage only reuses the training run, so it adds its 3 s.
 
 
 def test_costs_of_a_killed_run_are_dropped(tmp_path):

@@ -87,7 +87,7 @@ def test_model_with_the_alias_champion_has_the_predictions_of_the_saved_model(cl
     assert example.shape == (3, 15)
     assert np.isfinite(model.predict(example).to_numpy()).all()
     run = client.get_run(model.metadata.run_id)
-    assert run.data.metrics["accuracy_pct"] == 65.0  # mean over held-out boards
+    assert run.data.metrics["accuracy_pct"] == 65.0  # the mean over both held-out boards
     assert run.data.metrics["mse_xy_mm2"] == 1.5
 
 
@@ -121,7 +121,7 @@ def test_universal_model_is_calibrated_by_parameters(client):
     skin = reskin.load_universal().zero(noload_uT).see(b_uT)
     skin.label(np.array(labels)[:, :2], force_N, b_uT)
     np.testing.assert_allclose(model.predict(db_uT, params).to_numpy(), skin.predict(b_uT), rtol=1e-4, atol=1e-3)
-    uncalibrated = model.predict(db_uT).to_numpy()  # for a nominal skin
+    uncalibrated = model.predict(db_uT).to_numpy()  # without parameters, the estimates are those for a nominal skin
     assert uncalibrated.shape == (2, 3)
     assert not np.allclose(uncalibrated, skin.predict(b_uT), rtol=1e-4)
     assert io.sha256(Path(model._model_impl.file)) == io.sha256(FILE)
@@ -146,7 +146,7 @@ def serving_example(model) -> dict:
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 @pytest.mark.parametrize("name", ["reskin-ci", "reskin-universal"])
-def test_mlflow_models_serve_answers_by_http(client, root, name):
+def test_command_mlflow_models_serve_returns_predictions_by_http(client, root, name):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     uri = f"models:/{name}@champion"

@@ -113,7 +113,7 @@ def test_missing_port_leaves_no_files(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failing_label_source_is_reported(terminal, tmp_path):
+def test_error_of_a_label_source_ends_the_recording(terminal, tmp_path):
     def fail_to_open(_):
         raise CaptureError("the gauge: cannot open the port. Plug it in.")
 

@@ -173,7 +173,7 @@ def test_licences_of_gpu_packages_that_torch_needs_are_ignored(tmp_path):
         ("MIT License; my own words", False), ("BSD License (3-clause)", True),
     ],
 )  # fmt: skip
-def test_licence_is_compatible_if_one_alternative_is(licence, compatible):
+def test_licence_is_compatible_if_one_of_its_alternatives_is(licence, compatible):
     assert is_compatible(licence) is compatible
 
 

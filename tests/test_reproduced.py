@@ -51,7 +51,7 @@ def test_each_value_is_counted_once_in_either_direction_of_the_comparison(one, o
         ("a", "b", None),
     ],
 )  # fmt: skip
-def test_any_difference_is_counted(old, new, relative):
+def test_values_that_differ_at_all_are_listed_with_their_relative_difference(old, new, relative):
     (difference,) = compare({"shear": {"mean": old}}, {"shear": {"mean": new}}).differing
     assert difference.name == "shear.mean"
     assert difference.relative == (None if relative is None else pytest.approx(relative))

@@ -172,7 +172,7 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
 
 
 @pytest.mark.parametrize(("file", "override", "readers"), OVERRIDES, ids=[override for _, override, _ in OVERRIDES])
-def test_override_reruns_the_stages_that_read_it(root, stages, before, file, override, readers):
+def test_override_of_a_setting_reruns_the_stages_that_read_the_setting(root, stages, before, file, override, readers):
     with override_files(root, (file, override)):
         after = parameter_values(root, stages)
     known = {name if "@" in name else f"{name}@ci" for name in set().union(*(named for _, _, named in OVERRIDES))}

@@ -118,7 +118,7 @@ def test_each_training_run_is_published_once(tmp_path):
     contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
     assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
 
-    # After a change of settings, the new result is current, and the old result is kept.
+    # After a change of settings, the new result is current, and the run of the old result is kept.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k9"]
@@ -145,7 +145,7 @@ def test_runs_with_old_scores_and_runs_of_dropped_experiments_are_not_current(tm
     assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
 
 
-def test_report_run_has_figures_page_and_numbers(tmp_path):
+def test_run_of_a_report_has_its_figures_page_and_numbers(tmp_path):
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     write(tmp_path)
     (run,) = runs(tmp_path, "tags.stage = 'report'")
@@ -218,7 +218,7 @@ def test_runs_that_were_published_with_an_earlier_layout_are_superseded(tmp_path
     assert len(runs(tmp_path, "tags.current = 'true' and tags.kind = 'training'")) == 1
 
 
-def test_sweep_run_has_metrics_over_steps(tmp_path):
+def test_run_of_a_sweep_has_its_metrics_by_step(tmp_path):
     write_report(tmp_path / "reports")
     curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
     send(tmp_path, curves=curves)

@@ -89,6 +89,6 @@ def test_missing_reports_are_an_error(checkout, arguments, message):
     assert message in str(done.exception)
 
 
-def test_failed_command_is_named(tmp_path):
+def test_error_for_a_failed_command_names_the_command(tmp_path):
     with pytest.raises(verify.SchemaError, match="`json.tool nowhere` failed in a clone of the last commit"):
         verify._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)

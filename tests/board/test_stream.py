@@ -68,7 +68,7 @@ def test_frames_that_contain_any_finite_numbers_are_decoded_unchanged(chips_n, p
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_stream_fed_byte_by_byte_decodes_like_the_whole(wire):
+def test_decoding_byte_by_byte_gives_the_same_frames_as_decoding_all_bytes_at_once(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
     whole, account = decode_portions([data], wire, 5)
