@@ -151,10 +151,11 @@ def test_edit_of_a_caption_reruns_the_report_and_edit_of_code_also_the_experimen
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
     with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
+    # Stage table2 depends on the captions of all tables.
     assert stale_stages(before, after) == {
         "table2@ci",
         "report@ci",
-    }  # Stage table2 depends on the captions of all tables.
+    }
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci"}

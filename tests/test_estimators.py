@@ -198,9 +198,8 @@ def test_universal_regressor_follows_the_conventions_of_scikit_learn(pressed, tm
     assert regressor.noload_uT is noload_uT
     assert list(regressor.feature_names_in_) == list(frame)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
-    np.testing.assert_array_equal(
-        regressor.fit(frame, y).predict(frame), first
-    )  # a second fit does not use the first one
+    # A second fit does not use the first one.
+    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)
     np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
     assert metrics.score(y, first)["accuracy_pct"] > 90  # the presses are those of the labels
     regressor.model_.save(tmp_path / "skin.safetensors")

@@ -322,13 +322,14 @@ def test_each_source_has_either_recordings_and_a_known_scene_or_a_note(name):
 def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, tmp_path):
     folder = {"eflesh_forces": "eflesh"}.get(name, name)
     fetching.download(SOURCES[name], str(shared_data / folder), tmp_path / name)
+    # The numbers of rows that data/README.md states.
     counts = {
         "lab": 7150,
         "ini": 23300,
         "eflesh": 4805,
         "eflash7": 268,
         "leaphand": 301,
-    }  # numbers of rows, as in data/README.md
+    }
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7, "leaphand": leaphand}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)

@@ -142,7 +142,7 @@ def test_folder_is_read_without_git(tmp_path, home, scratch, monkeypatch):
         ("data/raw/a.csv", "data/raw/a.csv"),
         ("raw/a.csv", "data/raw/a.csv"),
         ("home/data/old/a.csv", "data/old/a.csv"),
-        ("elsewhere/a.csv", "data/old/a.csv"),  # two paths match equally well: the first one is found
+        ("elsewhere/a.csv", "data/old/a.csv"),  # two paths match equally well, so the first one is found
         ("raw/ba.csv", None),
         ("raw", None),
     ],

@@ -162,9 +162,8 @@ def test_training_run_used_by_two_stages_is_counted_once(tmp_path):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert (
-        total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0
-    )  # The second stage only reuses the training run, so it adds its 3 s.
+    # The second stage only reuses the training run, so it adds its 3 s.
+    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0
 
 
 def test_costs_of_a_killed_run_are_dropped(tmp_path):

@@ -129,9 +129,8 @@ def test_remaining_time_is_within_a_factor_of_two_on_other_machines(checkout, st
     start(ORDER[0], 0.0)
     start(ORDER[1], 1.5 * slower)
     sentence = start(ORDER[2], 31.5 * slower)
-    assert sentence.startswith(
-        "progress: 31 % after "
-    )  # The stages that have ended account for 31.5 of the expected 103 s.
+    # The stages that have ended account for 31.5 of the expected 103 s.
+    assert sentence.startswith("progress: 31 % after ")
     assert 0.5 < minutes_left(sentence) / (71.5 * slower / 60) < 2
 
 

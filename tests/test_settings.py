@@ -122,7 +122,7 @@ def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
     files = {path: read_param_file(fs, path) for path, fs in file_systems.items()}
     values: dict[str, list[Any]] = {stage.name: [] for stage in stages}
     for name, dep in dependencies:
-        # as in `read_param_file` of DVC: without keys, a stage depends on the whole file
+        # As in `read_param_file` of DVC, a stage that lists no keys of a file depends on the whole file.
         content = files[dep.fs_path]
         values[name].append([dpath.get(content, key, separator=".") for key in dep.params] if dep.params else content)
     return {name: repr(of_stage) for name, of_stage in values.items()}

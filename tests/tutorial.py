@@ -39,7 +39,9 @@ STEP = re.compile(
     re.DOTALL,
 )
 LONG_S = 1800.0
-HTTP_PORT = "8765"  # port on the page; the test uses a free one, because several tests may run at the same time
+HTTP_PORT = (
+    "8765"  # the port on the page; the tests use a free port instead, because several tests may run at the same time
+)
 # Two numbers are equal if they differ by at most TOLERANCE plus TOLERANCE_PCT % of the number on the page. Outputs
 # depend on times of arrival: a recording may begin at another frame, and the number of frames of a press varies by one.
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
@@ -199,7 +201,7 @@ def differences(done: Done) -> list[str]:
 def _without_optional(text: str) -> str:
     for pattern in OPTIONAL:
         text = pattern.sub("", text)
-    return re.sub(r" +", " ", re.sub(r"-{2,}", "--", text))  # tables are as wide as their numbers
+    return re.sub(r" +", " ", re.sub(r"-{2,}", "--", text))  # the widths of tables depend on their numbers
 
 
 def write(text: str, done: Sequence[Done]) -> str:

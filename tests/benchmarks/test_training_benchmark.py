@@ -223,9 +223,8 @@ def test_time_to_train_all_folds_compared_with_plain_loops_and_sgemm(tmp_path: P
         columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
         with make_executor(imports="reskin.models.train") as executor:
             start_s = seconds(lambda: start_workers(executor))
-            beside = [
-                executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)
-            ]  # each product takes a quarter of a second
+            # Each product takes a quarter of a second.
+            beside = [executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)]
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):

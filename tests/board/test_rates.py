@@ -43,9 +43,8 @@ def test_frame_rate_of_the_emulator_is_measured(wire, rate_hz):
     board = recognise_at_due_times(script)
     rate = board.rate
     assert rate.arrived_hz == pytest.approx(rate_hz, rel=1e-6)
-    assert rate.sent_hz == pytest.approx(
-        rate_hz, rel=1e-3
-    )  # The board sends the time of its clock in single precision.
+    # The board sends the time of its clock in single precision.
+    assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)
     assert rate.method == ("clock" if wire == "binary-clock" else "arrivals")
     assert board.frame_bytes_n == np.mean([len(piece) for piece in script.pieces])
     assert (rate.repeated_frames, rate.repeated_readings) == (0, 0)
