@@ -131,10 +131,10 @@ def show(found: Mapping[str, Any]) -> None:
     rows = [
         {
             "setting": name,
-            "values equal": run["equal_n"],
-            "of": run["values_n"],
+            "equal values": run["equal_n"],
+            "compared values": run["values_n"],
             "largest relative difference": f"{100 * run.get('largest_relative', 0.0):.3g} %",
-            "of which": run.get("of", "–"),
+            "value with this difference": run.get("of", "–"),
         }
         for name, run in found["runs"].items()
     ]
