@@ -124,11 +124,8 @@ def test_imported_packages_are_declared():
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
     required = {re.split(r"[\[<>=]", line)[0] for line in lines}
-    of_ros = {
-        "rclpy",
-        "std_srvs",
-        *(name for name in imported if name.endswith("_msgs")),
-    }  # packages of ROS 2, which pip cannot install
+    # These are packages of ROS 2, which pip cannot install.
+    of_ros = {"rclpy", "std_srvs", *(name for name in imported if name.endswith("_msgs"))}
     assert {known.get(name, name) for name in imported - of_ros} <= required
 
 

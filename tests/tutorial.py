@@ -39,9 +39,8 @@ STEP = re.compile(
     re.DOTALL,
 )
 LONG_S = 1800.0
-HTTP_PORT = (
-    "8765"  # the port on the page; the tests use a free port instead, because several tests may run at the same time
-)
+# The port on the page. The tests use a free port instead, because several tests may run at the same time.
+HTTP_PORT = "8765"
 # Two numbers are equal if they differ by at most TOLERANCE plus TOLERANCE_PCT % of the number on the page. Outputs
 # depend on times of arrival: a recording may begin at another frame, and the number of frames of a press varies by one.
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1

@@ -22,7 +22,7 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
 GROWTH_MIN = 1.25  # cost ratio of two successive counts above which growth is distinguished from timing noise
-# For each stage, the work that explains its exponent (column `reason`). A stage that is missing here raises a KeyError.
+# For each stage, the work that explains its exponent (column `reason`). Every stage must be listed here.
 CAUSES = {
     "ingest_simulated": "captures are converted to Parquet files one after another, independently of each other",
     "describe": "skins are described one after another; medians over skins sort their values",
