@@ -36,7 +36,7 @@ CAUSES = {
     "add one": "DVC parses the .dvc file of every capture; the registry and the plan are rewritten",
     "ingest and split all": "one stage reads the captures one after another; DVC hashes and stores files",
     "nothing to do": "DVC parses the .dvc file of every capture and checks its files",
-    "ingest one more, split": "like `nothing to do`; in addition, DVC hashes and stores the readings again, and split reads them",
+    "ingest one more, split": "like `nothing to do`; DVC also hashes and stores all readings, and split reads them",
 }
 Points = list[tuple[int, float]]
 
