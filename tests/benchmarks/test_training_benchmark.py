@@ -260,7 +260,7 @@ def test_time_to_train_all_folds_compared_with_plain_loops_and_sgemm(tmp_path: P
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
-def test_cpu_time_of_each_part_of_a_training_step(triplet_weight: float) -> None:
+def test_cpu_time_of_all_parts_of_a_training_step(triplet_weight: float) -> None:
     rows = make_rows()
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
     train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # the first call imports PyTorch

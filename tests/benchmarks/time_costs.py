@@ -138,8 +138,8 @@ def compare_heaviest(scene: str, rows: list[dict[str, Any]], rates: Mapping[str,
         if limits is None:
             found.append({"stage": row["stage"], "computed, s": short(took_s)})
             continue
-        named = {f"{name} alone, s": short(seconds) for name, seconds in limits.items()}
-        ratio = {"computed / the longest of them": f"{took_s / max(limits.values()):.2f}"}
+        named = {f"lower bound ({name}), s": short(seconds) for name, seconds in limits.items()}
+        ratio = {"computed / largest lower bound": f"{took_s / max(limits.values()):.2f}"}
         found.append({"stage": row["stage"], "computed, s": short(took_s)} | named | ratio)
     return found
 
@@ -151,7 +151,7 @@ def main() -> None:
     MEASURED.mkdir(exist_ok=True)
     (MEASURED / "rates.json").write_text(json.dumps({"machine": machine(), **rates}, indent=1) + "\n")
     parts = [
-        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of matrix products (float32) and "
+        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of matrix products (single precision) and "
         f"{rates['memory_bytes_per_s'] / 1e9:.1f} GB copied per CPU second of one thread; "
         f"{rates['disk_bytes_per_s'] / 1e6:.0f} MB written to disk per second."
     ]
