@@ -194,7 +194,16 @@ def message_of(output: Sequence[str] | str) -> str:
 
 
 ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # the table shortens these paths of this machine
-TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", "the next run", "s", "verdict")
+TITLES = (
+    "fault",
+    "how it is injected",
+    "what the user sees",
+    "exit status",
+    "lost work",
+    "the next run",
+    "s",
+    "verdict",
+)
 
 
 @dataclass
