@@ -83,7 +83,7 @@ def by_ridge(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray,
 
 
 def by_mean(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
-    """Predict the mean of the labels for all presses; any useful estimate must be better."""
+    """Predict the mean of the labels for all presses. A useful method must have smaller errors than this."""
     target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].mean(axis=0)
     return np.tile(target, (len(tested.db_uT), 1))
 
@@ -177,7 +177,10 @@ def model() -> Universal:
 
 @pytest.mark.parametrize("name", ["reskin", "anyskin", "eflesh"])
 def test_accuracy_on_simulated_skins_of_a_layout(name: str) -> None:
-    """Score the model on simulated skins of its layout, with errors of the law as in training."""
+    """Score the model on simulated skins of its layout.
+
+    Their fields differ from those of the simulated law by random errors, as in training.
+    """
     model = model_for(name)
     inputs = read_inputs(layout=model.layout)
     skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", law_error())

@@ -1,9 +1,10 @@
 """Accuracy on a later day on which the skin slides on its base in another way, with presses of both days.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_days_benchmark.py` prints the tables of docs/learning.md. All
-skins are simulated: parameters and errors of the law are drawn as in training, with other seeds. On the later day,
-either nothing has changed, or the parameters of the slide are drawn again from the prior, or these parameters and the
-errors of the law are drawn again. No recorded press is used.
+skins are simulated. Their parameters and the errors of the law (differences between the fields of a skin and those that
+the simulated law predicts) are drawn as in training, with other seeds. On the later day, either nothing has changed, or
+the parameters of the slide are drawn again from the prior, or these parameters and the errors of the law are drawn
+again. Except in the last test, no recorded press is used.
 """
 
 from collections.abc import Callable, Iterator

@@ -1,8 +1,9 @@
 """Choose the default force estimator, and the power of the map's probabilities of forces, on simulated skins.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_force_benchmark.py`, which takes four minutes. On each skin,
-the shipped model is calibrated to 65 presses at unknown places and to labels; 25 other presses are tested. Errors of
-the law are as in training, or twice as large. No recorded press is used.
+the shipped model is calibrated to 65 presses at unknown places and to labels; 25 other presses are tested. The fields
+of the skins differ from those of the simulated law by errors as in training, or by errors that are twice as large. No
+recorded press is used.
 """
 
 from statistics import median

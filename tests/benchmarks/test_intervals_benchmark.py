@@ -3,11 +3,11 @@
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_intervals_benchmark.py`, which takes three minutes of
 processor time. The law error is the difference between a skin's fields and the fields of the simulated law. The network
 (variant `nominal`, settings of scene lab) is trained on simulated skins alone. For each kind of law error, the
-benchmark prints the misfit of the unlabelled presses. For each number of labels, it prints four numbers for the map,
-then for map and network combined: the coverage at the assumed likelihood power, the coverage at the calibrated power,
-in brackets the half width of the interval at the calibrated power, and the accuracy. The last number is the standard
-deviation over skins of the coverage of map and network at the calibrated power. The test asserts that larger law errors
-widen the intervals.
+benchmark prints the misfit of the unlabelled presses. For each number of labels, it prints four numbers for the map
+alone, and then for map and network combined: the coverage at the assumed likelihood power, the coverage at the
+calibrated power, the half width of the interval at the calibrated power (in brackets), and the accuracy. The last
+number of a line is the standard deviation, over skins, of the coverage of map and network at the calibrated power. The
+test asserts that larger law errors widen the intervals.
 """
 
 import numpy as np

@@ -1,8 +1,9 @@
 """Place error after labelling presses at places chosen by the map's uncertainty, at fixed places, or at random.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, which takes one minute. The skins
-are simulated, with parameters around those of the nominal skin and law errors as in training; the shipped model was not
-trained on them. On each skin, 65 presses on the grid are candidates for labels, and another 65 are test presses.
+are simulated, with parameters around those of the nominal skin. As in training, their fields differ from those of the
+simulated law by random errors. The shipped model was not trained on these skins. On each skin, 65 presses on the grid
+are candidates for labels, and another 65 are test presses.
 """
 
 from collections.abc import Callable

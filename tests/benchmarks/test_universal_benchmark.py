@@ -1,8 +1,8 @@
 """Error of the universal model against its cost, for different lattices, numbers of training skins and steps.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints the table of docs/learning.md.
-The test skins were not used in training; they have law errors as in training and 65 presses each. All times are
-processor time of one thread.
+The test skins were not used in training, and have 65 presses each. As in training, their fields differ from those of
+the simulated law by random errors. All times are processor time of one thread.
 """
 
 import os
