@@ -16,7 +16,7 @@ REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
 
 
 def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
-    """Return readings of two chips; the second chip is a quarter as sensitive as the first."""
+    """Return readings of two chips. The field changes of the second chip are a quarter of those of the first."""
     rng, readings_n = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
     forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
     shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)

@@ -201,7 +201,7 @@ def test_universal_regressor_follows_the_conventions_of_scikit_learn(pressed, tm
     # A second fit does not use the first one.
     np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)
     np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
-    assert metrics.score(y, first)["accuracy_pct"] > 90  # the presses are those of the labels
+    assert metrics.score(y, first)["accuracy_pct"] > 90  # the tested presses are the labelled ones
     regressor.model_.save(tmp_path / "skin.safetensors")
     saved = reskin.load_universal(tmp_path / "skin.safetensors")
     # The tolerance allows for rounding of X + noload_uT.

@@ -30,7 +30,7 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
 
 
 def add_and_commit(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
-    """Change the files in git as `reskin add` and `dvc repro` do, and commit them."""
+    """Change the files in git in the same way as `reskin add` and `dvc repro`, and commit them."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
     plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())

@@ -51,7 +51,7 @@ class RecordingMapping(Mapping[str, Any]):
 
 
 def declared_sections(stage: str) -> tuple[set[str], set[str]]:
-    """Return the sections that dvc.yaml lists for a stage: those of the scene and those of params.yaml."""
+    """Return the sections of the scene and the sections of params.yaml that dvc.yaml lists for a stage."""
     scene_sections: set[str] = set()
     shared: set[str] = set()
     for entry in FLOW[stage]["do"].get("params", []):

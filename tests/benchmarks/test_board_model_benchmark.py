@@ -285,7 +285,7 @@ def test_errors_on_recorded_boards_with_one_chip_omitted(omitted: int | None) ->
     for board in ("board1", "board2"):
         parts = [read(file, "lab", {})[0] for file in sorted(folder.glob(f"{board}_depth*.csv"))]
         recorded = pool_captures(parts)
-        # the y axis of the labels is opposite to that of the board
+        # The y axis of the labels and the y axis of the board point in opposite directions.
         place_mm = recorded.place_mm * (1, -1) + (0, 2 * layout.centre_mm[1])
         channels = (len(place_mm), 3 * len(kept))
         all_presses = Presses(

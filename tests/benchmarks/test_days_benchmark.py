@@ -35,7 +35,8 @@ CHOICE_SEED, SEED = 1, 2
 CHOICE_SKINS_N, SKINS_N, COVERAGE_SKINS_N = 24, size(96, 1), 24
 PRESSES_N, LABELS_N = size((0, 5, 12, 65), (5,)), size((0, 10, 40), (10,))
 CHOICE_PRESSES_N, RECORDED_PRESSES_N = (1, 3, 12), (0, 5, 12)
-# Pairs of correlations between the two days that are tried: that of the slide, and that of the law's errors.
+# These pairs of correlations between the two days are tried. The first value is the correlation of the slide, and the
+# second value is the correlation of the law's errors.
 CORRELATIONS = (0.0, 0.0), (0.0, 0.5), (0.0, 0.7), (0.0, 0.85), (0.0, 1.0), (0.5, 0.7)
 LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
 WAYS = TOGETHER, ALONE, BY_DAY = "all presses together", "new presses alone", "by day"

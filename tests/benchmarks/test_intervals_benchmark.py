@@ -41,7 +41,10 @@ SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
 def law_error(size: float, length_mm: tuple[float, float] = batches.ERROR_MM) -> LawError:
-    """Return a law error like that of training, of rms size `size` |dB|; its length scale is drawn from `length_mm`."""
+    """Return a function that adds law errors as in training to the fields of skins.
+
+    The rms of the errors is `size` |dB|, and their length scale is drawn from `length_mm`.
+    """
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
@@ -58,7 +61,7 @@ def mix_chips(skins: Population, rng: np.random.Generator) -> np.ndarray:
 
 
 def add_memory(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Subtract from each press 15 % of the field change of another press on the same skin, chosen at random."""
+    """Subtract from each press 15 % of the field change of another, random press on the same skin."""
     order = [rng.permutation(skins.db_uT.shape[1]) for _ in range(len(skins))]
     return np.stack([db_uT - 0.15 * db_uT[one] for db_uT, one in zip(skins.db_uT, order, strict=True)])
 

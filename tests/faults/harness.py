@@ -183,7 +183,7 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 
 
 def message_of(output: Sequence[str] | str) -> str:
-    """Return the error message in a command's output: that of the stage if there is one, else that of DVC."""
+    """Return the error message in a command's output: the message of the stage if there is one, else that of DVC."""
     lines = output.splitlines() if isinstance(output, str) else list(output)
     # DVC reports its own damaged files with the words "is invalid".
     for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):
