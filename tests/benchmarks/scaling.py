@@ -138,8 +138,8 @@ def explain(
         f"The number of tasks limits the speed-up: stages of `paper` have {counts} tasks and run one after another.",
         f"The remaining work is counted as one process: {rest_s:.0f} s of {rest_s + work_s:.0f} s, which limits the "
         f"speed-up of `paper` to {(rest_s + work_s) / rest_s:.0f}.",
-        f"Dask is no limit: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. One "
-        f"scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
+        f"Dask does not limit the speed-up: with 256 workers, it costs {cost['`paper` in full']:.1f} % of the time of "
+        f"`paper`. One scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
         f"{largest.task_s:.0f} s.",
     ]
     return [f"- {line}" for line in lines]
