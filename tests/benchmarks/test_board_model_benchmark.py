@@ -226,7 +226,8 @@ def test_simulated_field_changes_differ_from_those_of_a_recorded_eflesh_pad() ->
         cosine = cosines(chips_uT, recorded_uT.reshape(db_uT.shape))
         size_uT = np.median(magnitudes_uT(db_uT)), np.median(np.linalg.norm(recorded_uT, axis=1))
         print(
-            f"board turned by {turn_deg} degrees: mean cosine {cosine.mean():.2f}, median |dB| {np.round(size_uT)} uT"
+            f"board turned by {turn_deg} degrees: mean cosine of simulated and recorded dB {cosine.mean():.2f}, "
+            f"median |dB| {np.round(size_uT)} uT"
         )
         assert abs(cosine.mean()) < 0.5  # the law does not describe the pad; otherwise docs/learning.md is out of date
 

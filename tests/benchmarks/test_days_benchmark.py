@@ -42,7 +42,9 @@ LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
 WAYS = TOGETHER, ALONE, BY_DAY = "all presses together", "new presses alone", "by day"
 UNCHANGED, CHANGED, OTHER_ERRORS = "unchanged", "changed", "changed, other errors"
 NORMAL_90 = 1.645
-FULL_ONLY = pytest.mark.skipif(not FULL, reason="at a tiny size, this repeats the other test and tests/universal")
+FULL_ONLY = pytest.mark.skipif(
+    not FULL, reason="at the tiny size, this test would only repeat the other test and tests/universal"
+)
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,9 @@ def test_accuracy_on_a_later_day():
                 scores.setdefault((change, labels_n, n), []).append((together, alone, by_day))
     for change, of_skins in cosines.items():
         print(f"cosine of equal presses, slide {change}: 5, 50, 95 % quantiles {np.percentile(of_skins, [5, 50, 95])}")
-    print(f"| slide | labels | new presses | {TOGETHER} | {ALONE} | {BY_DAY} | {BY_DAY} minus the better one |")
+    print(
+        f"| slide | labels | new presses | {TOGETHER} | {ALONE} | {BY_DAY} | {BY_DAY} minus the better of the others |"
+    )
     print("|---|---|---|---|---|---|---|")
     for change, labels_n, n in sorted(scores, key=lambda row: (list(cosines).index(row[0]), *row[1:])):
         of_ways = np.array(scores[change, labels_n, n])

@@ -49,7 +49,9 @@ def test_default_force_estimator_and_power_have_the_highest_mean_score(monkeypat
                         scores.setdefault((scale, n, power, estimator), []).append(score)
     print()
     for (scale, n, power, estimator), of_skins in sorted(scores.items()):
-        print(f"errors x {scale:g}, {n} labels, power {power:g}, {estimator}: median R2 of F {median(of_skins):.3f}")
+        print(
+            f"law errors x {scale:g}, {n} labels, power {power:g}, {estimator}: median R2 of F {median(of_skins):.3f}"
+        )
     means = {
         (power, estimator): np.mean([
             median(of_skins) for (_, _, own, name), of_skins in scores.items() if (own, name) == (power, estimator)
@@ -57,7 +59,7 @@ def test_default_force_estimator_and_power_have_the_highest_mean_score(monkeypat
         for power in POWERS for estimator in ESTIMATORS
     }  # fmt: skip
     for (power, estimator), mean in means.items():
-        print(f"mean over rows: power {power:g}, {estimator}: {mean:.3f}")
+        print(f"mean over the rows above: power {power:g}, {estimator}: {mean:.3f}")
     assert np.isfinite([*means.values()]).all()
     if FULL:
         assert max(means, key=means.__getitem__) == (FORCE_POWER, DEFAULT)

@@ -69,7 +69,7 @@ def test_latency_from_last_byte_to_estimate(tmp_path, boards):
             page.wait()
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
+@pytest.mark.skipif(BROWSER is None, reason="no browser was found: see tests/live/test_browser.py")
 @for_all_boards
 def test_latency_from_last_byte_to_screen(tmp_path, boards):
     async def act(tab: Tab) -> None:

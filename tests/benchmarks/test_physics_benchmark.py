@@ -102,7 +102,7 @@ def test_field_change_of_all_nodes_equals_that_of_magpylib() -> None:
     }
     truth_T = calls["compiled"][0]()
     times_ms = {name: best_ms(call, repeats_n) for name, (call, repeats_n) in calls.items()}
-    print(f"\nfield before and after, {len(rest[0])} nodes that all move x {len(BOARD.chips_m)} chips")
+    print(f"\nfield before and after, {len(rest[0])} moving nodes x {len(BOARD.chips_m)} chips")
     for name, (call, _) in calls.items():
         print(f"  {name:16} {times_ms[name]:8.2f} ms {times_ms[name] / times_ms['compiled']:8.1f} x")
         # The reference fields lose digits in the difference of two sums, and magpylib uses mu_0 of another CODATA year.
