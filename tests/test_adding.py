@@ -88,7 +88,7 @@ def assert_refused(root: Path, attempt, message: str) -> None:
     assert contents(root) == before
 
 
-def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
+def test_added_recording_is_tracked_by_dvc_and_is_in_the_registry_and_the_plan(root, lab_file):
     header = add_lab(root, lab_file)
     assert header.capture == "board1_skin1_readings"
     assert (root / "data/raw/small/board1_skin1_readings.dvc").exists()
@@ -125,8 +125,12 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
     assert str(found or "") in stderr
 
 
-def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypatch, capsys):
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was called"))
+def test_recording_is_not_compared_with_the_skin_if_the_scene_has_no_section_compare(
+    root, lab_file, monkeypatch, capsys
+):
+    monkeypatch.setattr(
+        "pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("find_departure must not be called")
+    )
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
 
@@ -154,7 +158,7 @@ def test_recording_with_exchanged_coordinates_is_added_with_a_warning(root, tmp_
         assert ("other captures only with x and y swapped" in capsys.readouterr().err) == swapped
 
 
-def test_recording_that_was_added_before_is_refused_unless_allowed(root, lab_file):
+def test_recording_that_was_added_before_is_refused_unless_copies_are_allowed(root, lab_file):
     add_lab(root, lab_file)
     assert_refused(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
     assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
@@ -164,13 +168,13 @@ def test_recording_that_was_added_before_is_refused_unless_allowed(root, lab_fil
     assert len(plan.check(root).stages["ingest"]) == 2
 
 
-def test_copy_of_a_recording_with_other_formatting_is_recognised(root, lab_file, tmp_path):
+def test_copy_of_a_recording_is_recognised_although_its_numbers_are_formatted_differently(root, lab_file, tmp_path):
     add_lab(root, lab_file)
     (tmp_path / "copy.csv").write_text(lab_file.read_text().replace("21.5,", "21.50,"))
     assert_refused(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
 
 
-def test_failed_removal_changes_nothing(root, lab_file):
+def test_failed_removal_changes_no_files(root, lab_file):
     add_lab(root, lab_file)
     file = root / PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
@@ -218,7 +222,7 @@ def test_marks_are_added_to_the_clock(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"x", bytes(range(256)) * 40, b"indent,phase\n0,contact\n", b"\x00" * 4096, "µ".encode() * 9]
 )
-def test_broken_recording_leaves_no_files(root, tmp_path, content):
+def test_adding_a_broken_recording_raises_and_leaves_no_files(root, tmp_path, content):
     (tmp_path / "broken.csv").write_bytes(content)
     assert_refused(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
 
@@ -230,7 +234,7 @@ def test_missing_recording_is_an_error(root, tmp_path):
     assert_refused(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
 
 
-def test_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
+def test_error_for_a_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     cases = {
         lab_file: ("ini", "lab"),
@@ -270,7 +274,7 @@ def test_unknown_scene_is_an_error(root, lab_file):
     )
 
 
-def test_recording_cannot_join_a_simulated_scene(root, lab_file):
+def test_recording_cannot_be_added_to_a_simulated_scene(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
     assert_refused(
         root,
@@ -303,13 +307,13 @@ def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary"), source
     return folder
 
 
-def test_recording_cannot_join_a_scene_that_simulates_its_captures(root, tmp_path):
+def test_simulated_capture_cannot_be_added_to_a_scene_that_simulates_its_own_captures(root, tmp_path):
     folder = native_folder(tmp_path / "run1", source="simulated")
     prepared = preparing.native(folder, labels(), None, ())
     assert_refused(root, lambda: add.add(root, "ci", prepared, allow_copy=False), "ci simulates its own captures")
 
 
-def test_recording_of_an_emulated_board_joins_a_scene_for_such_boards(root, tmp_path):
+def test_recording_of_an_emulated_board_can_be_added_to_a_scene_for_emulated_boards(root, tmp_path):
     folder = native_folder(tmp_path / "run1", source="simulated")
     creating.new(root, "emulated", ["board1", "b2"], 4, 1, "reskin", "simulated")
     prepared = preparing.native(folder, labels(), None, ())
@@ -328,7 +332,7 @@ def test_native_capture_keeps_its_header(root, tmp_path):
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
 
 
-def test_native_capture_with_other_label_or_bytes_is_an_error(root, tmp_path):
+def test_native_capture_is_an_error_if_its_labels_or_bytes_contradict_its_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
     assert_refused(
         root,
@@ -360,7 +364,7 @@ def test_dump_without_frames_is_an_error(root, tmp_path, damage, message):
     )
 
 
-def test_dump_of_another_number_of_chips_suggests_the_right_one(root, tmp_path):
+def test_error_for_a_wrong_number_of_chips_suggests_the_right_one(root, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
     what = Dump("binary", 5, 400.0, tmp_path / "probe.csv", ())
@@ -384,7 +388,7 @@ def test_capture_with_many_lost_bytes_is_an_error(root, tmp_path):
     )
 
 
-def test_command_prints_a_one_line_error(root_with_code, tmp_path):
+def test_reskin_add_prints_an_error_of_one_line(root_with_code, tmp_path):
     (tmp_path / "broken.csv").write_bytes(b"")
     arguments = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root_with_code, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
@@ -412,7 +416,7 @@ def run_and_raise(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_command_prints_that_the_scene_was_added_to_the_plan(root_with_code, lab_file, monkeypatch):
+def test_reskin_add_prints_that_it_has_added_the_scene_to_the_plan(root_with_code, lab_file, monkeypatch):
     monkeypatch.chdir(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root_with_code, "reskin", *arguments)
@@ -428,7 +432,7 @@ def test_command_prints_that_the_scene_was_added_to_the_plan(root_with_code, lab
     assert "switched" not in again
 
 
-def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root_with_code, lab_file, monkeypatch):
+def test_option_like_copies_a_scene_and_leaves_no_copy_if_adding_fails(root_with_code, lab_file, monkeypatch):
     monkeypatch.chdir(root_with_code)
     before = contents(root_with_code)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
@@ -446,14 +450,14 @@ def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root_with_code, l
     assert (root_with_code / SCENES / "mine.yaml").read_text() == text
 
 
-def test_recording_without_contact_needs_an_experiment_that_reads_it(root, tmp_path):
+def test_recording_without_contact_is_an_error_if_no_experiment_of_the_scene_uses_it(root, tmp_path):
     write_leaphand(tmp_path, numbers(30))
     prepared = preparing.foreign(tmp_path / leaphand.READINGS, "leaphand", labels(), {"pad": "1"})
     message = "nothing touches the skin in this recording, and no experiment of scene small uses such recordings"
     assert_refused(root, lambda: add.add(root, "small", prepared, allow_copy=False), message)
 
 
-def test_scene_with_too_little_data_is_an_error(root_with_code, lab_file):
+def test_stage_split_fails_without_traceback_if_the_scene_has_only_one_board(root_with_code, lab_file):
     add_lab(root_with_code, lab_file)
     done = run(root_with_code, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0
@@ -461,7 +465,7 @@ def test_scene_with_too_little_data_is_an_error(root_with_code, lab_file):
     assert "Traceback" not in done.stderr + done.stdout
 
 
-def test_new_scene_for_a_layout_holds_out_each_of_its_boards(root, tmp_path, monkeypatch):
+def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(root, tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     created = output_of(["new", "mine", "--boards", "b1,b2,b3", "--presses", "60", "--passes", "2"])
     assert "experiment calibrated is left out" in created
@@ -503,7 +507,7 @@ def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path
         assert (warned in output, "fill in column pass" in output) == (not stated, not stated)
 
 
-def test_several_recordings_are_named_by_their_files(root, tmp_path, monkeypatch):
+def test_board_and_skin_of_several_recordings_are_taken_from_the_names_of_their_files(root, tmp_path, monkeypatch):
     monkeypatch.chdir(root)
     output_of(["new", "mine", "--boards", "b1,b2", "--presses", "12"])
     for i, name in enumerate(("b1_s1", "b2_s1_more", "b3_s1")):

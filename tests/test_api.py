@@ -39,7 +39,7 @@ def test_importing_reskin_imports_no_slow_packages():
     assert done.stdout.strip() == "[]"
 
 
-def test_estimators_need_scikit_learn_but_the_library_does_not(monkeypatch):
+def test_only_the_estimators_need_scikit_learn(monkeypatch):
     assert {"ContactRegressor", "UniversalRegressor", "SCORERS"} < set(dir(reskin))
     monkeypatch.setattr("reskin.find_spec", lambda name: None)
     with pytest.raises(
@@ -50,7 +50,7 @@ def test_estimators_need_scikit_learn_but_the_library_does_not(monkeypatch):
     assert all(hasattr(reskin, name) for name in reskin.__all__)
 
 
-def test_load_rows_equals_the_pipeline(tmp_path):
+def test_load_rows_returns_the_rows_that_the_pipeline_uses(tmp_path):
     files = [tmp_path / f"data/indentations/small/c{i}.parquet" for i in range(2)]
     for file in files:
         io.write_readings(file, [readings()], {})
@@ -60,7 +60,7 @@ def test_load_rows_equals_the_pipeline(tmp_path):
         np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
 
 
-def test_simulate_pokes_equals_a_simulated_capture_without_noise():
+def test_simulate_pokes_returns_the_fields_of_a_simulated_capture_without_noise():
     simulate = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]
     simulate["protocols"] = {"grid": simulate["protocols"]["grid"] | {"passes_n": 1, "depths_mm": [1.0], "terms": []}}
     exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
@@ -85,7 +85,7 @@ def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)
 
 
-def test_designs_accept_plain_values_and_refuse_wrong_ones():
+def test_functions_that_draw_skins_and_boards_accept_plain_values_and_refuse_wrong_ones():
     spreads = {"chip_offset_uT": 0.0}
     board = reskin.draw_board(chips_xy_mm=[[0, 0], [7, 0]], chips_turn_deg=[0, 90], spreads=spreads)
     assert board.chips_m.shape == (2, 3)
@@ -131,7 +131,7 @@ def test_open_accepts_loaded_models(model):  # noqa: F811
         reskin.open("/dev/none", model=None)
 
 
-def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
+def test_loaded_model_returns_the_predictions_of_its_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 
     loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())
@@ -146,7 +146,7 @@ def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
         loaded.predict([1.0, 2.0])
 
 
-def test_simulated_recording_is_loaded_like_a_recorded_one(tmp_path):
+def test_simulated_recording_is_loaded_in_the_same_way_as_a_recorded_one(tmp_path):
     folder = reskin.simulate_recording(tmp_path / "run1", board="b1", skin="b1_s0", depths_mm=[1.0])
     frame = reskin.load_recording(folder)
     assert [frame[name].unique().tolist() for name in ("capture", "board", "skin", "source")] == [

@@ -31,7 +31,7 @@ PUBLISHED = {
 ABOUT = About(method="mine", by="A. Name", trained_on="labels", code="none")
 
 
-def test_published_versions_never_change():
+def test_files_of_published_versions_have_not_changed():
     found = {f"v{version}/{file.name}" for version in (1,) for file in (folds.FOLDER / f"v{version}").iterdir()}
     assert found == set(PUBLISHED)
     assert {name: io.sha256(folds.FOLDER / name) for name in PUBLISHED} == PUBLISHED
@@ -58,7 +58,7 @@ def lab(shared_data) -> Dataset:
     return read_dataset("lab", recordings(shared_data, "lab"))
 
 
-def test_folds_of_lab_recordings_are_those_that_the_code_draws(lab):
+def test_published_folds_of_lab_recordings_equal_those_that_the_code_draws(lab):
     drawn = draw.draw_lab(list(lab.folds.recordings), lab.presses)
     content = json.loads((folds.FOLDER / "v1/lab.json").read_text())
     assert {name: content[name] for name in drawn} == json.loads(json.dumps(drawn))
@@ -80,7 +80,7 @@ def test_tested_presses_of_lab_recordings_are_far_from_labels(lab):
     assert lab.presses["board1"].recording.tolist() == [0] * 65 + [1] * 65 + [2] * 65
 
 
-def test_method_gets_only_the_data_that_it_may_use():
+def test_task_contains_only_the_data_that_a_method_may_use():
     data = read_dataset("simulated")
     one = data.folds.draws[0]
     task = data.task(one, 10)
@@ -107,7 +107,7 @@ def test_recording_that_was_changed_is_refused(shared_data, tmp_path):
         benchmark.tasks("lab", tmp_path)
 
 
-def test_example_of_the_page_makes_a_complete_file(tmp_path, monkeypatch):
+def test_example_of_the_page_writes_a_complete_file_of_predictions(tmp_path, monkeypatch):
     page = (folds.ROOT / "docs/benchmark.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     exec(page.split("```python\n")[1].split("```")[0].replace('"lab"', '"simulated"'), {})
@@ -117,11 +117,12 @@ def test_example_of_the_page_makes_a_complete_file(tmp_path, monkeypatch):
     assert errors_mm2[1] < errors_mm2[0]
 
 
-# --- A tiny dataset: boards a and b have four presses each (two are tested); board c is for training ---
+# --- Tests with a tiny dataset: boards a and b have four presses each, of which two are tested; board c is for training
 
 TRUE = {"x_mm": [0.0, 4.0, 8.0, 16.0], "y_mm": [0.0, 4.0, 8.0, 16.0], "F_N": [1.0, 3.0, 2.0, 2.0]}
 HEAD = "fold,press,x_mm,y_mm,F_N,x_low_mm,x_high_mm,y_low_mm,y_high_mm,F_sd_N\n"
-# Errors of board a: (0.5, 0.5) and (3, 4) mm, 1 and 0 N; of board b: none. Intervals are 2 mm wide.
+# The predictions of the two presses of board a are wrong by (0.5, 0.5) and (3, 4) mm, and by 1 and 0 N. Those of
+# board b are exact. The intervals are 2 mm wide.
 ROWS = [
     f"t.tiny.{board}.draw0.labels{labels},{press},{x},{y},{F},{x - 1},{x + 1},{y - 1},{y + 1},0"
     for labels in (0, 1)
@@ -208,13 +209,13 @@ def test_reversed_rows_have_the_same_scores(tiny, tmp_path):
     assert scores[0] == scores[1]
 
 
-def test_parquet_has_the_scores_of_csv(tiny, tmp_path):
+def test_predictions_have_the_same_scores_as_parquet_and_as_csv(tiny, tmp_path):
     csv = write_rows(tmp_path, ROWS)
     pd.read_csv(csv).to_parquet(tmp_path / "mine.parquet")
     assert score_file(tmp_path / "mine.parquet", ABOUT).tasks == score_file(csv, ABOUT).tasks
 
 
-def test_all_folds_of_one_label_count_may_be_omitted(tiny, tmp_path):
+def test_predictions_of_all_folds_with_one_number_of_labels_may_be_omitted(tiny, tmp_path):
     entry = score_file(write_rows(tmp_path, ROWS[4:]), ABOUT)
     assert [task.labels_n for task in entry.tasks] == [1]
 
@@ -340,7 +341,7 @@ def test_command_writes_the_scores_and_an_entry(tiny, tmp_path):
         entries.read_entries(tiny)
 
 
-# --- Our own methods ---
+# --- Tests of our own methods
 
 
 def test_method_nearest_label_has_its_committed_scores_on_simulated_boards(tmp_path):

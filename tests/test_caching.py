@@ -66,7 +66,7 @@ def check(root: Path) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_cache_without_damage_has_no_damaged_objects(root):
+def test_check_of_an_undamaged_cache_finds_no_damaged_objects(root):
     # This temporary file was left by DVC when it was killed.
     next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")
     assert check(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
@@ -85,7 +85,7 @@ def test_damaged_object_and_its_copies_in_the_checkout_are_removed(root):
     assert check(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
 
 
-def test_object_is_restored_from_an_undamaged_output(root):
+def test_damaged_object_is_restored_from_an_undamaged_output(root):
     put_in_cache(root, md5(b"folds"), b"f0lds")
     assert f"It was restored from {FOLDS}." in check(root)[1]
     assert cache_file(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
@@ -100,20 +100,20 @@ def test_output_that_the_user_has_edited_is_kept(root):
     assert (root / FOLDS).read_bytes() == b"by hand"
 
 
-def test_folder_is_kept_if_its_list_of_files_is_damaged(root):
+def test_folder_is_kept_if_the_list_of_its_files_is_damaged_in_the_cache(root):
     name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     put_in_cache(root, name, b"[")
     assert f"It was moved to {cache.DAMAGED}/{name}. Run: dvc repro train_multi@one" in check(root)[1]
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 
-def test_recording_is_kept_although_it_is_damaged(root):
+def test_damaged_recording_is_moved_but_not_deleted(root):
     put_in_cache(root, md5(b"recorded"), b"rec0rded")
     (root / RECORDED).write_bytes(b"rec0rded")
     assert f"dvc pull {RECORDED}.dvc, or add the recording again" in check(root)[1]
     assert (root / cache.DAMAGED / md5(b"recorded")).read_bytes() == b"rec0rded"
 
 
-def test_damaged_unused_object_is_moved(root):
+def test_damaged_object_that_no_output_uses_is_moved_out_of_the_cache(root):
     put_in_cache(root, "0" * 32, b"of an older run")
     assert "No output in dvc.lock uses it" in check(root)[1]

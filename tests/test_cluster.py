@@ -87,7 +87,7 @@ def test_sweep_on_two_workers_gives_the_results_of_a_local_sweep(address, tmp_pa
         assert equal_results(a, b)
     assert [i for _, _, i in ran] == list(range(6))
     assert len({process for process, _, _ in ran} - {os.getpid()}) == 2
-    # workers run in this working directory, because paths in stages are relative
+    # Workers run in the working directory of this process, because stages use relative paths.
     assert {folder for _, folder, _ in ran} == {os.getcwd()}
 
 
@@ -112,7 +112,7 @@ def test_error_on_a_worker_is_raised_in_the_client(address, monkeypatch):
         ({"w": {"scipy": "0.1"}}, "scipy of worker w must be .* got 0.1"),
     ],
 )
-def test_workers_with_other_arithmetic_are_an_error(workers, expected):
+def test_workers_that_may_compute_other_results_are_an_error(workers, expected):
     threads = {name: {"nthreads": changed.get("threads", 1)} for name, changed in workers.items()}
     client = SimpleNamespace(
         scheduler_info=lambda n_workers: {"workers": threads},
@@ -122,7 +122,7 @@ def test_workers_with_other_arithmetic_are_an_error(workers, expected):
         _check_workers(client, "tcp://there")
 
 
-def test_lost_scheduler_is_an_error():
+def test_loss_of_the_scheduler_is_an_error():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
     submitted.cancel()  # When Dask loses the scheduler, it cancels all calls.

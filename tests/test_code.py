@@ -51,18 +51,18 @@ def test_changed_code_changes_the_digest(monkeypatch, tmp_path, old, new):
     assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) != digest(monkeypatch, tmp_path, SOURCE)
 
 
-def test_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path):
+def test_digest_of_a_module_includes_the_data_file_of_the_same_name(monkeypatch, tmp_path):
     assert digest(monkeypatch, tmp_path, SOURCE, "a: 1") != digest(monkeypatch, tmp_path, SOURCE, "a: 2")
 
 
 def test_digest_includes_imported_modules_of_the_packages():
     names = code.imported("reskin.models.train")
     assert {"reskin.models.train", "reskin.seeds"} <= set(names)
-    assert {"reskin", "reskin.models"} <= set(names)  # These are packages, whose __init__.py runs first.
+    assert {"reskin", "reskin.models"} <= set(names)  # Importing a module first runs the __init__.py of these packages.
     assert all(name.split(".")[0] in code.PACKAGES for name in names)
 
 
-def test_stages_that_use_an_edited_module_of_the_library_run_again():
+def test_digest_of_a_stage_includes_the_modules_of_the_library_that_it_uses():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 
@@ -70,7 +70,7 @@ DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing"
 
 
 @pytest.mark.parametrize("stage", sorted({*all_stages()} - {"table2", "report", "publish"}))
-def test_computing_stages_import_only_display_modules_of_the_report(stage):
+def test_stages_that_compute_results_import_only_display_modules_of_the_report(stage):
     imported = {name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")}
     assert imported <= DISPLAY
 

@@ -48,7 +48,7 @@ def rows(output: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("against", [[], ["--against", "first"]])
-def test_equal_values_print_one_line(checkout, against):
+def test_one_line_is_printed_if_all_values_are_equal(checkout, against):
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     provenance = io.read_json(checkout / "reports/quick/provenance.json")
     io.write_json(checkout / "reports/quick/provenance.json", provenance | {"device": EPYC, "seconds": 9.0})
@@ -59,7 +59,7 @@ def test_equal_values_print_one_line(checkout, against):
     )
 
 
-def test_difference_lists_machines_and_sizes(checkout):
+def test_differing_values_are_printed_with_the_machines_and_the_sizes_of_differences(checkout):
     write(checkout / "reports/quick", 60.0, device=EPYC)
     code, output = run("quick")
     assert code == 1
@@ -100,7 +100,7 @@ def test_values_of_only_one_run_are_counted_by_section(checkout):
 
 
 @pytest.mark.parametrize("where", ["", "quick", "reports/quick", "quick/numbers.json"])
-def test_folder_or_file_can_replace_the_revision(checkout, where):
+def test_option_against_accepts_a_folder_or_a_file_instead_of_a_revision(checkout, where):
     other = checkout / "other"
     write(other / (where.removesuffix("numbers.json") if where.endswith(".json") else where), 80.0)
     assert run("quick", "--against", str(other if where == "reports/quick" else other / where))[0] == 0
@@ -130,7 +130,7 @@ def test_checkout_outside_git_is_an_error(tmp_path, monkeypatch):
     assert "has no reports/" in output
 
 
-def test_all_scenes_are_compared_without_an_argument(checkout, monkeypatch):
+def test_all_scenes_are_compared_if_no_scene_is_named(checkout, monkeypatch):
     monkeypatch.setattr(plan, "check", lambda root: type("Plan", (), {"scenes": ("lab", "quick")}))
     code, output = run()
     assert code == 2

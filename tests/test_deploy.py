@@ -22,12 +22,12 @@ def test_scripts_are_valid_shell(shell, script):
     subprocess.run([shell, "-n", script], cwd=ROOT, check=True)
 
 
-def test_unknown_command_is_an_error():
+def test_unknown_command_of_the_dask_script_is_an_error():
     finished = subprocess.run([*DASK, "start"], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (finished.returncode, "must be scheduler, worker or run; got 'start'" in finished.stderr) == (2, True)
 
 
-def test_manifest_runs_the_script_with_its_service():
+def test_pods_of_the_manifest_run_the_script_with_the_address_of_the_scheduler():
     commands = [container["command"] for pod in PODS for container in pod["spec"]["containers"]]
     assert [command[:2] for command in commands] == [DASK] * 3
     assert [command[2] for command in commands] == ["scheduler", "worker", "run"]
@@ -37,7 +37,7 @@ def test_manifest_runs_the_script_with_its_service():
     assert service["spec"]["selector"] == PODS[0]["metadata"]["labels"]
 
 
-def test_program_and_children_end_with_the_block(tmp_path):
+def test_program_and_its_child_processes_end_at_the_end_of_the_with_block(tmp_path):
     child = "import subprocess, sys; subprocess.Popen(['sleep', '60']); print('up', flush=True); sys.stdin.read()"
     command = ["sh", "-c", f'echo $$ > group; "{sys.executable}" -c "{child}"; sleep 60']
     with pytest.raises(ZeroDivisionError), running("it", command, tmp_path / "log") as alive:
@@ -52,7 +52,7 @@ def test_program_and_children_end_with_the_block(tmp_path):
             time.sleep(0.05)
 
 
-def test_error_of_a_stopped_server_has_its_last_output(tmp_path):
+def test_error_for_a_stopped_server_contains_its_last_output(tmp_path):
     with running("it", ["sh", "-c", "echo no such folder; exit 3"], tmp_path / "log") as alive:
         with pytest.raises(ServerError, match="it has stopped \\(exit status 3\\).*no such folder"):
             while True:

@@ -16,7 +16,7 @@ REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
 
 
 def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
-    """Return readings of two chips; the second chip is a quarter as sensitive as the first."""
+    """Return readings of two chips. The field changes of the second chip are a quarter of those of the first."""
     rng, readings_n = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
     forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
     shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)
@@ -34,11 +34,12 @@ def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places
     )  # fmt: skip
 
 
-def test_fields_noise_steps_and_forces_are_recovered():
+def test_description_recovers_the_fields_noise_steps_and_forces_of_synthetic_readings():
     found = describe(example_readings())
     assert found["field_at_rest_chip_median_uT"] == pytest.approx((500 + np.hypot(1000, 2500)) / 2)
     assert found["field_at_rest_channel_max_uT"] == 2500
-    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)  # 1600 degrees of freedom: standard error 2 %
+    # The noise has 1600 degrees of freedom, so its standard error is 2 %.
+    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)
     assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
     assert found["step_xy_uT"] == pytest.approx(0.2, rel=1e-3)
     assert found["step_z_uT"] == pytest.approx(0.3227, rel=1e-3)
@@ -48,7 +49,7 @@ def test_fields_noise_steps_and_forces_are_recovered():
     assert found["rate_hz"] == pytest.approx(400.0)
 
 
-def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
+def test_changes_of_a_random_walk_at_rest_grow_with_the_root_of_the_number_of_contacts():
     without_walk = example_readings()
     steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
     drifting = replace(
@@ -57,7 +58,7 @@ def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
     found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
-    # large tolerance, because there are only 4 x 6 changes over this number of contacts
+    # The tolerance is large, because there are only 4 x 6 changes over this number of contacts.
     assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)
     assert "rest_changes_in_1000_uT" not in found
     assert describe(without_walk)["rest_changes_in_100_uT"] == 0
@@ -73,7 +74,7 @@ def test_motion_between_stops_is_not_counted_as_noise():
     assert describe(moved)["noise_z_uT"] == describe(line)["noise_z_uT"]
 
 
-def test_unreached_forces_have_no_change_of_field():
+def test_no_field_change_is_given_for_forces_that_were_not_reached():
     assert {"change_at_0.5_N_uT", "change_at_1_N_uT", "change_at_3_N_uT"}.isdisjoint(describe(example_readings()))
 
 
@@ -85,25 +86,25 @@ def test_field_is_described_without_forces():
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_unlabelled_contacts_are_described_by_fields():
+def test_contacts_of_unknown_place_and_force_are_described_by_their_fields():
     found = describe(example_readings(places=False, known_force=False))
     assert found["field_at_rest_channel_max_uT"] == 2500
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_rows_without_contact_are_described_at_rest():
+def test_rows_without_contact_are_described_only_by_their_fields_at_rest():
     found = describe(example_readings(places=False))
     assert found["field_at_rest_channel_max_uT"] == 2500
     assert {"force_max_N", "noise_z_uT", "weakest_over_strongest_chip"}.isdisjoint(found)
 
 
-def test_captures_of_one_skin_count_once():
+def test_values_of_the_captures_of_one_skin_are_averaged_first():
     summary = over_skins([("s0", {"a": 1.0}), ("s0", {"a": 3.0}), ("s1", {"a": 4.0, "b": 7.0})])
     assert summary["a"] == {"mean": 3.0, "least": 2.0, "most": 4.0, "sd": pytest.approx(np.sqrt(2)), "n": 2}
     assert summary["b"] == {"mean": 7.0, "least": 7.0, "most": 7.0, "n": 1}
 
 
-def test_growth_with_force_uses_all_captures_of_a_skin():
+def test_ratio_of_field_changes_at_two_forces_uses_all_captures_of_a_skin():
     summary = over_skins([("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})])
     assert summary["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
     assert summary["change_at_3_N_over_1_N"]["n"] == 1
@@ -115,12 +116,12 @@ def test_mean_over_skins_is_between_minimum_and_maximum(values):
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 
 
-def test_fields_at_rest_are_dropped():
+def test_without_rest_drops_all_values_at_rest():
     description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
     assert without_rest(description) == {"rate_hz": 9.0}
 
 
-def test_largest_force_of_a_skin_is_that_of_all_its_captures():
+def test_largest_force_of_a_skin_is_the_largest_of_all_its_captures():
     summary = over_skins([("s0", {"force_max_N": 2.0}), ("s0", {"force_max_N": 6.0}), ("s1", {"force_max_N": 3.0})])
     assert summary["force_max_N"]["most"] == 6
     assert summary["force_max_N"]["mean"] == 4.5

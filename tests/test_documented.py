@@ -44,7 +44,7 @@ def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("file", SETTINGS, ids=lambda file: file.stem)
-def test_parameters_are_documented(file):
+def test_parameters_of_all_files_of_settings_are_documented(file):
     assert sorted(set(keys(read_yaml(file))) - code_words("docs/parameters.md")) == []
 
 
@@ -73,7 +73,7 @@ def number_names(settings: Any) -> Iterator[str]:
     yield from settings if isinstance(settings, dict) else ()
 
 
-def test_numbers_are_documented():
+def test_keys_of_numbers_json_are_documented():
     known = code_words("docs/numbers.md")
     patterns = [word for word in known if "*" in word]
     chosen = {

@@ -27,7 +27,7 @@ def _no_digests(monkeypatch):
 
 
 def test_every_stage_depends_on_its_code_digests():
-    # `publish` is the second command of stage report
+    # `publish` is no stage of its own, but the second command of stage report.
     assert {*all_stages(), "code"} - {"publish"} == STAGES.keys()
     assert {name: [dep for dep in STAGES[name]["deps"] if "code/" in dep] for name in OTHERS} == {
         name: [f"data/code/{name}"] for name in OTHERS
@@ -68,7 +68,7 @@ def test_edited_caption_reruns_only_the_report(monkeypatch):
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))
-def test_paths_of_commands_are_declared(name):
+def test_paths_in_commands_are_declared_as_dependencies_outputs_or_params(name):
     stage = STAGES[name]
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
@@ -79,11 +79,11 @@ def test_paths_of_commands_are_declared(name):
     assert unknown == []
 
 
-def test_fewer_than_thirty_stages_besides_experiments():
+def test_there_are_fewer_than_thirty_stages_besides_the_experiments():
     assert len(STAGES.keys() - set(ANALYSES)) < 30
 
 
-def test_ignored_recordings_are_tracked_by_dvc(tmp_path):
+def test_recordings_that_git_ignores_are_tracked_by_dvc(tmp_path):
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     shutil.copy(ROOT / ".gitignore", tmp_path)
     (tmp_path / ".dvc").mkdir()
@@ -93,7 +93,7 @@ def test_ignored_recordings_are_tracked_by_dvc(tmp_path):
     (capture / "readings.csv").write_text("x\n")
     (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
     with Repo(str(tmp_path)) as repo:
-        # tracked, so `dvc push` includes the recording
+        # DVC tracks the recording, so `dvc push` uploads it.
         assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]
     status = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
     assert status == "?? data/raw/lab/one.dvc\n"

@@ -22,9 +22,11 @@ from reskin.seeds import rng_for
 from tests.models.example_jobs import some_rows
 from tests.test_api import ROOT
 
-ROUNDING = "single precision: the rounding of a row depends on the other rows of its block"
+ROUNDING = "in single precision, the rounding of a prediction depends on the other rows of the same call"
 CONTACT_FAILS = dict.fromkeys(["check_methods_sample_order_invariance", "check_methods_subset_invariance"], ROUNDING)
-OTHER_DATA = "fits data with another number of channels than the board, or other targets than x_mm, y_mm and force"
+OTHER_DATA = (
+    "the check fits data with another number of channels than the board has, or other targets than x, y and force"
+)
 UNIVERSAL_FAILS = dict.fromkeys(
     [
         "check_dict_unchanged", "check_dont_overwrite_parameters", "check_dtype_object", "check_estimators_dtypes",
@@ -44,7 +46,7 @@ SHORT = {"steps_n": 4, "batch_n": 16}
 @pytest.mark.parametrize(
     ("estimator", "fails"),
     [(reskin.ContactRegressor(steps_n=15), CONTACT_FAILS), (reskin.UniversalRegressor(np.zeros(15)), UNIVERSAL_FAILS)],
-    ids=["contact", "universal"],
+    ids=["ContactRegressor", "UniversalRegressor"],
 )
 def test_estimators_pass_the_checks_of_scikit_learn(estimator, fails):
     with warnings.catch_warnings():
@@ -63,7 +65,7 @@ def network_of(regressor: reskin.ContactRegressor) -> dict[str, np.ndarray]:
     return dict(regressor.network_.tensors)
 
 
-def test_defaults_are_the_recipe_of_the_paper():
+def test_default_settings_of_contact_regressor_are_the_recipe_of_the_paper():
     settings = read_yaml(ROOT / "params.yaml")["recipes"]["paper"]
     settings["steps_n"] = read_yaml(ROOT / "pipeline/scenes/lab.yaml")["train_multi"]["steps_n"]
     defaults = reskin.ContactRegressor().get_params()
@@ -93,7 +95,7 @@ def test_network_equals_that_of_the_training_loop_bit_for_bit(triplet_weight):
     assert (other_seed.predict(X) != expected.predicted).all()
 
 
-def test_cross_validation_over_boards_gives_the_metrics_of_the_project():
+def test_scores_of_cross_validation_over_boards_equal_the_metrics_of_the_project():
     X, y = (np.concatenate(parts) for parts in zip(*[poke_rows(board=i) for i in range(3)], strict=True))
     board, regressor = np.repeat(["b0", "b1", "b2"], 48), reskin.ContactRegressor(**SHORT)
     y[::7, 2] = np.nan  # some forces are unknown
@@ -155,14 +157,14 @@ def pressed() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def with_unknown(y: np.ndarray) -> np.ndarray:
-    """Return targets: six presses have place and force, three have only the place, all others are unlabelled."""
+    """Return the targets with NaN for unknown values: six presses have place and force, three only a place."""
     known = y.copy()
     known[6:9, 2] = np.nan
     known[9:] = np.nan
     return known
 
 
-def test_universal_regressor_equals_the_universal_model(pressed):
+def test_universal_regressor_returns_the_estimates_of_the_universal_model(pressed):
     noload_uT, X, y = pressed
     known = with_unknown(y).astype(np.float32)
     model = reskin.load_universal().zero(noload_uT)
@@ -181,7 +183,7 @@ def test_universal_regressor_equals_the_universal_model(pressed):
     np.testing.assert_array_equal(regressor.predict(X), mean)
 
 
-def test_universal_regressor_follows_conventions(pressed, tmp_path):
+def test_universal_regressor_follows_the_conventions_of_scikit_learn(pressed, tmp_path):
     noload_uT, X, y = pressed
     frame = pd.DataFrame(X, columns=[f"db{axis}{chip}_uT" for chip in range(5) for axis in "xyz"])
     regressor = reskin.UniversalRegressor(noload_uT)
@@ -196,12 +198,14 @@ def test_universal_regressor_follows_conventions(pressed, tmp_path):
     assert regressor.noload_uT is noload_uT
     assert list(regressor.feature_names_in_) == list(frame)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(regressor)).predict(frame), first)
-    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)  # a second fit starts from the prior
+    # A second fit does not use the first one.
+    np.testing.assert_array_equal(regressor.fit(frame, y).predict(frame), first)
     np.testing.assert_array_equal(clone(regressor).fit(frame, y).predict(frame), first)
-    assert metrics.score(y, first)["accuracy_pct"] > 90  # accuracy on the labelled presses themselves
+    assert metrics.score(y, first)["accuracy_pct"] > 90  # the tested presses are the labelled ones
     regressor.model_.save(tmp_path / "skin.safetensors")
     saved = reskin.load_universal(tmp_path / "skin.safetensors")
-    np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)  # rounding of the sum
+    # The tolerance allows for rounding of X + noload_uT.
+    np.testing.assert_allclose(saved.predict(X + saved.noload_uT), first, atol=1e-3)
 
 
 def test_universal_regressor_warns_of_mirrored_labels(pressed):

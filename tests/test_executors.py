@@ -11,7 +11,7 @@ from reskin.models import job
 from reskin.numerics import device
 
 
-def test_calls_run_in_separate_processes(monkeypatch):
+def test_calls_run_in_another_process_with_executor_processes(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
@@ -56,7 +56,7 @@ def test_unknown_executor_is_an_error(monkeypatch, value):
         make_executor(imports="json")
 
 
-def test_calls_can_run_in_this_process(monkeypatch):
+def test_calls_run_in_this_process_with_executor_here(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()
@@ -82,7 +82,7 @@ def test_unknown_device_is_an_error(monkeypatch, value):
     )
 
 
-def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
+def test_median_call_time_does_not_include_the_first_call(monkeypatch):
     now_s, calls = [0.0], []
 
     def call() -> None:
@@ -96,7 +96,7 @@ def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
     assert median_s == (2 + job.REPEATS_N + 1) / 2  # This is the median of 2 s to 26 s.
 
 
-def test_single_slow_call_does_not_change_the_median(monkeypatch):
+def test_median_call_time_is_not_changed_by_a_single_slow_call(monkeypatch):
     now_s, durations_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
 
     def call() -> None:

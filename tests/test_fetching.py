@@ -128,7 +128,7 @@ def test_recordings_are_fetched_and_added_once(root, example):
     assert "scene small is not in the plan; to run it: reskin scenes use small; dvc repro" in fetch(root)
 
 
-def test_interrupted_add_continues(root, monkeypatch):
+def test_fetch_continues_after_an_interruption_while_recordings_were_added(root, monkeypatch):
     add, calls = adding.add, []
 
     def interrupt_second_add(*fields, **options):
@@ -155,7 +155,7 @@ def test_recording_added_earlier_is_not_added_again(root, example, tmp_path):
 
 
 @pytest.mark.usefixtures("without_adding")
-def test_mirror_or_folder_replaces_the_home(root, example, tmp_path):
+def test_recordings_can_be_fetched_from_a_mirror_or_a_folder(root, example, tmp_path):
     write_source(root, source_of(example.files, (tmp_path / "away").as_uri(), example.commit))
     assert_refused(root, "cannot read the repository")
     (tmp_path / "files/deep").mkdir(parents=True)
@@ -209,7 +209,7 @@ def test_truncated_or_missing_file_is_an_error(root, example, tmp_path):
 
 
 @pytest.mark.usefixtures("without_adding")
-def test_changed_file_is_fetched_again(root, example):
+def test_fetched_file_that_was_changed_is_fetched_again(root, example):
     fetch(root)
     (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
     assert "all checksums match" in fetch(root)
@@ -217,7 +217,7 @@ def test_changed_file_is_fetched_again(root, example):
 
 
 @pytest.mark.usefixtures("without_adding")
-def test_unlicensed_data_need_consent(root, example):
+def test_fetching_files_without_a_licence_needs_consent(root, example):
     write_source(root, source_of(example.files, example.url, example.commit, licence=None))
     assert_refused(root, "the use of files without a licence was not confirmed. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
@@ -238,7 +238,7 @@ def test_consent_can_be_given_on_the_command_line(root, example, monkeypatch):
     assert done.stdout.endswith("Not added.\n")
 
 
-def test_checksum_of_an_archive_is_that_of_the_converted_table(root, tmp_path):
+def test_archive_is_converted_to_a_table_before_its_checksum_is_compared(root, tmp_path):
     rows = [
         f"{i},{phase},{4 * i},2,{','.join(f'{value * (1 + i):.4f}' for value in range(20))},0.000000,0.000000,{force}"
         for i in range(2)
@@ -298,14 +298,14 @@ def test_unknown_source_is_an_error(root):
         fetching.fetch(root, "lab", None, agree=lambda _: True, say=print)
 
 
-def test_sources_are_listed_without_a_name(monkeypatch):
+def test_fetch_without_a_name_lists_the_sources(monkeypatch):
     monkeypatch.chdir(ROOT)
     lines = CliRunner().invoke(app, ["fetch"]).stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == list(SOURCES)
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_sources_have_recordings_and_a_known_scene_or_a_note(name):
+def test_each_source_has_either_recordings_and_a_known_scene_or_a_note(name):
     source, paths = SOURCES[name], {Path(file.path) for file in SOURCES[name].files}
     assert len(paths) == len(source.files)
     for recording in source.recordings:
@@ -322,13 +322,14 @@ def test_sources_have_recordings_and_a_known_scene_or_a_note(name):
 def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, tmp_path):
     folder = {"eflesh_forces": "eflesh"}.get(name, name)
     fetching.download(SOURCES[name], str(shared_data / folder), tmp_path / name)
+    # The numbers of rows that data/README.md states.
     counts = {
         "lab": 7150,
         "ini": 23300,
         "eflesh": 4805,
         "eflash7": 268,
         "leaphand": 301,
-    }  # numbers of rows, as in data/README.md
+    }
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7, "leaphand": leaphand}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)
@@ -339,7 +340,7 @@ def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, t
 
 
 @pytest.mark.timeout(600)
-def test_real_boards_join_their_scene(shared_data, tmp_path, monkeypatch):
+def test_fetched_recordings_of_real_boards_are_added_to_scene_lab(shared_data, tmp_path, monkeypatch):
     (tmp_path / "checkout").mkdir()
     root = copy_checkout(tmp_path / "checkout")
     plan.use(root, ["quick"])

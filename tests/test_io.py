@@ -26,7 +26,7 @@ def test_readings_written_to_a_file_are_read_unchanged(tmp_path):
     assert io.read_ingest_counts(tmp_path / "c0.parquet") == {"rows_n": 6}
 
 
-def test_columns_have_units_and_the_file_a_schema_version(tmp_path):
+def test_file_of_readings_states_the_units_of_columns_and_its_schema_version(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     schema = pq.read_schema(tmp_path / "c0.parquet")
     assert {field.name: field.metadata[b"unit"].decode() for field in schema if field.name in UNITS} == UNITS
@@ -35,7 +35,7 @@ def test_columns_have_units_and_the_file_a_schema_version(tmp_path):
     assert pq.ParquetFile(tmp_path / "c0.parquet").metadata.row_group(0).column(5).compression == "ZSTD"
 
 
-def test_blocks_are_concatenated(tmp_path):
+def test_blocks_of_readings_are_concatenated_in_one_file(tmp_path):
     io.write_readings(tmp_path / "whole.parquet", [readings()], {})
     io.write_readings(tmp_path / "blocks.parquet", [readings(), readings()], {})
     assert len(io.read_readings(tmp_path / "blocks.parquet")) == 2 * len(io.read_readings(tmp_path / "whole.parquet"))
@@ -60,7 +60,7 @@ def test_folder_that_cannot_be_created_is_an_error(tmp_path):
             io.write_text(folder / "out.csv", "new")
 
 
-def test_if_writing_fails_the_old_file_is_kept(tmp_path):
+def test_old_file_is_kept_if_writing_the_new_one_fails(tmp_path):
     io.write_text(tmp_path / "a.txt", "old")
     with pytest.raises(RuntimeError), io.replacing(tmp_path / "a.txt") as temporary:
         temporary.write_text("half")
@@ -68,7 +68,7 @@ def test_if_writing_fails_the_old_file_is_kept(tmp_path):
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
-def test_os_errors_name_the_right_file(tmp_path):
+def test_os_errors_name_the_file_that_could_not_be_read_or_written(tmp_path):
     def names_in_errors(*names: Path) -> tuple[str, ...]:
         """Return the file that each error names.
 
@@ -85,12 +85,12 @@ def test_os_errors_name_the_right_file(tmp_path):
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
     assert names_in_errors(source) == ("source", "source", "source")
     assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    # EIO may be caused by either file of a copy.
+    # If a file is copied, EIO may be caused by either of the two files.
     assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")
     assert names_in_errors() == ("a.txt", "a.txt", "")
 
 
-def test_read_only_disk_error_names_the_target(tmp_path, monkeypatch):
+def test_error_for_a_read_only_disk_names_the_target(tmp_path, monkeypatch):
     def refuse(path: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(path))
 
@@ -100,7 +100,7 @@ def test_read_only_disk_error_names_the_target(tmp_path, monkeypatch):
     assert raised.value.filename == str(tmp_path / "a.txt")
 
 
-def test_unreadable_source_is_named(tmp_path):
+def test_error_for_an_unreadable_source_names_the_source(tmp_path):
     with (
         pytest.raises(IsADirectoryError, match="source"),
         explaining("ingest_many"),
@@ -115,7 +115,7 @@ def read_texts(folder: Path) -> dict[str, str]:
     return {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
 
-def test_folder_of_texts_is_replaced(tmp_path):
+def test_write_texts_replaces_all_files_of_a_folder(tmp_path):
     io.write_texts(tmp_path / "tables", {"a.md": "old", "gone.md": "old"})
     io.write_texts(tmp_path / "tables", {"a.md": "±1 µT", "b.md": ""})
     assert read_texts(tmp_path / "tables") == {"a.md": "±1 µT", "b.md": ""}
@@ -124,7 +124,7 @@ def test_folder_of_texts_is_replaced(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
 
 
-def test_failed_text_keeps_the_old_folder(tmp_path):
+def test_old_folder_is_kept_if_writing_one_of_its_texts_fails(tmp_path):
     io.write_texts(tmp_path / "tables", {"a.md": "old", "b.md": "old"})
     with pytest.raises(UnicodeEncodeError):
         io.write_texts(tmp_path / "tables", {"a.md": "new", "b.md": "half a pair: \ud800"})
@@ -156,7 +156,7 @@ def test_missing_column_is_an_error(tmp_path):
         io.read_readings(tmp_path / "c1.parquet")
 
 
-def test_nan_is_not_written_to_json(tmp_path):
+def test_write_json_raises_if_a_value_is_nan(tmp_path):
     with pytest.raises(ValueError, match="Out of range float"):
         io.write_json(tmp_path / "a.json", {"x": float("nan")})
     assert list(tmp_path.iterdir()) == []
@@ -209,7 +209,7 @@ def test_flipped_bits_of_tables_are_detected(tmp_path):
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 6  # Other bytes are in headers of pages, whose bits do not affect the values.
+    assert detected_n > end // 6  # The other flipped bits are in headers of pages and do not affect the values.
 
 
 def test_tensors_without_digest_are_read(tmp_path):
@@ -233,7 +233,7 @@ def test_missing_file_is_an_error(tmp_path, read):
         read(tmp_path / "none")
 
 
-def test_unreadable_file_is_not_called_damaged(tmp_path, monkeypatch):
+def test_error_for_an_unreadable_file_does_not_say_that_it_is_damaged(tmp_path, monkeypatch):
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
 
     def refuse(path, **_):

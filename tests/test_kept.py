@@ -1,4 +1,4 @@
-"""Tests of arrays that are cached in files beside the code."""
+"""Tests of arrays that are cached in files in the folder of the code."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_cached_array_is_loaded_unchanged(package):
 
 
 @pytest.mark.parametrize("what", ["source", "another source", "setting"])
-def test_changed_source_or_setting_invalidates_the_array(package, monkeypatch, what):
+def test_cached_array_is_not_loaded_after_a_change_of_source_or_setting(package, monkeypatch, what):
     io.save_cached_array(package, "flow", np.ones(3))
     if what == "setting":
         monkeypatch.setenv("ATEN_CPU_CAPABILITY", "default")
@@ -45,7 +45,7 @@ def test_damaged_array_is_not_loaded(package, content):
     assert io.load_cached_array(package, "flow") is None
 
 
-def test_unwritable_folder_is_ignored(package):
+def test_array_is_not_cached_if_the_folder_cannot_be_written(package):
     (package / "__pycache__").write_text("a file in the way")
     io.save_cached_array(package, "flow", np.ones(3))
     assert io.load_cached_array(package, "flow") is None

@@ -34,14 +34,14 @@ def test_os_errors_are_explained(error, message):
 @pytest.mark.parametrize(
     "error", [FileNotFoundError(errno.ENOENT, "No such file", "x"), ValueError("ours"), KeyError(1)]
 )
-def test_other_errors_are_not_caught(error):
+def test_errors_that_the_machine_has_not_caused_are_not_caught(error):
     with pytest.raises(type(error)), explaining("split"):
         raise error
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full, which only Linux has")
 @pytest.mark.parametrize("write", [io.write_json, io.write_table, io.write_tensors])
-def test_full_disk_error_names_the_target(tmp_path, write):
+def test_error_for_a_full_disk_names_the_target(tmp_path, write):
     target, (temporary,) = tmp_path / "out", [tmp_path / f".out.{os.getpid()}.tmp"]
     content = {io.write_table: pa.table({"a": np.zeros(9)}), io.write_tensors: {"a": np.zeros(9)}}.get(write, [1])
     with pytest.MonkeyPatch.context() as patch:

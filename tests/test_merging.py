@@ -30,7 +30,7 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
 
 
 def add_and_commit(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
-    """Change the files in git as `reskin add` and `dvc repro` do, and commit them."""
+    """Change the files in git in the same way as `reskin add` and `dvc repro`, and commit them."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
     plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
@@ -72,21 +72,21 @@ def merge_two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> Non
     git(root, "merge", "theirs", check=False)
 
 
-def test_registry_plan_and_lock_have_both_recordings(root):
+def test_merge_keeps_both_recordings_in_the_registry_the_plan_and_the_lock_file(root):
     merge_two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
     assert "2 captures" in merge.merge(root)
     assert list(read_registry(root).captures["shared"]) == ["mine", "yours"]
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
     assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
-    assert stages["report@shared"] == {"cmd": "with mine"}  # only our entry is kept, so DVC will run the stage again
+    assert stages["report@shared"] == {"cmd": "with mine"}  # only our entry is kept, so DVC runs the stage again
     assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     git(root, "commit", "-qm", "Merge")
     assert git(root, "status", "--porcelain") == ""
 
 
-def test_deleted_report_stays_deleted(root):
+def test_report_that_one_side_deleted_stays_deleted_after_a_merge(root):
     add_and_commit(root, "first", "s0", "b0")
     git(root, "checkout", "-qb", "theirs")
     add_and_commit(root, "yours", "s2", "b2")
@@ -99,7 +99,7 @@ def test_deleted_report_stays_deleted(root):
     assert not (root / "reports/shared/tables/lobo.md").exists()
 
 
-def test_contradictory_recordings_change_nothing(root):
+def test_merge_of_contradictory_recordings_raises_and_changes_no_files(root):
     merge_two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
     before = {name: (root / name).read_bytes() for name in merge.RESOLVED}
     with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
@@ -116,13 +116,13 @@ def test_contradictory_recordings_change_nothing(root):
         ({"mine": entry("s2", "b2")}, "the name mine is taken in scene"),
     ],
 )
-def test_merged_registry_is_validated(theirs, message):
+def test_merge_raises_if_the_merged_registry_would_be_invalid(theirs, message):
     ours = Registry(captures={"shared": {"mine": entry("s1", "b1")}})
     with pytest.raises(ReskinError, match=message):
         merge.merge_registries(EMPTY, ours, Registry(captures={"shared": theirs}))
 
 
-def test_added_scenes_are_planned_and_removed_ones_are_not():
+def test_merged_plan_has_the_added_scenes_but_not_the_removed_ones():
     assert merge.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
     assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
@@ -144,7 +144,7 @@ def test_merge_without_conflict_is_an_error(root):
         merge.merge(root)
 
 
-def test_removed_and_replaced_captures_are_not_restored():
+def test_merge_does_not_restore_captures_that_one_side_removed_or_replaced():
     kept, removed, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
     base = Registry(captures={"scene": {"kept": kept, "gone": removed, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
@@ -153,7 +153,7 @@ def test_removed_and_replaced_captures_are_not_restored():
     assert merge.merge_registries(base, theirs, theirs) == theirs
 
 
-def test_each_lock_entry_comes_from_one_side():
+def test_each_entry_of_the_merged_lock_file_is_copied_from_one_side():
     base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
     assert merge.merge_stages(base, base, changed) == (changed, [])
     assert merge.merge_stages(base, changed, base) == (changed, [])

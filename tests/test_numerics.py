@@ -22,7 +22,9 @@ from tests.benchmarks import size
 
 ROOT = Path(__file__).resolve().parents[1]
 AVX2, NEWEST = frozenset({"avx2"}), frozenset({"avx2", *BEYOND_AVX2.values()})
-needs_avx2 = pytest.mark.skipif("avx2" not in cpu_flags(), reason="nothing is selected on a processor without AVX2")
+needs_avx2 = pytest.mark.skipif(
+    "avx2" not in cpu_flags(), reason="on a processor without AVX2, the project does not select instructions"
+)
 
 
 @cache
@@ -38,7 +40,7 @@ def digests_under(*settings: str) -> str:
 
 @needs_avx2
 def test_training_does_not_depend_on_the_processor_that_mkl_detects_or_on_threads():
-    # These variables select the code of MKL and oneDNN for unknown processors, and three threads instead of one.
+    # These variables make MKL and oneDNN use their code for unknown processors, and three threads instead of one.
     other = "MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41", "OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"
     assert digests_under(*other) == digests_under()
 
@@ -52,7 +54,7 @@ def test_training_depends_on_the_selected_instructions(setting):
     assert all(one != other for one, other in pairs)
 
 
-def test_affine_equals_pytorch():
+def test_affine_and_its_gradients_equal_those_of_pytorch():
     rng = rng_for(0, "affine")
     for shapes in (((3, 7, 5), (3, 5, 4), (3, 1, 4)), ((3, 7, 5), (5, 4), (1, 4)), ((7, 5), (5, 4), (1, 4))):
         ours = [torch.from_numpy(rng.normal(size=shape)).requires_grad_() for shape in shapes]
@@ -77,7 +79,7 @@ def test_exponential_function_equals_numpy_in_single_precision(value):
     assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
 
 
-def test_numpy_imported_too_early_is_reported():
+def test_import_of_numpy_before_the_variables_are_set_is_reported():
     code = "import numpy; from reskin.numerics import departures; import os; print(departures(os.environ))"
     inherited = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run(
@@ -86,12 +88,12 @@ def test_numpy_imported_too_early_is_reported():
     assert (TOO_LATE in done.stdout) == ("avx2" in cpu_flags())
 
 
-def test_changed_variable_is_reported():
+def test_variables_with_other_values_than_the_project_sets_are_reported():
     assert departures(PINNED) == []
     assert departures({**PINNED, "OPENBLAS_CORETYPE": "Zen"}) == ["OPENBLAS_CORETYPE=Zen"]
 
 
-def test_variables_of_the_user_are_kept():
+def test_variables_that_the_user_has_set_are_kept():
     own_settings = {"ATEN_CPU_CAPABILITY": "default", "NPY_DISABLE_CPU_FEATURES": ""}
     assert not set(pinned(NEWEST, own_settings)) & set(own_settings)
 
@@ -100,12 +102,12 @@ def test_empty_variable_counts_as_unset():
     assert pinned(AVX2, {"OPENBLAS_CORETYPE": ""}) == PINNED
 
 
-def test_numpy_disables_only_existing_features():
+def test_numpy_disables_only_features_that_the_processor_has():
     assert "NPY_DISABLE_CPU_FEATURES" not in pinned(AVX2, {})
     assert pinned(NEWEST, {})["NPY_DISABLE_CPU_FEATURES"].split() == list(BEYOND_AVX2)
 
 
-def test_other_processors_are_not_pinned():
+def test_no_variables_are_set_on_processors_without_avx2():
     assert pinned(frozenset(), {}) == {}
 
 

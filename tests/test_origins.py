@@ -8,7 +8,8 @@ from pipeline.manage.fetch import Origin, open_origin
 from reskin.errors import CaptureError
 from tests import repositories
 
-# Files with line ends that git would convert, binary data, a name that a shell would expand, a name that git quotes.
+# These files have line ends that git would convert, binary data, a name that a shell would expand, and a name that git
+# quotes.
 FILES = {
     "data/crlf.csv": b"a,b\r\n1,2\r\n",
     "data/lf.csv": b"a,b\n1,2\n",
@@ -40,7 +41,7 @@ def assert_error(message: str, *arguments) -> None:
 
 
 @pytest.mark.parametrize("filters", [True, False])
-def test_repository_has_the_committed_bytes(tmp_path, home, scratch, filters):
+def test_files_of_a_repository_are_read_as_they_were_committed(tmp_path, home, scratch, filters):
     commit = repositories.commit(home, FILES)
     url = repositories.bare(home, tmp_path / "mirror.git", filters=filters)
     assert contents(open_origin(url, commit, scratch)) == FILES
@@ -55,14 +56,14 @@ def test_mirror_can_be_any_kind_of_clone(tmp_path, home, scratch, kind):
     assert contents(open_origin(str(where), commit, scratch)) == FILES
 
 
-def test_folder_is_read_as_it_is(home, scratch):
+def test_files_of_a_folder_are_read_unchanged(home, scratch):
     repositories.commit(home, FILES)
     assert contents(open_origin(str(home / "data"), "0" * 40, scratch)) == {
         path.removeprefix("data/"): content for path, content in FILES.items() if path.startswith("data/")
     }
 
 
-def test_older_commit_has_its_bytes(tmp_path, home, scratch):
+def test_file_is_read_as_it_was_at_an_older_commit(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
@@ -76,7 +77,7 @@ def test_newest_commit_is_the_default(tmp_path, home, scratch):
     assert open_origin(url, None, scratch).read("data/lf.csv") == b"edited\n"
 
 
-def test_old_server_is_read_by_branches(tmp_path, home, scratch, monkeypatch):
+def test_older_commit_is_read_from_a_server_with_the_old_git_protocol(tmp_path, home, scratch, monkeypatch):
     first = repositories.commit(home, FILES)
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=False)
@@ -112,7 +113,7 @@ def test_shallow_clone_without_the_commit_is_an_error(tmp_path, home, scratch):
 
 
 @pytest.mark.parametrize("filters", [True, False])
-def test_shallow_clone_at_the_commit_is_a_mirror(tmp_path, home, scratch, filters):
+def test_shallow_clone_that_contains_the_commit_can_be_a_mirror(tmp_path, home, scratch, filters):
     repositories.commit(home, {"data/lf.csv": b"older\n"})
     commit = repositories.commit(home, FILES)
     repositories.git(tmp_path, "clone", "--quiet", "--depth=1", home.as_uri(), "shallow")
@@ -120,7 +121,7 @@ def test_shallow_clone_at_the_commit_is_a_mirror(tmp_path, home, scratch, filter
     assert contents(open_origin(str(tmp_path / "shallow"), commit, scratch)) == FILES
 
 
-def test_non_repository_is_an_error_with_gits_reason(tmp_path, scratch):
+def test_error_for_a_path_that_is_not_a_repository_contains_the_message_of_git(tmp_path, scratch):
     assert_error("nowhere: no such mirror or folder", str(tmp_path / "nowhere"), None, scratch)
     nowhere = (tmp_path / "nowhere.git").as_uri()
     assert_error("nowhere.git: cannot read the repository: fatal: .*--from", nowhere, None, scratch)
@@ -141,7 +142,7 @@ def test_folder_is_read_without_git(tmp_path, home, scratch, monkeypatch):
         ("data/raw/a.csv", "data/raw/a.csv"),
         ("raw/a.csv", "data/raw/a.csv"),
         ("home/data/old/a.csv", "data/old/a.csv"),
-        ("elsewhere/a.csv", "data/old/a.csv"),  # two paths match equally well: the first one is found
+        ("elsewhere/a.csv", "data/old/a.csv"),  # two paths match equally well, so the first one is found
         ("raw/ba.csv", None),
         ("raw", None),
     ],

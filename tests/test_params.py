@@ -55,7 +55,7 @@ def test_params_and_plan_are_valid():
         ({"train_multi": TRAINING | {"recipe": ["paper"]}}, r"train_multi\.recipe must be one of"),
     ],
 )
-def test_invalid_scene_names_the_parameter(changes, message):
+def test_error_for_an_invalid_scene_names_the_parameter(changes, message):
     with pytest.raises(ParamsError, match=message):
         check(recorded_scene(**changes))
 
@@ -115,7 +115,7 @@ def test_simulated_experiment_needs_a_simulated_scene():
         ("adapt", ["adapt"]),  # The passes of the pool are still not tested.
     ],
 )
-def test_removed_experiment_leaves_unused_settings(removed, unused):
+def test_settings_of_a_removed_experiment_are_listed_as_unused(removed, unused):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(settings, "ci.yaml").unused == []
     needing = {"adapt": ["pokes", "sensors", "manual", "flexible", "choice"]}.get(removed, [])
@@ -134,7 +134,7 @@ def test_removed_experiment_leaves_unused_settings(removed, unused):
     "unit",
     ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "neglected_effects"],
 )
-def test_stages_follow_experiments_and_protocols(unit):
+def test_scene_runs_only_the_stages_of_its_experiments_and_protocols(unit):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(settings, "ci.yaml").runs(unit)
     removed = ("drift", "variation")
@@ -147,7 +147,7 @@ def test_stages_follow_experiments_and_protocols(unit):
     assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_all_missing_experiments_are_listed():
+def test_error_lists_all_missing_experiments():
     with pytest.raises(ParamsError, match="experiment choice needs adapt, triplet in the same scene"):
         scene("lobo", "choice")
 
@@ -155,7 +155,7 @@ def test_all_missing_experiments_are_listed():
 ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
 
 
-def test_scene_with_all_experiments():
+def test_scene_with_all_experiments_runs_all_their_stages():
     checked = scene(*ALL)
     assert set(stages(checked.experiments, *LEARNING)) == {
         "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
@@ -165,11 +165,11 @@ def test_scene_with_all_experiments():
     assert checked.curves == {
         "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
     }  # fmt: skip
-    # The names of experiments that have folds.
+    # These experiments have folds.
     assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}
 
 
-def test_scene_with_one_experiment():
+def test_scene_with_one_experiment_runs_only_its_stage():
     one = scene("lobo")
     assert (stages(one.experiments, *LEARNING), one.model_stages, one.curves) == (
         ["train_multi"],
@@ -179,7 +179,7 @@ def test_scene_with_one_experiment():
 
 
 @pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
-def test_scene_sections_match_experiments(experiment):
+def test_scene_needs_only_the_sections_of_its_experiments(experiment):
     ((section, settings),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct it there."):
@@ -188,7 +188,7 @@ def test_scene_sections_match_experiments(experiment):
 
 
 @pytest.mark.parametrize("experiment", SPLIT_SETTINGS)
-def test_split_settings_match_experiments(experiment):
+def test_section_split_needs_only_the_settings_of_the_experiments(experiment):
     keys, others = (
         SPLIT_SETTINGS[experiment],
         ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else [])),
@@ -219,7 +219,7 @@ def test_invalid_experiment_setting_is_an_error(changes, message):
         scene(*ALL, **changes)
 
 
-def test_all_missing_settings_are_listed():
+def test_error_lists_all_missing_settings():
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "transfer", "sensitivity"]}
     settings["split"] = {}
     settings["simulate"]["protocols"].pop("glass")
@@ -227,14 +227,14 @@ def test_all_missing_settings_are_listed():
         parse_scene(settings, "ci.yaml")
 
 
-def test_settings_have_no_defaults():
+def test_missing_setting_is_an_error_because_settings_have_no_defaults():
     settings = recorded_scene()
     del settings["seed"]
     with pytest.raises(ParamsError, match="scene.yaml: seed is missing"):
         parse_scene(settings, "scene.yaml")
 
 
-def test_misspelt_parameter_is_named():
+def test_error_for_a_misspelt_parameter_names_it():
     with pytest.raises(ParamsError, match=r"recipes.fast.rat_max is not a known parameter .its value: 4"):
         check(recorded_scene(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
     settings = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
@@ -242,7 +242,7 @@ def test_misspelt_parameter_is_named():
         check(recorded_scene(train_multi=settings))
 
 
-def test_yaml_exponents_are_numbers(tmp_path):
+def test_numbers_with_an_exponent_in_yaml_are_read_as_numbers(tmp_path):
     (tmp_path / "a.yaml").write_text("rate: 1e-3\n")
     assert read_yaml(tmp_path / "a.yaml") == {"rate": 0.001}
 

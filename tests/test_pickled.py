@@ -35,7 +35,7 @@ def test_pickled_plain_values_are_decoded_unchanged(value, protocol):
     assert decode(pickle.dumps(value, protocol), "a") == value
 
 
-def test_repeated_value_is_decoded_each_time():
+def test_value_that_occurs_several_times_is_decoded_at_each_place():
     row = [1.5, 2.5]
     assert decode(pickle.dumps({"a": row, "b": [row, row]}, 3), "a") == {"a": row, "b": [row, row]}
 
@@ -69,7 +69,7 @@ def test_command_in_a_pickle_is_not_run(tmp_path, protocol):
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=50).map(lambda tail: pickle.dumps([1, {"a": 2.5}], 4)[:-1] + tail))
-def test_arbitrary_bytes_give_a_value_or_an_error(content):
+def test_arbitrary_bytes_are_decoded_or_raise_a_capture_error(content):
     with suppress(CaptureError):
         decode(content, "a")
 
@@ -97,7 +97,7 @@ def archive_of_csv(text: str) -> bytes:
 FIELDS = [float(i) for i in range(20)]
 
 
-def test_samples_become_rows_by_indentation():
+def test_samples_of_an_archive_become_rows_in_the_order_of_indentations():
     text = to_lab_csv(
         archive_of(
             bl_arr=[sample(0, [4, 0], FIELDS, [0, 0, 0]), sample(1, [6, 0], FIELDS, [0, 0, 0])],
@@ -117,7 +117,7 @@ def test_samples_become_rows_by_indentation():
     assert rows[-1].split(",")[-3:] == ["0.000000", "0.250000", "-3.000000"]
 
 
-def test_archive_becomes_a_lab_recording(tmp_path):
+def test_converted_archive_is_read_as_a_recording_of_layout_lab(tmp_path):
     presses = [sample(i, [4 * i, 2], FIELDS, [0, 0, 0]) for i in range(3)]
     contacts = [sample(i, [4 * i, 2], [2 * value for value in FIELDS], [0, 0, -1 - i]) for i in range(3)]
     (tmp_path / lab.READINGS).write_bytes(to_lab_csv(archive_of(bl_arr=presses, cont_arr=contacts), "a"))
@@ -151,7 +151,7 @@ def test_invalid_archive_is_an_error(archive, message):
     assert "\n" not in str(caught.value)
 
 
-def test_real_samples_give_the_recorded_file(shared_data):
+def test_converted_archive_of_real_samples_equals_the_recorded_file(shared_data):
     """The original archive is not available. Therefore an archive is built from the recorded values."""
     file = shared_data / "lab/board1_depth1.csv"
     known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
@@ -159,7 +159,7 @@ def test_real_samples_give_the_recorded_file(shared_data):
     assert hashlib.sha256(again).hexdigest() == known[file.name]
 
 
-def test_nested_references_are_converted_once():
+def test_each_value_of_deeply_nested_references_is_converted_only_once():
     nested: list = []
     for _ in range(60):
         nested = [nested, nested]  # There are 2^60 paths through these references.

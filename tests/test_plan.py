@@ -28,7 +28,7 @@ def test_plan_of_the_checkout_is_up_to_date():
     plan.check(ROOT)
 
 
-def test_stages_that_no_scene_needs_are_empty():
+def test_plan_lists_no_scenes_for_stages_that_no_scene_needs():
     generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
     assert generated["train_multi"] == ["lab"]
     assert generated["train_single"] == generated["verification"] == generated["runtime"] == []
@@ -77,7 +77,7 @@ def test_experiment_that_chooses_settings_has_no_stage_of_its_own():
     assert with_choice == without
 
 
-def test_report_rejects_a_plan_without_an_experiment(tmp_path, monkeypatch):
+def test_planned_scene_raises_if_the_plan_lacks_an_experiment_of_the_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
@@ -88,7 +88,7 @@ def test_report_rejects_a_plan_without_an_experiment(tmp_path, monkeypatch):
         planned_scene(tiny)
 
 
-def test_each_recorded_capture_has_an_ingest_stage():
+def test_each_recorded_capture_has_an_ingest_stage_of_its_own():
     generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
     parse(Plan, generated, "plan")
     assert generated["stages"]["ingest"] == {
@@ -99,7 +99,7 @@ def test_each_recorded_capture_has_an_ingest_stage():
     assert generated["captures"] == {"lab": ["c0", "c1"]}
 
 
-def test_many_captures_have_one_ingest_stage():
+def test_scene_with_many_captures_has_only_one_ingest_stage():
     names = [f"c{i:02}" for i in range(plan.MANY_N + 1)]
     generated = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
     assert generated["ingest"] == {}
@@ -183,7 +183,7 @@ def simulated_checkout(tmp_path, **changes):
     return root
 
 
-def test_each_protocol_has_a_folder_and_stages(tmp_path):
+def test_each_protocol_is_simulated_and_ingested_by_stages_of_its_own(tmp_path):
     root = simulated_checkout(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages

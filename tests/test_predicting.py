@@ -71,7 +71,7 @@ def write_stream(folder, wire):
 
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt"])
-def test_stream_decoded_table_and_log_give_the_same_csv(tmp_path, model, wire):
+def test_predictions_from_a_stream_from_its_decoded_table_and_from_a_log_are_equal(tmp_path, model, wire):
     folder, table = write_stream(tmp_path, wire), tmp_path / "frames.parquet"
     io.write_table(table, decode_dump((folder / STREAM_FILE).read_bytes(), wire, 5, "stream")[0])
     outs = [tmp_path / f"{name}.csv" for name in ("log_out", "folder_out", "table_out")]
@@ -82,10 +82,10 @@ def test_stream_decoded_table_and_log_give_the_same_csv(tmp_path, model, wire):
 
 
 @pytest.mark.parametrize("external_uT", [0.0, 50.0])
-def test_uniform_field_is_no_contact_if_external_fields_are_expected(tmp_path, external_uT):
+def test_change_of_a_uniform_field_counts_as_contact_unless_external_fields_are_expected(tmp_path, external_uT):
     t_s, b_uT, temperature_degC = log_of()
     touched = np.arange(len(t_s)) >= QUIET_N
-    # These changes replace the changes that are equal along all axes.
+    # The change of 200 uT in all channels is replaced by a field that is uniform along the axes of the board.
     turning_uT = to_chips(np.tile([40.0, -30.0, 60.0], 5)[None]) - 200
     b_uT = (b_uT + touched[:, None] * turning_uT).astype(np.float32)
     (tmp_path / "log.csv").write_text(render(t_s, b_uT, temperature_degC))
@@ -93,7 +93,7 @@ def test_uniform_field_is_no_contact_if_external_fields_are_expected(tmp_path, e
     assert counts["contact_readings_n"] == (0 if external_uT else TOUCHED_N)
 
 
-def test_networks_cannot_expect_external_fields(tmp_path, model):
+def test_predicting_with_a_network_raises_if_external_fields_are_expected(tmp_path, model):
     with pytest.raises(ReskinError, match="networks have no option for external fields"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv", external_uT=50.0)
 
@@ -112,7 +112,7 @@ def test_unsuitable_tables_and_labelled_recordings_are_an_error(tmp_path, model)
         predict(tmp_path / "c0", model, tmp_path / "out.csv")
 
 
-def test_every_line_has_a_row_and_contacts_have_estimates(tmp_path, model):
+def test_output_has_a_row_for_every_line_and_estimates_for_every_contact(tmp_path, model):
     counts = predict(write_log(tmp_path), model, tmp_path / "out.csv")
     names, *rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()]
     assert names == ["t_s", "x_mm", "y_mm", "F_N", "contact"]
@@ -131,7 +131,7 @@ def test_collapsed_model_is_an_error(tmp_path, model):
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
+def test_unsuitable_inputs_raise_an_error_before_any_file_is_written(tmp_path, model):
     log, out = write_log(tmp_path), tmp_path / "out.csv"
     four = tmp_path / "four"
     four.mkdir()
@@ -176,7 +176,7 @@ def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
     ],
 )
-def test_wrong_card_is_an_error(tmp_path, model, change, message):
+def test_wrong_model_card_is_an_error(tmp_path, model, change, message):
     model.with_suffix(".json").write_text(json.dumps(CARD | change))
     with pytest.raises(ReskinError, match=message) as refused:
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -184,13 +184,13 @@ def test_wrong_card_is_an_error(tmp_path, model, change, message):
 
 
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
-def test_incomplete_card_is_an_error(tmp_path, model, lacking):
+def test_incomplete_model_card_is_an_error(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
     with pytest.raises(ReskinError, match=f"{lacking} (is missing|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_card_that_is_not_a_mapping_is_an_error(tmp_path, model):
+def test_model_card_that_is_not_a_mapping_is_an_error(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
     with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -269,7 +269,7 @@ def write_presses(folder, chips_on_n=0, factor=1.0):
     return folder / "log.csv"
 
 
-def test_summary_counts_misfits_and_forces_at_the_limit(tmp_path, model, capsys):
+def test_summary_counts_readings_of_an_unknown_skin_and_forces_at_the_limit(tmp_path, model, capsys):
     log, out = write_presses(tmp_path), tmp_path / "out.csv"
     counts = predict(log, None, out)
     assert (counts["unknown_skin_readings_n"], counts["force_at_limit_readings_n"]) == (0, 0)

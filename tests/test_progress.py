@@ -31,7 +31,7 @@ def test_stage_prints_its_position(checkout, monkeypatch, stage, line):
     assert progress.stage_position() == line
 
 
-def test_positions_follow_a_changed_plan(checkout, monkeypatch):
+def test_positions_are_computed_again_after_a_change_of_the_plan(checkout, monkeypatch):
     for stages in (ORDER, ORDER[:2]):
         monkeypatch.setattr(progress, "_ask_dvc", lambda stages=stages: stages)
         assert progress.stages_in_order() == stages
@@ -50,8 +50,8 @@ def test_stage_outside_dvc_prints_nothing(monkeypatch):
     assert progress.stage_position() is None
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
-def test_table_2_precedes_other_protocols(tmp_path, monkeypatch):
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # libraries that DVC uses cause warnings
+def test_stages_that_table_2_needs_run_before_all_other_stages(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     plan.use(root, ["ci"])
     monkeypatch.chdir(root)
@@ -61,5 +61,5 @@ def test_table_2_precedes_other_protocols(tmp_path, monkeypatch):
     assert set(order[: order.index("table2@ci")]) == needed
     planned = read_yaml(Path("pipeline/plan.yaml"))["stages"]
     assert len(order) == 1 + sum(len(keys) for keys in planned.values())
-    monkeypatch.setattr(progress, "_ask_dvc", lambda: pytest.fail("asked DVC again"))
+    monkeypatch.setattr(progress, "_ask_dvc", lambda: pytest.fail("DVC must not be asked again"))
     assert progress.stages_in_order() == order

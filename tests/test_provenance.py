@@ -67,7 +67,7 @@ def test_code_version_of_modules_is_their_last_functional_change(tmp_path, monke
     assert code_version_of(["pipeline.two"]) == third
 
 
-def test_machine_is_described():
+def test_machine_states_the_processor_its_cores_and_the_version_of_python():
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
 
@@ -83,17 +83,17 @@ def test_first_of_two_processors_is_named():
 
 
 @pytest.mark.parametrize("cpuinfo", ["", "\n\n", "no colon here", "model name:\nflags:"])
-def test_unknown_processor_is_named_by_python(cpuinfo):
+def test_name_of_an_unknown_processor_is_the_one_that_python_reports(cpuinfo):
     assert processor_name(cpuinfo, {}, otherwise="arm") == "arm"
     assert processor_name(cpuinfo, {}, otherwise="") == "unknown processor"
 
 
 @pytest.mark.parametrize("name", VARIABLES)
-def test_variables_that_change_sums_are_listed(name):
+def test_variables_that_change_the_results_are_listed_with_the_processor(name):
     assert f"{name}=x" in processor_name(XEON, {name: "x"}, otherwise="")
 
 
-def test_pinned_variables_are_not_listed():
+def test_variables_that_the_project_has_set_are_not_listed():
     flags = frozenset({"avx2", "avx512vl", "avx512_vbmi2"})
     assert processor_name(XEON, pinned(flags, {}), otherwise="") == processor_name(XEON, {}, otherwise="")
 
@@ -104,7 +104,7 @@ def test_instruction_sets_are_listed_if_available(flag, name):
     assert processor_name("Features : fp", {}, otherwise="arm") == "arm"
 
 
-def test_machine_without_cpuinfo_is_described(tmp_path, monkeypatch):
+def test_machine_is_described_although_cpuinfo_is_missing(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "CPUINFO", tmp_path / "none")
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
@@ -120,14 +120,14 @@ def test_costs_are_in_seconds_and_megabytes(tmp_path):
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # The peak memory of this Python process in MB.
 
 
-def test_stage_cost_includes_reused_training(tmp_path):
+def test_cost_of_a_stage_includes_training_runs_that_were_reused(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
     record_cost(tmp_path, "train", 12.0)
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # The last 2 s are the rest of the stage.
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # Apart from the training, the stage took 2 s.
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
@@ -138,7 +138,7 @@ def test_stage_cost_includes_reused_training(tmp_path):
 
 
 @given(st.floats(0, 9), st.floats(0, 9), st.lists(st.tuples(st.floats(0, 9), st.booleans()), max_size=4))
-def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, trained):
+def test_cost_of_a_stage_is_at_least_the_time_of_its_last_run(tmp_path_factory, waited_s, other_s, trained):
     folder = tmp_path_factory.mktemp("costs")
     record_trainings(folder, "train", {str(i): one for i, one in enumerate(trained)}, waited_s)
     record_cost(folder, "train", waited_s + other_s)
@@ -146,7 +146,7 @@ def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, 
     assert total_cost_s([cost]) >= cost["seconds"] - 0.02  # Both values are rounded to 0.01 s.
 
 
-def test_repeated_training_of_a_run_counts_once(tmp_path):
+def test_training_run_that_a_stage_uses_twice_is_counted_once(tmp_path):
     clear_cost(tmp_path, "sweep")
     record_trainings(tmp_path, "sweep", {"a": (8.0, False)}, waited_s=4.0)
     record_trainings(tmp_path, "sweep", {"a": (8.0, True), "c": (1.0, True)}, waited_s=1.0)
@@ -162,7 +162,8 @@ def test_training_run_used_by_two_stages_is_counted_once(tmp_path):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # The last 3 s are those of the second stage.
+    # The second stage only reuses the training run, so it adds its 3 s.
+    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0
 
 
 def test_costs_of_a_killed_run_are_dropped(tmp_path):

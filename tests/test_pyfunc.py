@@ -66,7 +66,7 @@ def client(root, monkeypatch) -> mlflow.MlflowClient:
     return mlflow.MlflowClient()
 
 
-def test_example_has_the_largest_changes_of_a_recording(tmp_path):
+def test_read_example_returns_the_largest_field_changes_of_a_recording(tmp_path):
     changes_uT = DB_uT * np.array([[0.0], [3.0], [2.0], [1.0]])
     pd.DataFrame({"b_uT": list(changes_uT + 50), "noload_uT": list(0 * DB_uT + 50)}).to_parquet(tmp_path / "a.parquet")
     example_uT = read_example([tmp_path / "missing.parquet", tmp_path / "a.parquet"])
@@ -74,7 +74,7 @@ def test_example_has_the_largest_changes_of_a_recording(tmp_path):
     assert read_example([]) is None
 
 
-def test_champion_of_a_scene_predicts_like_the_saved_model(client, root):
+def test_model_with_the_alias_champion_has_the_predictions_of_the_saved_model(client, root):
     model = mlflow.pyfunc.load_model("models:/reskin-ci@champion")
     assert model.metadata.get_input_schema().input_names() == channel_names(15)
     assert model.metadata.get_output_schema().input_names() == list(COLUMNS)
@@ -87,11 +87,11 @@ def test_champion_of_a_scene_predicts_like_the_saved_model(client, root):
     assert example.shape == (3, 15)
     assert np.isfinite(model.predict(example).to_numpy()).all()
     run = client.get_run(model.metadata.run_id)
-    assert run.data.metrics["accuracy_pct"] == 65.0  # mean over held-out boards
+    assert run.data.metrics["accuracy_pct"] == 65.0  # the mean over both held-out boards
     assert run.data.metrics["mse_xy_mm2"] == 1.5
 
 
-def test_champion_moves_to_the_current_model(tmp_path, monkeypatch, empty_store):
+def test_alias_champion_moves_to_the_current_model(tmp_path, monkeypatch, empty_store):
     shutil.copy(empty_store, tmp_path / "mlflow.db")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'mlflow.db'}")
     client = mlflow.MlflowClient()
@@ -121,13 +121,13 @@ def test_universal_model_is_calibrated_by_parameters(client):
     skin = reskin.load_universal().zero(noload_uT).see(b_uT)
     skin.label(np.array(labels)[:, :2], force_N, b_uT)
     np.testing.assert_allclose(model.predict(db_uT, params).to_numpy(), skin.predict(b_uT), rtol=1e-4, atol=1e-3)
-    uncalibrated = model.predict(db_uT).to_numpy()  # for a nominal skin
+    uncalibrated = model.predict(db_uT).to_numpy()  # without parameters, the estimates are those for a nominal skin
     assert uncalibrated.shape == (2, 3)
     assert not np.allclose(uncalibrated, skin.predict(b_uT), rtol=1e-4)
     assert io.sha256(Path(model._model_impl.file)) == io.sha256(FILE)
 
 
-def test_scoring_server_answers_a_reading(client):
+def test_scoring_server_returns_predictions_for_its_example(client):
     from mlflow.pyfunc import scoring_server
 
     model = mlflow.pyfunc.load_model("models:/reskin-ci@champion")
@@ -146,7 +146,7 @@ def serving_example(model) -> dict:
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 @pytest.mark.parametrize("name", ["reskin-ci", "reskin-universal"])
-def test_mlflow_models_serve_answers_by_http(client, root, name):
+def test_command_mlflow_models_serve_returns_predictions_by_http(client, root, name):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     uri = f"models:/{name}@champion"

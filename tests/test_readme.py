@@ -101,7 +101,7 @@ def test_readme_links_the_code_of_every_stage():
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 
 
-def test_readme_is_short_and_links_are_valid():
+def test_readme_is_short_and_links_in_the_docs_are_valid():
     assert len((ROOT / "README.md").read_text(encoding="utf-8")) <= 8000
     broken = []
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "data/README.md"]:
@@ -111,7 +111,7 @@ def test_readme_is_short_and_links_are_valid():
     assert broken == []
 
 
-def test_recorded_block_shows_the_scores_of_presses_at_random_places():
+def test_block_recorded_shows_the_scores_of_presses_at_random_places():
     """Compares cells of the table with the committed results of scene lab."""
     quick, lab = (
         join(*(io.read_json(ROOT / f"reports/{scene}/{name}.json") for name in ("numbers", "provenance")))
@@ -129,7 +129,7 @@ def test_recorded_block_shows_the_scores_of_presses_at_random_places():
     assert line.endswith(f"| {mean:.0f} ({values[0]:.0f}; {values[1]:.0f}) |")
 
 
-def test_simulated_block_shows_ours_next_to_the_paper():
+def test_block_headline_shows_our_scores_next_to_those_of_the_paper():
     results = [
         join(*(io.read_json(ROOT / f"reports/{scene}/{name}.json") for name in ("numbers", "provenance")))
         for scene in ("paper", "quick")

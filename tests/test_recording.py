@@ -79,7 +79,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
 
 
-def test_progress_on_a_terminal(monkeypatch, capsys):
+def test_progress_on_a_terminal_shows_the_rate_lost_bytes_and_faults(monkeypatch, capsys):
     now_s = iter([0.0, 0.5, 1.0, 1.5, 3.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(now_s))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
@@ -113,7 +113,7 @@ def test_missing_port_leaves_no_files(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failing_label_source_is_reported(terminal, tmp_path):
+def test_error_of_a_label_source_ends_the_recording(terminal, tmp_path):
     def fail_to_open(_):
         raise CaptureError("the gauge: cannot open the port. Plug it in.")
 
@@ -125,7 +125,7 @@ def test_failing_label_source_is_reported(terminal, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_stuck_label_thread_writes_no_header(tmp_path):
+def test_marks_set_after_the_label_file_was_closed_are_not_written_to_the_header(tmp_path):
     part, header = begin_capture(tmp_path / "run1", NO_INFO, wire="binary", chips_n=5, by="a test")
     headers = [header]
     context = _label_context(part, headers, threading.Event())

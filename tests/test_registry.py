@@ -28,7 +28,7 @@ def test_same_recording_twice_is_an_error():
         register(ONE, header("c1"), "aa", allow_copy=True)
 
 
-def test_relabelled_copy_is_an_error_unless_allowed():
+def test_relabelled_copy_is_an_error_unless_copies_are_allowed():
     copy = header("c1", board="b1", skin="s1")
     with pytest.raises(CaptureError, match="--allow-copy"):
         register(ONE, copy, "aa")

@@ -58,7 +58,7 @@ print(load_universal().zero([0.0] * 15).predict([[0.0] * 15]).shape)
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """Return the names of the files that setuptools puts into the wheel."""
+    """Return a folder with the files that setuptools puts into the wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     arguments = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
     subprocess.run(
@@ -82,7 +82,7 @@ def test_wheel_contains_only_the_library(wheel):
     } <= names
 
 
-def test_third_party_scripts_have_a_licence(wheel):
+def test_third_party_scripts_have_a_licence_file(wheel):
     foreign = [file for file in wheel.rglob("*.js") if len(max(file.read_text().splitlines(), key=len)) > 500]
     assert [file.name for file in foreign if not list(file.parent.glob(f"{file.name}.LICENSE*"))] == []
 
@@ -97,7 +97,7 @@ def test_library_imports_only_required_packages():
     assert done.stdout == "(1, 3)\n", done.stderr
 
 
-def test_missing_package_names_its_extra():
+def test_error_for_a_missing_package_names_the_extra_that_installs_it():
     with pytest.raises(
         ParamsError, match=r"model.safetensors: the Python package `nowhere` is not installed.*\[pipeline\]"
     ):
@@ -124,7 +124,8 @@ def test_imported_packages_are_declared():
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
     required = {re.split(r"[\[<>=]", line)[0] for line in lines}
-    of_ros = {"rclpy", "std_srvs", *(name for name in imported if name.endswith("_msgs"))}  # not installed with pip
+    # These are packages of ROS 2, which pip cannot install.
+    of_ros = {"rclpy", "std_srvs", *(name for name in imported if name.endswith("_msgs"))}
     assert {known.get(name, name) for name in imported - of_ros} <= required
 
 
@@ -148,12 +149,12 @@ def test_supported_versions_of_python_are_the_same_everywhere():
     assert container in classified
 
 
-def test_licences_are_compatible():
+def test_licences_of_all_required_packages_are_compatible():
     assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # also fails if an exception is no longer needed
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
 
 
-def test_packages_of_torch_for_gpus_are_not_judged(tmp_path):
+def test_licences_of_gpu_packages_that_torch_needs_are_ignored(tmp_path):
     def package(name: str) -> PathDistribution:
         folder = tmp_path / f"{name}-1.dist-info"
         io.write_text(folder / "METADATA", f"Name: {name}\nLicense: Proprietary\n")
@@ -173,7 +174,7 @@ def test_packages_of_torch_for_gpus_are_not_judged(tmp_path):
         ("MIT License; my own words", False), ("BSD License (3-clause)", True),
     ],
 )  # fmt: skip
-def test_licence_is_compatible_if_one_alternative_is(licence, compatible):
+def test_licence_is_compatible_if_one_of_its_alternatives_is(licence, compatible):
     assert is_compatible(licence) is compatible
 
 
@@ -193,7 +194,7 @@ def test_constraints_omit_reskin_and_gpu_packages():
     assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
 
 
-def test_checkout_commands_are_listed():
+def test_list_of_checkout_commands_is_complete():
     names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
     assert {"scenes", "model", *names} == {*CHECKOUT_COMMANDS}
 

@@ -129,18 +129,19 @@ def test_remaining_time_is_within_a_factor_of_two_on_other_machines(checkout, st
     start(ORDER[0], 0.0)
     start(ORDER[1], 1.5 * slower)
     sentence = start(ORDER[2], 31.5 * slower)
-    assert sentence.startswith("progress: 31 % after ")  # These are 31.5 of 103 seconds.
+    # The stages that have ended account for 31.5 of the expected 103 s.
+    assert sentence.startswith("progress: 31 % after ")
     assert 0.5 < minutes_left(sentence) / (71.5 * slower / 60) < 2
 
 
-def test_other_scenes_and_stages_after_the_target_do_not_count(checkout, start, monkeypatch):
+def test_remaining_time_excludes_other_scenes_and_stages_after_the_target(checkout, start, monkeypatch):
     (checkout / "dvc.lock").unlink()
     monkeypatch.setattr(remaining, "stages_in_order", lambda: [*ORDER[:2], "split@other", *ORDER[2:]])
     sentence = start(ORDER[0], 0.0, "/usr/bin/dvc repro train_multi@tiny")
     assert minutes_left(sentence) == pytest.approx(91.5 / 60, abs=0.06)
 
 
-def test_next_run_starts_anew(checkout, start):
+def test_progress_starts_again_with_the_next_run(checkout, start):
     (checkout / "dvc.lock").unlink()
     start(ORDER[0], 0.0)
     start(ORDER[1], 1.5)
@@ -156,7 +157,7 @@ def test_progress_of_a_scene_without_report_is_unknown(checkout, start):
 def test_stage_outside_dvc_prints_nothing(checkout, monkeypatch):
     monkeypatch.delenv(remaining.VARIABLE, raising=False)
     assert progress() is None
-    monkeypatch.setenv(remaining.VARIABLE, ORDER[1])  # The variable is inherited, although no DVC runs.
+    monkeypatch.setenv(remaining.VARIABLE, ORDER[1])  # The variable is set, but no `dvc repro` runs.
     assert progress() is None
 
 
@@ -170,6 +171,6 @@ def test_stage_prints_the_progress_of_its_run(tmp_path):
     assert minutes_left(done.stderr) > 0
 
 
-def test_broken_state_does_not_stop_a_stage(checkout, start):
+def test_broken_state_file_does_not_stop_a_stage(checkout, start):
     io.write_text(remaining.STATE, json.dumps({"process": os.getpid()}))
     assert "the remaining time is unknown (KeyError" in start(ORDER[1], 0.0)

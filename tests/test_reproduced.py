@@ -32,7 +32,7 @@ def test_run_has_no_difference_from_itself(numbers):
 
 @FEW
 @given(NUMBERS, NUMBERS)
-def test_values_are_counted_once_and_symmetrically(one, other):
+def test_each_value_is_counted_once_in_either_direction_of_the_comparison(one, other):
     forwards, backwards = compare(one, other), compare(other, one)
     assert forwards.equal.total() == backwards.equal.total()
     both_n = forwards.equal.total() + len(forwards.differing)
@@ -51,7 +51,7 @@ def test_values_are_counted_once_and_symmetrically(one, other):
         ("a", "b", None),
     ],
 )  # fmt: skip
-def test_any_difference_is_counted(old, new, relative):
+def test_values_that_differ_at_all_are_listed_with_their_relative_difference(old, new, relative):
     (difference,) = compare({"shear": {"mean": old}}, {"shear": {"mean": new}}).differing
     assert difference.name == "shear.mean"
     assert difference.relative == (None if relative is None else pytest.approx(relative))
@@ -79,7 +79,7 @@ def test_rows_with_equal_labels_are_numbered():
     assert names == ["audit[a].what", "audit[a #2].what", "audit[b].what", "audit[#1].x_mm"]
 
 
-def test_changed_labels_are_paired_by_position():
+def test_rows_with_changed_labels_are_paired_by_their_position():
     old = [{"claim": "better", "holds": "no"}, {"claim": "better", "holds": "yes"}]
     new = [old[0], {"claim": "better", "holds": "inconclusive"}]
     (difference,) = compare({"order": old}, {"order": new}).differing
@@ -96,7 +96,7 @@ def test_changed_labels_are_paired_by_position():
         (True, False, None), (1.0, 2.0, None),
     ],
 )  # fmt: skip
-def test_verdict_is_the_first_word_of_the_text(old, new, verdicts):
+def test_change_of_the_verdict_at_the_start_of_a_text_is_recognised(old, new, verdicts):
     (difference,) = compare({"cell": old}, {"cell": new}).differing
     assert difference.verdicts == verdicts
 

@@ -23,7 +23,7 @@ def write_rwlock(locks, pid: int) -> None:
     (locks / RWLOCK).write_text(json.dumps({"write": {"data/out": entry}, "read": {"params.yaml": [entry]}}))
 
 
-def test_checkout_without_a_run_is_idle(tmp_path, locks):
+def test_checkout_in_which_no_dvc_repro_runs_is_idle(tmp_path, locks):
     require_idle(tmp_path / "elsewhere")
     (locks / LOCK).write_text("1")
     (locks / RWLOCK).write_text("{}")
@@ -36,8 +36,8 @@ def test_running_stage_is_an_error(tmp_path, locks):
         require_idle(tmp_path)
 
 
-def test_stale_lock_is_named(tmp_path, locks):
-    # A process that is not DVC.
+def test_error_names_the_lock_to_delete_if_its_process_is_not_dvc(tmp_path, locks):
+    # This process is not DVC, but the lock names it.
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
         write_rwlock(locks, other.pid)
         with pytest.raises(ParamsError, match=rf"If process {other.pid} is not DVC, delete \.dvc/tmp/rwlock first"):
@@ -47,7 +47,7 @@ def test_stale_lock_is_named(tmp_path, locks):
         other.communicate()
 
 
-def test_run_between_two_stages_is_an_error(tmp_path, locks):
+def test_dvc_repro_between_two_of_its_stages_is_an_error(tmp_path, locks):
     lock = LockFile(str(locks / LOCK))
     with pytest.raises(ParamsError, match="`dvc repro` runs in this checkout. Nothing was changed"):
         require_idle(tmp_path)

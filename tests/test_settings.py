@@ -51,7 +51,7 @@ class RecordingMapping(Mapping[str, Any]):
 
 
 def declared_sections(stage: str) -> tuple[set[str], set[str]]:
-    """Return the sections that dvc.yaml lists for a stage: those of the scene and those of params.yaml."""
+    """Return the sections of the scene and the sections of params.yaml that dvc.yaml lists for a stage."""
     scene_sections: set[str] = set()
     shared: set[str] = set()
     for entry in FLOW[stage]["do"].get("params", []):
@@ -122,7 +122,7 @@ def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
     files = {path: read_param_file(fs, path) for path, fs in file_systems.items()}
     values: dict[str, list[Any]] = {stage.name: [] for stage in stages}
     for name, dep in dependencies:
-        # as in `read_param_file` of DVC: without keys, a stage depends on the whole file
+        # As in `read_param_file` of DVC, a stage that lists no keys of a file depends on the whole file.
         content = files[dep.fs_path]
         values[name].append([dpath.get(content, key, separator=".") for key in dep.params] if dep.params else content)
     return {name: repr(of_stage) for name, of_stage in values.items()}
@@ -172,7 +172,7 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
 
 
 @pytest.mark.parametrize(("file", "override", "readers"), OVERRIDES, ids=[override for _, override, _ in OVERRIDES])
-def test_override_reruns_the_stages_that_read_it(root, stages, before, file, override, readers):
+def test_override_of_a_setting_reruns_the_stages_that_read_the_setting(root, stages, before, file, override, readers):
     with override_files(root, (file, override)):
         after = parameter_values(root, stages)
     known = {name if "@" in name else f"{name}@ci" for name in set().union(*(named for _, _, named in OVERRIDES))}
@@ -180,7 +180,7 @@ def test_override_reruns_the_stages_that_read_it(root, stages, before, file, ove
     assert changed & known == {name if "@" in name else f"{name}@ci" for name in readers}
 
 
-def test_protocol_edit_simulates_only_that_protocol(root, stages, before):
+def test_edit_of_a_protocol_reruns_only_its_own_simulation(root, stages, before):
     for protocol in FURTHER_PROTOCOLS:
         with override_files(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
             after = parameter_values(root, stages)
@@ -212,7 +212,7 @@ def test_stage_checks_only_the_sections_that_it_reads(root):
             plan.check(root)
 
 
-def test_control_has_the_settings_of_its_adaptation(root):
+def test_variant_control_has_the_settings_of_its_adaptation(root):
     with override_files(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
         adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}

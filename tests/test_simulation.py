@@ -68,7 +68,7 @@ def test_suitable_protocols_are_accepted(name, protocol, changes):
     check_protocols(with_protocol(name, protocol, **changes), "test")
 
 
-def test_main_boards_have_the_skin_of_the_paper():
+def test_boards_of_protocol_grid_must_have_a_skin_of_the_size_in_the_paper():
     changed = synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
     with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid must be .20.0, 20.0."):
         check_protocols(changed, "test")

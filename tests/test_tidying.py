@@ -54,7 +54,7 @@ def test_tidy_removes_only_stale_outputs(root):
     assert tidy.stale_outputs(root, plan.check(root)) == {}
 
 
-def test_file_of_a_planned_stage_is_kept(root):
+def test_folder_that_contains_outputs_of_a_planned_stage_is_kept(root):
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
     # This folder also contains outputs of train_multi.
     lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]
@@ -75,7 +75,7 @@ def test_experiment_in_the_scene_has_no_stale_outputs(root):
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
 
-def test_outputs_of_other_machines_are_not_listed(root):
+def test_stale_outputs_that_do_not_exist_on_this_machine_are_not_listed(root):
     (root / WRITTEN["drift@one"]).unlink()
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 

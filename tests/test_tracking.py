@@ -118,7 +118,7 @@ def test_each_training_run_is_published_once(tmp_path):
     contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
     assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
 
-    # After a change of settings, the new result is current, and the old result is kept.
+    # After a change of settings, the new result is current, and the run of the old result is kept.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k9"]
@@ -131,9 +131,9 @@ def test_each_training_run_is_published_once(tmp_path):
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k1"]
 
 
-def test_new_score_replaces_the_old_and_dropped_experiments_are_not_current(tmp_path):
+def test_runs_with_old_scores_and_runs_of_dropped_experiments_are_not_current(tmp_path):
     write(tmp_path, b0="k0", b1="k1")
-    # The same training run with a new score.
+    # The key is that of the same training run, but the score is new.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
     counts = send(tmp_path, {"train_multi": tmp_path / "models"})
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
@@ -145,7 +145,7 @@ def test_new_score_replaces_the_old_and_dropped_experiments_are_not_current(tmp_
     assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
 
 
-def test_report_run_has_figures_page_and_numbers(tmp_path):
+def test_run_of_a_report_has_its_figures_page_and_numbers(tmp_path):
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     write(tmp_path)
     (run,) = runs(tmp_path, "tags.stage = 'report'")
@@ -168,12 +168,12 @@ def test_report_run_has_figures_page_and_numbers(tmp_path):
     assert current.data.metrics == {"table2.multi.accuracy_pct": 60.0}
 
 
-def test_counts_of_data_are_no_metrics():
+def test_counts_are_not_published_as_metrics():
     numbers = {"capture": {"bytes_n": 5}, "drift": {"skins_n": 3, "end": {"accuracy_pct": {"mean": 90.0, "n": 2}}}}
     assert metrics_of(numbers) == [("drift.end.accuracy_pct.mean", 90.0, 0)]
 
 
-def test_runs_last_as_long_as_their_training(tmp_path):
+def test_runs_have_the_start_and_the_end_of_their_training(tmp_path):
     for name in ("b0", "b1"):
         write_model(tmp_path / "models", name, name)
     trainings = {("train_multi", "b0"): Span(1000.0, 4.0), ("train_multi", "b1"): Span(1003.0, 6.5)}
@@ -210,7 +210,7 @@ def test_views_list_the_scores_first(tmp_path):
     assert client.get_experiment_by_name("ci").tags["mlflow.note.content"] == "ours"
 
 
-def test_runs_of_the_earlier_layout_are_superseded(tmp_path, monkeypatch):
+def test_runs_that_were_published_with_an_earlier_layout_are_superseded(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "LAYOUT", 2)
     write(tmp_path, b0="k0")
     monkeypatch.undo()
@@ -218,7 +218,7 @@ def test_runs_of_the_earlier_layout_are_superseded(tmp_path, monkeypatch):
     assert len(runs(tmp_path, "tags.current = 'true' and tags.kind = 'training'")) == 1
 
 
-def test_sweep_run_has_metrics_over_steps(tmp_path):
+def test_run_of_a_sweep_has_its_metrics_by_step(tmp_path):
     write_report(tmp_path / "reports")
     curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
     send(tmp_path, curves=curves)
@@ -263,7 +263,7 @@ def history_points_n(client: mlflow.MlflowClient, run) -> int:
 
 
 @pytest.mark.parametrize("restored", [True, False])
-def test_unrestored_report_is_found_by_its_results(tmp_path, restored):
+def test_run_of_a_report_that_was_not_restored_is_found_by_its_results(tmp_path, restored):
     publish_state(tmp_path, old=True)
     first = current(tmp_path)
     publish_state(tmp_path, old=False)
@@ -273,14 +273,14 @@ def test_unrestored_report_is_found_by_its_results(tmp_path, restored):
     assert current(tmp_path) == first
 
 
-def test_unreported_results_are_published(tmp_path):
+def test_results_are_published_although_their_report_is_missing(tmp_path):
     publish_state(tmp_path, old=True)
     io.remove(tmp_path / "reports")
     publish_state(tmp_path, old=False, reported=False)
     assert {run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")} == {"train_multi", "sweep_pokes"}
 
 
-def test_interrupted_curve_is_written_again(tmp_path):
+def test_stage_runs_that_were_interrupted_are_published_again(tmp_path):
     publish_state(tmp_path, old=True)
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     for run in runs(tmp_path, "tags.kind = 'stage'"):
@@ -347,7 +347,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
     assert messages == []
 
 
-def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
+def test_publishing_to_a_slow_server_stops_and_can_be_continued_later(tmp_path, monkeypatch):
     # With -4 s plus 2 s per run, the time limit for two runs is 0 s.
     monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)
     with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):

@@ -37,7 +37,7 @@ print(1)
 """
 
 
-def test_steps_have_options_and_outputs():
+def test_read_steps_returns_the_options_and_outputs_of_steps():
     first, second = read_steps(PAGE_TEXT)
     assert first == Step("sh", "serve\n", "ready in 2.00 s\n", {"until": "ready", "stop": ""})
     assert second == Step("python", "print(1)\n", None)
@@ -49,12 +49,12 @@ def test_numbers_are_compared_with_a_tolerance_and_words_exactly(printed, differ
     assert bool(differences(Done(first, f"ready in {printed} s\n"))) == differs
 
 
-def test_writing_replaces_only_outputs():
+def test_write_replaces_only_the_outputs_on_the_page():
     done = [Done(step, "new\n") for step in read_steps(PAGE_TEXT)]
     assert write(PAGE_TEXT, done) == PAGE_TEXT.replace("ready in 2.00 s", "new")
 
 
-def test_shown_output_hides_the_folder_and_marks_what_is_left_out(tmp_path):
+def test_shown_output_replaces_the_folder_and_marks_omitted_lines(tmp_path):
     step = Step("sh", "", "", {"from": "two", "to": "three"})
     output = f"one\ntwo\none\ntwo {tmp_path}/a\nthree\nfour\n"
     assert shown(output, step, tmp_path) == "[...]\ntwo /home/me/reskin/a\nthree\n[...]\n"

@@ -49,7 +49,9 @@ def run_command(*arguments: str) -> tuple[int, str]:
         ((80.0, 80.0, "ridge"), 1, "| tables | table2    | 1       | 1        |"),
     ],
 )
-def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, expected):
+def test_finished_reports_are_compared_with_those_of_the_last_commit(
+    checkout, tmp_path_factory, changed, status, expected
+):
     other = tmp_path_factory.mktemp("other")
     write(other / "quick", *changed)
     write(checkout / "reports/quick", 0.0)  # reports in the working tree must be ignored
@@ -58,7 +60,7 @@ def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factor
     assert expected in output
 
 
-def test_rerun_starts_from_the_commit_and_its_clone_is_kept(checkout, monkeypatch):
+def test_rerun_starts_without_old_reports_and_keeps_its_new_reports(checkout, monkeypatch):
     def run(clone, environment, *arguments, quiet=False):
         if arguments[0] == "dvc":
             assert not list((clone / "reports/quick").glob("*"))
@@ -87,6 +89,6 @@ def test_missing_reports_are_an_error(checkout, arguments, message):
     assert message in str(done.exception)
 
 
-def test_failed_command_is_named(tmp_path):
+def test_error_for_a_failed_command_names_the_command(tmp_path):
     with pytest.raises(verify.SchemaError, match="`json.tool nowhere` failed in a clone of the last commit"):
         verify._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)

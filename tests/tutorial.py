@@ -6,9 +6,10 @@ tests/test_tutorial.py runs the quick steps, or all of them with RESKIN_BENCHMAR
 A step is a block of code (sh or python). The block of text that follows is the output of the step. An HTML comment
 before a step has options, separated by semicolons:
 
-* `until TEXT`: run in the background; the output ends with the first line that contains TEXT
-* `stop`: with `until`, then press Ctrl-C
-* `from TEXT`, `to TEXT`: show only the lines from the last one that begins with TEXT, and to the first one after it
+* `until TEXT`: run the step in the background; its output ends with the first line that contains TEXT
+* `stop`: after that line, press Ctrl-C (only together with `until`)
+* `from TEXT`: show only the lines from the last line that begins with TEXT
+* `to TEXT`: after that line, show only the lines up to the first one that begins with TEXT
 * `words`: compare only the words of the output, because trainings amplify the differences between recordings
 
 Consecutive Python steps share their variables.
@@ -38,12 +39,13 @@ STEP = re.compile(
     re.DOTALL,
 )
 LONG_S = 1800.0
-HTTP_PORT = "8765"  # port on the page; the test uses a free one, because several tests may run at the same time
+# The port on the page. The tests use a free port instead, because several tests may run at the same time.
+HTTP_PORT = "8765"
 # Two numbers are equal if they differ by at most TOLERANCE plus TOLERANCE_PCT % of the number on the page. Outputs
 # depend on times of arrival: a recording may begin at another frame, and the number of frames of a press varies by one.
 TOLERANCE_PCT, TOLERANCE = 20.0, 0.1
 NUMBER = re.compile(r"(?<![A-Za-z_])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
-OPTIONAL = (  # parts of lines that occur only if the machine is busy
+OPTIONAL = (  # patterns of parts of lines that are printed only if the machine is busy
     re.compile(r"; [a-z ]+(?:: [a-z ]+)? \(\d+, [\d.]+ s\)"),  # alarms
     re.compile(r"[,;] (?:skipped_|gap)\w+ \d+"),
     re.compile(r"; \d+ touches left out: [^;\n]*"),
@@ -110,7 +112,7 @@ def shown(output: str, step: Step, folder: Path) -> str:
 
 
 class Shell:
-    """Runs the steps of the page, and ends those in the background at the end of the `with` block."""
+    """Runs the steps of the page; at the end of the `with` block, ends the programs that run in the background."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._port = folder, str(_free_port())
@@ -198,7 +200,7 @@ def differences(done: Done) -> list[str]:
 def _without_optional(text: str) -> str:
     for pattern in OPTIONAL:
         text = pattern.sub("", text)
-    return re.sub(r" +", " ", re.sub(r"-{2,}", "--", text))  # tables are as wide as their numbers
+    return re.sub(r" +", " ", re.sub(r"-{2,}", "--", text))  # the widths of tables depend on their numbers
 
 
 def write(text: str, done: Sequence[Done]) -> str:

@@ -1,6 +1,6 @@
 """Benchmarks. `make bench` runs them at full size; the test suite runs each one at a tiny size.
 
-Sizes are written `size(FULL, TINY)`. Assertions about times and training results apply at full size only.
+A size is written as `size(FULL, TINY)`. Assertions about times and training results apply at full size only.
 """
 
 import os

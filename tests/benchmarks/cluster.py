@@ -176,10 +176,10 @@ def restart_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: st
         start_s = time.monotonic()
         process.wait(120)
         last_line = (place / "said.txt").read_text().splitlines()[-1]
-        require(process.returncode == 1 and "Finished trainings are cached" in last_line, last_line)
+        require(process.returncode == 1 and "Finished training runs are cached" in last_line, last_line)
         note(f"after {time.monotonic() - start_s:.1f} s: `{last_line}`")
         cluster.end_all()
-    with steps.step("restart scheduler and workers, repeat the command") as note:
+    with steps.step("the scheduler and the workers are restarted, and the command is repeated") as note:
         finished = {line[1] for line in running.lines("ended")}
         before_n = len(running.lines("begun"))
         cluster.start_all()
@@ -212,7 +212,7 @@ def slow_down(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 def sweep_with_slow_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
     with (
-        steps.step("one worker four times as slow (stopped for 1.5 s of every 2 s)") as note,
+        steps.step("one worker is four times as slow (it is stopped for 1.5 s of every 2 s)") as note,
         slow_down(cluster.up["w2"]),
     ):
         sweep = wait_for_sweep(cluster.sweep(folder / "slow"), folder / "slow")
@@ -278,7 +278,7 @@ def run_steps(steps: Steps, folder: Path) -> Measurements:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/measured")
-    parser.add_argument("--keep", type=Path, help="work in this folder and keep it")
+    parser.add_argument("--keep", type=Path, help="folder for all files of the test; it is kept")
     arguments = parser.parse_args()
     if reason := unsupported_reason():
         print(f"not tested: network namespaces need root on Linux and the command `ip`; on this machine: {reason}.")

@@ -1,9 +1,9 @@
 """Estimate the speed-up of training by 1 to 256 workers, and what limits it, by simulating the cluster.
 
-Uses the times and sizes measured by cluster.py and the training times of each stage in reports/<scene>/provenance.json;
-writes a table and a figure. The discrete-event simulation makes three assumptions. One client sends tasks one after
-another over a shared network. Each worker loads the training rows once. The time of a task is the mean for its stage,
-multiplied by a ratio drawn from the measured task times.
+The module uses the times and sizes measured by cluster.py, and the training times of each stage in
+reports/<scene>/provenance.json. It writes a table and a figure. The discrete-event simulation makes three assumptions.
+One client sends tasks one after another over a shared network. Each worker loads the training rows once. The time of a
+task is the mean for its stage, multiplied by a ratio drawn from the measured task times.
 """
 
 import heapq
@@ -32,7 +32,7 @@ class Measurements:
     """Times and sizes that the cluster test measured."""
 
     task_s: tuple[float, ...]  # CPU time of each task
-    processes_s: tuple[float, float]  # of the whole sweep: in one process, in two processes
+    processes_s: tuple[float, float]  # time of the whole sweep in one process, and in two processes
     call_s: float  # overhead of a task: time per empty task, when empty tasks are sent one after another
     connect_s: float  # time to connect a stage to a cluster whose workers have already loaded the libraries
     rows_bytes: float  # size of the training rows, which each worker loads once
@@ -138,8 +138,8 @@ def explain(
         f"The number of tasks limits the speed-up: stages of `paper` have {counts} tasks and run one after another.",
         f"The remaining work is counted as one process: {rest_s:.0f} s of {rest_s + work_s:.0f} s, which limits the "
         f"speed-up of `paper` to {(rest_s + work_s) / rest_s:.0f}.",
-        f"Dask is no limit: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. One "
-        f"scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
+        f"Dask does not limit the speed-up: with 256 workers, it costs {cost['`paper` in full']:.1f} % of the time of "
+        f"`paper`. One scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
         f"{largest.task_s:.0f} s.",
     ]
     return [f"- {line}" for line in lines]

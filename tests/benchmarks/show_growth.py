@@ -1,7 +1,8 @@
 """Write docs/growth.md and its figure from docs/measured/growth.json, which time_growth.py measures.
 
-Run `python -m tests.benchmarks.show_growth`. The page reports two exponents of cost against size: the slope in the
-log-log figure, which includes fixed costs, and the exponent of the growing part alone.
+Run `python -m tests.benchmarks.show_growth`. The page has two exponents of the growth of cost with size. The first is
+the slope of the curve in the log-log figure, which includes fixed costs. The second is the exponent p of a fit of
+a + b n^p, which separates the fixed costs a.
 """
 
 import json
@@ -21,21 +22,21 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
 GROWTH_MIN = 1.25  # cost ratio of two successive counts above which growth is distinguished from timing noise
-# For each stage, the work that explains its exponent (column `why`). A stage that is missing here raises a KeyError.
+# For each stage, the work that explains its exponent (column `reason`). Every stage must be listed here.
 CAUSES = {
-    "ingest_simulated": "one capture after another, independently: bytes to Parquet",
-    "describe": "one skin after another; medians over skins sort them",
-    "split": "reads and stacks all rows; each fold lists the names of its skins",
-    "train_multi": "the number of steps is fixed; reading and stacking rows and scoring each tested skin grow",
-    "report": "one account and one table row per capture",
-    "dvc": "hashes the inputs and outputs of each stage, file by file",
-    "dvc, raw captures": "hashes and stores the files of each capture",
-    "dvc, nothing to do": "checks the time and size of every file",
-    "whole": "the sum",
+    "ingest_simulated": "captures are converted to Parquet files one after another, independently of each other",
+    "describe": "skins are described one after another; medians over skins sort their values",
+    "split": "the stage reads and stacks all rows; each fold lists the names of its skins",
+    "train_multi": "the number of steps is fixed, but the stage reads and stacks all rows and scores each tested skin",
+    "report": "the report has byte counts and a table row for each capture",
+    "dvc": "DVC hashes the inputs and outputs of each stage, file by file",
+    "dvc, raw captures": "DVC hashes and stores the files of each capture",
+    "dvc, nothing to do": "DVC checks the time and size of every file",
+    "whole": "this row is the sum of all stages and of DVC",
     "add one": "DVC parses the .dvc file of every capture; the registry and the plan are rewritten",
-    "ingest and split all": "one capture after another in one stage, and DVC's files",
+    "ingest and split all": "one stage reads the captures one after another; DVC hashes and stores files",
     "nothing to do": "DVC parses the .dvc file of every capture and checks its files",
-    "ingest one more, split": "as `nothing to do`; DVC hashes and stores the readings again, and split reads them",
+    "ingest one more, split": "like `nothing to do`; DVC also hashes and stores all readings, and split reads them",
 }
 Points = list[tuple[int, float]]
 
@@ -81,12 +82,12 @@ def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
         (m, before), (n, last) = stage_points[-2:]
         power, per_item = exponent(stage_points), max(last - before, 0.0) / (n - m)
         yield {
-            "what": name,
+            "stage or command": name,
             **{f"{count:,}": short(value) for count, value in stage_points},
-            "slope, last step": f"{slopes(stage_points)[-1]:.2f}",
-            "exponent beyond the fixed start": "–" if power is None else f"{power:.2f}",
+            "slope between the last two": f"{slopes(stage_points)[-1]:.2f}",
+            "exponent p of a + b n^p": "–" if power is None else f"{power:.2f}",
             f"at {MANY_N:,}": short(last + per_item * (MANY_N - n)),
-            "why": CAUSES[name],
+            "reason": CAUSES[name],
         }
 
 

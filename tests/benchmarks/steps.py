@@ -49,6 +49,6 @@ def end_on_signals() -> None:
 
 
 def require(condition: bool, what: str) -> None:
-    """Raise an AssertionError unless the condition is true. Unlike `assert`, this also works under `python -O`."""
+    """Raise an AssertionError unless the condition is true; unlike `assert`, this also works under `python -O`."""
     if not condition:
         raise AssertionError(what)

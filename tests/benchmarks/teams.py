@@ -181,7 +181,7 @@ def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
         ben.git("pull", "--quiet", "--no-rebase", "origin", "main", check=False)
         conflicts = ben.git("diff", "--name-only", "--diff-filter=U").split()
         require({"dvc.lock", "data/captures.yaml", "pipeline/plan.yaml"} <= {*conflicts}, f"in conflict: {conflicts}")
-        note(f"{len(conflicts)} files in conflict, none after")
+        note(f"{len(conflicts)} files in conflict before `reskin merge`, none after it")
         ben.reskin("merge")
         ben.git("commit", "--quiet", "-m", "Merge both skins")
     with steps.step("Ben: `dvc pull`, `dvc repro`, commit, push") as note:
@@ -278,7 +278,7 @@ def run_steps(steps: Steps, folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/measured/teams.md")
-    parser.add_argument("--keep", type=Path, help="work in this folder and keep it")
+    parser.add_argument("--keep", type=Path, help="folder for all files of the workflow; it is kept")
     arguments = parser.parse_args()
     end_on_signals()
     steps = Steps()

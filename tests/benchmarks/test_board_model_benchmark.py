@@ -43,8 +43,9 @@ from tests.recordings.headers import DEFAULT_POLICY, PARAMS, make_header
 
 ROOT = Path(__file__).resolve().parents[2]
 LABELS_N, SEEDS_N, SKINS_N = size((0, 10, 40), (0, 10)), size(5, 1), size(12, 1)
-CLASSICAL = parse(RbfRidge, PARAMS["methods"]["few-labels"]["rbf-shape"], "params.yaml")  # not tuned on any pad
-FORCE_MIN_N = 0.3  # smallest force of the layout; weaker readings are not used
+# The settings of this method were not tuned on eFlesh pads.
+CLASSICAL = parse(RbfRidge, PARAMS["methods"]["few-labels"]["rbf-shape"], "params.yaml")
+FORCE_MIN_N = 0.3  # the smallest force that the layout's model estimates; readings with a smaller force are not used
 PITCH_MM = 8.0  # assumed distance between the nine places of `eflash7`, which the recordings do not state
 
 
@@ -82,7 +83,7 @@ def by_ridge(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray,
 
 
 def by_mean(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
-    """Predict the mean of the labels for all presses; any useful estimate must be better."""
+    """Predict the mean of the labels for all presses. A useful method must have smaller errors than this."""
     target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].mean(axis=0)
     return np.tile(target, (len(tested.db_uT), 1))
 
@@ -159,7 +160,10 @@ def make(layout: BoardLayout) -> Universal:
 
 @cache
 def model_for(name: str) -> Universal:
-    """Make the model for a layout of the project; at tiny size and for the paper's board, load the shipped model."""
+    """Make the model for a layout of the project.
+
+    At the tiny size and for the paper's board, the shipped model is loaded instead.
+    """
     if not FULL or name == "reskin":
         return load_universal()
     return make(read_layout(name))
@@ -172,8 +176,11 @@ def model() -> Universal:
 
 
 @pytest.mark.parametrize("name", ["reskin", "anyskin", "eflesh"])
-def test_simulated_skins_of_the_layout(name: str) -> None:
-    """Score the model on simulated skins of its layout, with errors of the law as in training."""
+def test_accuracy_on_simulated_skins_of_a_layout(name: str) -> None:
+    """Score the model on simulated skins of its layout.
+
+    Their fields differ from those of the simulated law by random errors, as in training.
+    """
     model = model_for(name)
     inputs = read_inputs(layout=model.layout)
     skins = draw_prior_skins(inputs.prior, SKINS_N, 1, "benchmark", law_error())
@@ -195,7 +202,7 @@ def test_simulated_skins_of_the_layout(name: str) -> None:
     for labels_n in LABELS_N:
         say(f"simulated {model.layout.name}, places | {labels_n} labels", places[labels_n], "mm")
         say(f"simulated {model.layout.name}, forces | {labels_n} labels", forces[labels_n], "N")
-        assert np.mean(places[labels_n], axis=0)[0] > 20  # by chance, less than 1 %
+        assert np.mean(places[labels_n], axis=0)[0] > 20  # by chance, less than 1 % of the places would be within 1 mm
 
 
 def folder_of(variable: str) -> Path:
@@ -204,7 +211,7 @@ def folder_of(variable: str) -> Path:
     return Path(os.environ[variable])
 
 
-def test_field_changes_of_the_first_pass() -> None:
+def test_simulated_field_changes_differ_from_those_of_a_recorded_eflesh_pad() -> None:
     """Print the cosine between simulated and recorded field changes, for the layout and for rotations of its board."""
     (recording,) = (folder_of("RESKIN_EFLESH") / "spatial_resolution").iterdir()
     readings, _ = read(recording, "eflesh", {})
@@ -219,12 +226,13 @@ def test_field_changes_of_the_first_pass() -> None:
         cosine = cosines(chips_uT, recorded_uT.reshape(db_uT.shape))
         size_uT = np.median(magnitudes_uT(db_uT)), np.median(np.linalg.norm(recorded_uT, axis=1))
         print(
-            f"board turned by {turn_deg} degrees: mean cosine {cosine.mean():.2f}, median |dB| {np.round(size_uT)} uT"
+            f"board turned by {turn_deg} degrees: mean cosine of simulated and recorded dB {cosine.mean():.2f}, "
+            f"median |dB| {np.round(size_uT)} uT"
         )
         assert abs(cosine.mean()) < 0.5  # the law does not describe the pad; otherwise docs/learning.md is out of date
 
 
-def test_places_on_a_recorded_pad(model: Universal) -> None:
+def test_errors_of_places_on_a_recorded_pad(model: Universal) -> None:
     """Draw labels from the first four passes over the pad; test the fifth pass."""
     (recording,) = (folder_of("RESKIN_EFLESH") / "spatial_resolution").iterdir()
     readings, _ = read(recording, "eflesh", {})
@@ -237,7 +245,7 @@ def test_places_on_a_recorded_pad(model: Universal) -> None:
 
 
 @pytest.mark.parametrize("i", [0, 1])
-def test_forces_on_a_recorded_pad(model: Universal, i: int) -> None:
+def test_errors_of_forces_on_a_recorded_pad(model: Universal, i: int) -> None:
     """Draw labels from the first eight strokes of a force gauge at one place; test the last two strokes."""
     recording = sorted((folder_of("RESKIN_EFLESH") / "normal_force").iterdir())[i]
     readings, _ = read(recording, "eflesh", {"force_axis": "z"})
@@ -247,7 +255,7 @@ def test_forces_on_a_recorded_pad(model: Universal, i: int) -> None:
     compare(f"forces, eflesh {i}", model, pool, tested, "N")
 
 
-def test_forces_on_a_pad_of_nine_places(model: Universal) -> None:
+def test_errors_of_forces_on_a_pad_that_was_pressed_at_nine_places(model: Universal) -> None:
     """Draw labels from the first 60 % of each recording of one place; test the last 40 %."""
     pools, tests = [], []
     for n in range(1, 10):
@@ -264,8 +272,8 @@ def test_forces_on_a_pad_of_nine_places(model: Universal) -> None:
 
 
 @pytest.mark.parametrize("omitted", [None, 4, 0])
-def test_recorded_boards_with_fewer_chips(omitted: int | None) -> None:
-    """Omit a chip of the paper's board from layout and recordings, as if the board had four chips; test both boards.
+def test_errors_on_recorded_boards_with_one_chip_omitted(omitted: int | None) -> None:
+    """Omit a chip of the paper's board from layout and recordings, as if the board had four chips; test two boards.
 
     Labels are drawn from a third of the presses of a board; the others are tested.
     """
@@ -278,7 +286,7 @@ def test_recorded_boards_with_fewer_chips(omitted: int | None) -> None:
     for board in ("board1", "board2"):
         parts = [read(file, "lab", {})[0] for file in sorted(folder.glob(f"{board}_depth*.csv"))]
         recorded = pool_captures(parts)
-        # the y axis of the labels is opposite to that of the board
+        # The y axis of the labels and the y axis of the board point in opposite directions.
         place_mm = recorded.place_mm * (1, -1) + (0, 2 * layout.centre_mm[1])
         channels = (len(place_mm), 3 * len(kept))
         all_presses = Presses(

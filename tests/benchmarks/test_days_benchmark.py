@@ -1,9 +1,10 @@
-"""Accuracy on a later day on which the skin slides differently, with presses of both days.
+"""Accuracy on a later day on which the skin slides on its base in another way, with presses of both days.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_days_benchmark.py` prints the tables of docs/learning.md. All
-skins are simulated: parameters and errors of the law are drawn as in training, with other seeds. On the later day,
-either nothing has changed, or the parameters of the slide are drawn again from the prior, or these parameters and the
-errors of the law are drawn again. No recorded press is used.
+skins are simulated. Their parameters and the errors of the law (differences between the fields of a skin and those that
+the simulated law predicts) are drawn as in training, with other seeds. On the later day, either nothing has changed, or
+the parameters of the slide are drawn again from the prior, or these parameters and the errors of the law are drawn
+again. Except in the last test, no recorded press is used.
 """
 
 from collections.abc import Callable, Iterator
@@ -34,13 +35,16 @@ CHOICE_SEED, SEED = 1, 2
 CHOICE_SKINS_N, SKINS_N, COVERAGE_SKINS_N = 24, size(96, 1), 24
 PRESSES_N, LABELS_N = size((0, 5, 12, 65), (5,)), size((0, 10, 40), (10,))
 CHOICE_PRESSES_N, RECORDED_PRESSES_N = (1, 3, 12), (0, 5, 12)
-# tried pairs of correlations between days: of the slide, of the law's errors
+# These pairs of correlations between the two days are tried. The first value is the correlation of the slide, and the
+# second value is the correlation of the law's errors.
 CORRELATIONS = (0.0, 0.0), (0.0, 0.5), (0.0, 0.7), (0.0, 0.85), (0.0, 1.0), (0.5, 0.7)
 LOG_ODDS_MIN = -np.inf, 0.0, 2.0, 5.0, np.inf
 WAYS = TOGETHER, ALONE, BY_DAY = "all presses together", "new presses alone", "by day"
 UNCHANGED, CHANGED, OTHER_ERRORS = "unchanged", "changed", "changed, other errors"
 NORMAL_90 = 1.645
-FULL_ONLY = pytest.mark.skipif(not FULL, reason="at a tiny size, this repeats the other test and tests/universal")
+FULL_ONLY = pytest.mark.skipif(
+    not FULL, reason="at the tiny size, this test would only repeat the other test and tests/universal"
+)
 
 
 @dataclass(frozen=True)
@@ -127,10 +131,14 @@ class TwoDays:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_correlations_and_limit_in_use_are_nearly_the_best(monkeypatch):
-    """Choose the correlations, then the limit. Unchanged and changed errors of the law have equal weight."""
+def test_correlations_and_log_odds_limit_in_use_are_nearly_optimal(monkeypatch):
+    """Compare the correlations, and then the limit of the log odds above which the slide counts as unchanged.
+
+    Days with unchanged and with changed errors of the law have equal weight.
+    """
     skins = list(draw_skins(CHOICE_SKINS_N, CHOICE_SEED))
-    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)  # always assume that the slide has changed
+    # No log odds reach this limit, so the slide always counts as changed.
+    monkeypatch.setattr(model, "SAME_SLIDE_LOG_ODDS_MIN", np.inf)
     by_pair = {}
     for pair in CORRELATIONS:
         with monkeypatch.context() as settings:
@@ -173,11 +181,14 @@ def test_accuracy_on_a_later_day():
             for labels_n, days in by_labels_n.items():
                 together = days.score(change, n, TOGETHER)
                 same = days.log_odds(change, n) >= model.SAME_SLIDE_LOG_ODDS_MIN
-                by_day = together if same else days.score(change, n, BY_DAY)  # if `same`, both are equal
+                # If `same` is true, calibration by day uses all presses together.
+                by_day = together if same else days.score(change, n, BY_DAY)
                 scores.setdefault((change, labels_n, n), []).append((together, alone, by_day))
     for change, of_skins in cosines.items():
         print(f"cosine of equal presses, slide {change}: 5, 50, 95 % quantiles {np.percentile(of_skins, [5, 50, 95])}")
-    print(f"| slide | labels | new presses | {TOGETHER} | {ALONE} | {BY_DAY} | {BY_DAY} minus the better one |")
+    print(
+        f"| slide | labels | new presses | {TOGETHER} | {ALONE} | {BY_DAY} | {BY_DAY} minus the better of the others |"
+    )
     print("|---|---|---|---|---|---|---|")
     for change, labels_n, n in sorted(scores, key=lambda row: (list(cosines).index(row[0]), *row[1:])):
         of_ways = np.array(scores[change, labels_n, n])
@@ -196,7 +207,7 @@ def test_accuracy_on_a_later_day():
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_coverage_and_force_on_a_later_day(tmp_path):
+def test_interval_coverage_and_force_errors_on_a_later_day(tmp_path):
     n, file = 12, tmp_path / "first.safetensors"
     scores: dict[tuple[str, int, str], list[tuple[float, float, float]]] = {}
     for skin, labels_n in product(draw_skins(COVERAGE_SKINS_N, SEED), LABELS_N):
@@ -242,7 +253,7 @@ def read_depth(file: Path, folder: Path) -> tuple[np.ndarray, LabelledPresses]:
 
 @FULL_ONLY
 @pytest.mark.timeout(3600)
-def test_recorded_depths_used_as_days(shared_data, tmp_path):
+def test_accuracy_if_recorded_depths_are_used_as_days(shared_data, tmp_path):
     """Use recordings at one depth as the first day, and recordings at another depth as the later day.
 
     These recordings are not from different days, so this does not test a change from day to day. Labels are at tested
@@ -257,9 +268,8 @@ def test_recorded_depths_used_as_days(shared_data, tmp_path):
         depths, place_mm = [presses[order] for presses in depths], depths[0].place_mm[order]
         np.testing.assert_allclose([presses.place_mm for presses in depths], [place_mm] * len(depths), atol=1e-9)
         new_n = max(RECORDED_PRESSES_N)
-        presses_i = np.concatenate(
-            [np.arange(PLACES_N), np.arange(PLACES_N - new_n)]
-        )  # the last new_n presses are not tested on the later day
+        # The last `new_n` presses are not tested on the later day.
+        presses_i = np.concatenate([np.arange(PLACES_N), np.arange(PLACES_N - new_n)])
         for first, later in permutations([presses[presses_i] for presses in depths], 2):
             skin = SkinOnTwoDays(
                 np.mean(rests_uT, axis=0), first.place_mm, first.force_N, first.db_uT, {CHANGED: later.db_uT}

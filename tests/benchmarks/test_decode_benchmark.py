@@ -101,7 +101,7 @@ def test_decoding_time_of_binary_frames(crlf_share):
     print(f"  blocks: {ours_s:.3f} s, {FRAMES_N / ours_s:.3g} frames/s, ", end="")
     print(f"peak {peak_MB(lambda: decode_all(data, 'binary', CHIPS_N, 'benchmark')):.0f} MB in addition to the bytes")
     print(f"  blocks, fed {PORTION_BYTES_N} bytes at a time: {best_s(lambda: feed_in_portions(data, 'binary')):.3f} s")
-    print(f"  moving the values alone: {copy_s:.3f} s; copying the bytes unchanged: {flat_s:.3f} s")
+    print(f"  copying only the values into arrays: {copy_s:.3f} s; copying the bytes unchanged: {flat_s:.3f} s")
     loop_data = data[: LOOP_FRAMES_N * FRAME_BYTES_N]
     for loop in (bare_loop, reader_loop, loop_to_arrays):
         loop_s = best_s(lambda loop=loop: loop(loop_data)) * FRAMES_N / LOOP_FRAMES_N

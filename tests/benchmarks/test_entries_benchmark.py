@@ -1,4 +1,7 @@
-"""Benchmark: our methods have the scores of their committed entries (dataset `simulated`)."""
+"""Test that our methods reach the scores of their entries that are committed to the benchmark.
+
+Only dataset `simulated` is used.
+"""
 
 from pathlib import Path
 
@@ -17,11 +20,12 @@ NAMES = [name for name, method in METHODS.items() if "simulated" in method.datas
 
 
 @pytest.mark.parametrize("name", size(NAMES, ["ridge regression"]))
-def test_entry_is_reproduced(name: str, tmp_path: Path) -> None:
+def test_scores_of_a_committed_entry_are_reproduced(name: str, tmp_path: Path) -> None:
     data, file = read_dataset("simulated"), entry_file("simulated", name)
     committed = parse(Entry, io.read_json(file), str(file))
     write(list(METHODS[name].predict(data.tasks())), tmp_path / "again.csv")
     again = score_predictions(tmp_path / "again.csv", read_predictions(tmp_path / "again.csv"), data, committed.about)
     for task, before in zip(again.tasks, committed.tasks, strict=True):
-        # tolerance: trained networks differ between processors; the intervals over boards are wider than the tolerance
+        # The tolerance allows for networks that are trained differently on another processor. It is less than the width
+        # of the intervals over boards.
         assert task.scores["accuracy_pct"]["mean"] == pytest.approx(before.scores["accuracy_pct"]["mean"], abs=2)

@@ -47,7 +47,7 @@ def run_c(folder: Path, b_uT: np.ndarray, *options: str) -> tuple[np.ndarray, fl
 
 
 @pytest.mark.skipif(not FULL or COMPILER is None, reason="needs RESKIN_BENCHMARKS=full and a C compiler")
-def test_exported_estimates_equal_those_of_python(tmp_path):
+def test_estimates_of_exported_models_equal_those_of_python(tmp_path):
     runtime = pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
     (tmp_path / "main.c").write_text(PROGRAM)
     largest: dict[tuple[str, str], float] = {}

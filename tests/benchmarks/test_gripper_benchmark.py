@@ -31,4 +31,7 @@ def test_error_of_the_held_force(feedback, aim_N):
             within.append((error < 0.1).mean())
     print(f"\n{feedback}, {aim_N:g} N, {SKINS_N} skins at {len(PLACES_MM)} places each:")
     print(f"  error of the true force: median {np.median(errors):.1%}, worst {max(errors):.1%}")
-    print(f"  time within 10 %: mean {np.mean(within):.0%}; always in {np.sum(np.array(within) == 1)} of {len(within)}")
+    print(
+        f"  time within 10 %: mean {np.mean(within):.0%}; "
+        f"all the time in {np.sum(np.array(within) == 1)} of {len(within)} grips"
+    )

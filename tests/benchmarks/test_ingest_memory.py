@@ -26,14 +26,13 @@ from tests.recordings.headers import DEFAULT_POLICY, make_header
 INDENTATIONS_N = size(1_000_000, 800)
 TILE_N = size(4_000, 400)  # indentations in the block of bytes that is written repeatedly
 QUIET_N = 400  # no-load frames before the first indentation and after the last
-SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # fraction of the indentation's full field change, frame by frame
-TRAVEL_N = 8  # most frames between indentations; random, because these gaps serve to match the clocks
+# The fraction of the full field change in each frame of an indentation.
+SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])
+# The largest number of frames between indentations. The number is random, so that the clocks can be matched by it.
+TRAVEL_N = 8
 RATE_HZ = 400.0
-ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = (
-    size(800, 2000),
-    size(240_000, 800),
-    80,
-)  # the stream has about 1 GB, which exceeds the memory limit
+# The stream has about 1 GB, which exceeds the memory limit.
+ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = size(800, 2000), size(240_000, 800), 80
 PEAK_MAX_MB = 1500  # 0.1 GB for the probe log of 2e6 dwells, 0.15 GB for its text, the rest for parsing
 
 
@@ -80,8 +79,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("marks", [((1.0, 1.0),), ()], ids=["marks", "contacts"])
-def test_a_million_indentations_are_read_in_bounded_memory(
+@pytest.mark.parametrize("marks", [((1.0, 1.0),), ()], ids=["clock from marks", "clock from contacts"])
+def test_memory_is_bounded_when_a_million_indentations_are_read(
     folder: Path, tmp_path: Path, marks: tuple[tuple[float, float], ...]
 ) -> None:
     capture = header(marks)
@@ -120,7 +119,7 @@ print(account["frames_n"], account["indentations_n"], round(peak_mb()))
 
 
 @pytest.mark.timeout(1800)
-def test_a_capture_larger_than_memory_is_read(tmp_path: Path) -> None:
+def test_capture_that_is_larger_than_the_memory_limit_is_read(tmp_path: Path) -> None:
     write_capture(tmp_path, LARGE_N, LARGE_TRAVEL_N)
     stream_MB = (tmp_path / STREAM_FILE).stat().st_size / 1e6
     command = [sys.executable, "-c", READ, str(tmp_path)]

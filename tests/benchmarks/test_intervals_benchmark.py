@@ -3,11 +3,11 @@
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_intervals_benchmark.py`, which takes three minutes of
 processor time. The law error is the difference between a skin's fields and the fields of the simulated law. The network
 (variant `nominal`, settings of scene lab) is trained on simulated skins alone. For each kind of law error, the
-benchmark prints the misfit of the unlabelled presses. For each number of labels, it prints four numbers for the map,
-then for map and network combined: the coverage at the assumed likelihood power, the coverage at the calibrated power,
-in brackets the half width of the interval at the calibrated power, and the accuracy. The last number is the standard
-deviation over skins of the coverage of map and network at the calibrated power. The test asserts that larger law errors
-widen the intervals.
+benchmark prints the misfit of the unlabelled presses. For each number of labels, it prints four numbers for the map
+alone, and then for map and network combined: the coverage at the assumed likelihood power, the coverage at the
+calibrated power, the half width of the interval at the calibrated power (in brackets), and the accuracy. The last
+number of a line is the standard deviation, over skins, of the coverage of map and network at the calibrated power. The
+test asserts that larger law errors widen the intervals.
 """
 
 import numpy as np
@@ -41,7 +41,10 @@ SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
 def law_error(size: float, length_mm: tuple[float, float] = batches.ERROR_MM) -> LawError:
-    """Return a law error like that of training, of rms size `size` |dB|; its length scale is drawn from `length_mm`."""
+    """Return a function that adds law errors as in training to the fields of skins.
+
+    The rms of the errors is `size` |dB|, and their length scale is drawn from `length_mm`.
+    """
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
@@ -58,7 +61,7 @@ def mix_chips(skins: Population, rng: np.random.Generator) -> np.ndarray:
 
 
 def add_memory(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Subtract from each press 15 % of the field change of another press on the same skin, chosen at random."""
+    """Subtract from each press 15 % of the field change of another, random press on the same skin."""
     order = [rng.permutation(skins.db_uT.shape[1]) for _ in range(len(skins))]
     return np.stack([db_uT - 0.15 * db_uT[one] for db_uT, one in zip(skins.db_uT, order, strict=True)])
 
@@ -70,10 +73,10 @@ def add_independent_errors(skins: Population, rng: np.random.Generator) -> np.nd
 
 
 FAMILIES: dict[str, LawError] = {
-    "nothing missed": law_error(0.0), "0.3 of |dB|": law_error(0.3), "0.5": law_error(0.5), "0.6": law_error(0.6),
-    "0.8": law_error(0.8), "0.5 over 1.2 to 2 mm": law_error(0.5, (1.2, 2.0)),
-    "0.5 over 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "chips mixed": mix_chips, "remembered": add_memory,
-    "one by one": add_independent_errors,
+    "no error": law_error(0.0), "0.3 |dB|": law_error(0.3), "0.5 |dB|": law_error(0.5), "0.6 |dB|": law_error(0.6),
+    "0.8 |dB|": law_error(0.8), "0.5 |dB|, length scale 1.2 to 2 mm": law_error(0.5, (1.2, 2.0)),
+    "0.5 |dB|, length scale 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "random gain matrix of each chip": mix_chips,
+    "memory of another press": add_memory, "independent error of each press": add_independent_errors,
 }  # fmt: skip
 
 
@@ -88,8 +91,8 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
     print("\npowers by labels:", {n: [round(power, 2) for power in powers] for n, powers in by_labels.items()})
     widths_mm = {}
     for name, error in {
-        "of the prior": universal.law_error(),
-        "as for the choice of powers": universal.unmodelled_error(),
+        "law error as in training": universal.law_error(),
+        "law error with which the powers are chosen": universal.unmodelled_error(),
         **size(FAMILIES, dict([*FAMILIES.items()][:1])),
     }.items():
         skins = draw_prior_skins(prior, SKINS_N, SEED, "asked", error)
@@ -103,7 +106,7 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
                 for assumed, covered, mm, within in found
             ) + f" | sd of the coverage over skins: {100 * sd:.1f} points")  # fmt: skip
             widths_mm[name, n] = found[1, 2]
-    assert not FULL or widths_mm["nothing missed", 0] < widths_mm["0.5", 0] < widths_mm["0.8", 0]
+    assert not FULL or widths_mm["no error", 0] < widths_mm["0.5 |dB|", 0] < widths_mm["0.8 |dB|", 0]
 
 
 def _scores(calibration, tested, labels_n, powers):

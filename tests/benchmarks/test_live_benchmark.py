@@ -69,7 +69,7 @@ def test_latency_from_last_byte_to_estimate(tmp_path, boards):
             page.wait()
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
+@pytest.mark.skipif(BROWSER is None, reason="no browser was found: see tests/live/test_browser.py")
 @for_all_boards
 def test_latency_from_last_byte_to_screen(tmp_path, boards):
     async def act(tab: Tab) -> None:
@@ -156,7 +156,7 @@ def serve_in_thread(sessions: list[Session]) -> str:
 
 
 @pytest.mark.timeout(3600)
-def test_memory_of_a_day_of_frames():
+def test_memory_used_by_the_traces_of_a_day():
     traces, made_n = Traces(layout_of(5), 0.0), 400
     rng = np.random.Generator(np.random.PCG64(0))
     db_uT = rng.standard_normal((made_n, 15)).astype(np.float32)
@@ -188,7 +188,7 @@ class Accelerated:
 
 @pytest.mark.timeout(7200)
 @pytest.mark.skipif(not STATM.exists(), reason="needs /proc of Linux")
-def test_memory_of_hours_of_bytes(tmp_path):
+def test_memory_used_while_bytes_are_decoded_for_hours(tmp_path):
     script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", size("1", "0.02")))
     frames_n = round(400 * QUARTER_S)
     chunks = [b"".join(script.pieces[i : i + frames_n]) for i in range(0, len(script) - frames_n + 1, frames_n)]

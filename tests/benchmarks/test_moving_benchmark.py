@@ -23,7 +23,7 @@ from reskin.universal.model import CalibratedModel, Evaluation, PriorModel, load
 from tests.benchmarks import FULL, size
 from tests.universal.skins import SETUP
 
-SEED, POWER = 2021, 0.5  # the power affects only standard deviations, which are not reported
+SEED, POWER = 2021, 0.5  # the likelihood power; it affects only standard deviations, which are not printed
 
 
 def magnets_uT(distance_mm: float, sd_uT: float, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -43,7 +43,7 @@ NETWORKS = ("reading as it is", "mean over chips removed", "left out", "expected
 
 
 def with_networks(model: CalibratedModel, found: Evaluation, db_uT: np.ndarray, networks: str) -> Evaluation:
-    """Replace the networks' estimates as one of the options `NETWORKS` states."""
+    """Replace the networks' estimates by those for another input; `networks` is one of `NETWORKS`."""
     own = found.network
     if networks == "left out":
         nothing = np.full_like(own.sd_mm, 1e6)
@@ -56,7 +56,7 @@ def with_networks(model: CalibratedModel, found: Evaluation, db_uT: np.ndarray, 
     return replace(found, network=own)
 
 
-def test_networks_and_distance_on_simulated_skins():
+def test_accuracy_by_inputs_of_the_networks_and_distance_of_magnets():
     """Compare inputs of the networks and assumed distances of magnets; both choices follow from these results."""
     skins_n, shipped = size(24, 1), load_universal()
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
@@ -87,17 +87,17 @@ def test_networks_and_distance_on_simulated_skins():
             cells = "  ".join(f"{pct:5.1f} / {mse:.2f}" for pct, mse in row)
             name = f"external_uT {sd_uT:3.0f}, magnets at {distance_mm:6.0f} mm, networks: {networks}"
             print(f"{labels_n:2} labels, {name:82} {cells}")
-    if FULL:  # the option improves places near magnets, and costs accuracy without external fields
+    if FULL:  # option `external_uT` makes places near magnets more accurate, and less accurate without external fields
         on = within[140.0, external.DISTANCE_MM, NETWORKS[3], 0]
         off = within[0.0, external.DISTANCE_MM, NETWORKS[0], 0]
         assert on[3] > off[3]
         assert on[0] < off[0]
 
 
-def test_coverage_on_simulated_skins():
+def test_interval_coverage_in_external_fields():
     """Compute the coverage of 90 % intervals, in fields of magnets that have the expected size.
 
-    `POWER_uT` and `POWER_PER_LABEL_uT` were chosen on other skins, with the name "external powers".
+    `POWER_uT` and `POWER_PER_LABEL_uT` were chosen on other skins, which were drawn with the name "external powers".
     """
     skins_n = size(24, 1)
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)

@@ -1,8 +1,9 @@
 """Place error after labelling presses at places chosen by the map's uncertainty, at fixed places, or at random.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, which takes one minute. The skins
-are simulated, with parameters around those of the nominal skin and law errors as in training; the shipped model was not
-trained on them. On each skin, 65 presses on the grid are candidates for labels, and another 65 are test presses.
+are simulated, with parameters around those of the nominal skin. As in training, their fields differ from those of the
+simulated law by random errors. The shipped model was not trained on these skins. On each skin, 65 presses on the grid
+are candidates for labels, and another 65 are test presses.
 """
 
 from collections.abc import Callable
@@ -26,7 +27,7 @@ SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
 Choose = Callable[[Universal, list[int]], int]
 
 
-def test_errors_by_choice_of_labelled_places():
+def test_place_errors_by_strategy_of_choosing_labelled_places():
     rng, errors = rng_for(0, "next place"), {}
     design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)

@@ -1,4 +1,4 @@
-"""The three commands of docs/add-a-skin.md on simulated recordings of three boards with six chips, and their time.
+"""Run the three commands of docs/add-a-skin.md on simulated recordings of three boards with six chips; time them.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_own_boards_benchmark.py`, five minutes of processor time.
 """
@@ -22,7 +22,7 @@ CHIPS = [(-5, -4, 0), (5, -4, 90), (-5, 4, 180), (5, 4, 270), (0, 0, 0), (0, 6.5
 CENTRE_MM = np.array([20.0, 15.0])  # the board's centre in the coordinates of the robot
 PASSES_N, DEPTHS_MM, READINGS_N, NOISE_uT = 2, (0.6, 1.1), 3, 3.0
 FIELDS = columns_of(len(CHIPS))[3 : 3 + 3 * len(CHIPS)]
-pytestmark = [pytest.mark.skipif(not FULL, reason="five minutes"), pytest.mark.timeout(3600)]
+pytestmark = [pytest.mark.skipif(not FULL, reason="takes five minutes: run `make bench`"), pytest.mark.timeout(3600)]
 
 
 def simulate(board: str) -> pd.DataFrame:
@@ -64,7 +64,7 @@ def describe_boards(scene: Path) -> None:
     scene.write_text(text)
 
 
-def test_three_commands_lead_to_scores_and_a_model(tmp_path):
+def test_three_commands_of_the_page_produce_scores_and_a_model(tmp_path):
     root = copy_checkout(tmp_path / "checkout")
     for board in ("b1", "b2", "b3"):
         file = root / f"{board}_s1.csv"

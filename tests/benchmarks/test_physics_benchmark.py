@@ -83,7 +83,7 @@ def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarr
 
 
 @pytest.mark.timeout(600)
-def test_field_of_all_nodes_equals_magpylib() -> None:
+def test_field_change_of_all_nodes_equals_that_of_magpylib() -> None:
     magpylib = pytest.importorskip("magpylib", reason="needs magpylib, a dev dependency")
     rest, moved = move_everything(skin("s0"))
     objects = [
@@ -102,7 +102,7 @@ def test_field_of_all_nodes_equals_magpylib() -> None:
     }
     truth_T = calls["compiled"][0]()
     times_ms = {name: best_ms(call, repeats_n) for name, (call, repeats_n) in calls.items()}
-    print(f"\nfield before and after, {len(rest[0])} nodes that all move x {len(BOARD.chips_m)} chips")
+    print(f"\nfield before and after, {len(rest[0])} moving nodes x {len(BOARD.chips_m)} chips")
     for name, (call, _) in calls.items():
         print(f"  {name:16} {times_ms[name]:8.2f} ms {times_ms[name] / times_ms['compiled']:8.1f} x")
         # The reference fields lose digits in the difference of two sums, and magpylib uses mu_0 of another CODATA year.
@@ -110,7 +110,7 @@ def test_field_of_all_nodes_equals_magpylib() -> None:
 
 
 @pytest.mark.timeout(600)
-def test_time_of_pokes_with_and_without_table() -> None:
+def test_time_to_simulate_pokes_with_and_without_a_cached_table() -> None:
     pokes_m, one = one_pass_m(), skin("s0")
     changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # the first call compiles the kernel
     forget_tables()
@@ -132,7 +132,7 @@ def test_time_of_pokes_with_and_without_table() -> None:
 
 
 @pytest.mark.timeout(600)
-def test_time_of_eighteen_skins_from_scratch() -> None:
+def test_time_to_simulate_eighteen_skins_without_cached_tables() -> None:
     pokes_m = one_pass_m()
     forget_tables()
     start_s = time.perf_counter()
@@ -146,7 +146,7 @@ def test_time_of_eighteen_skins_from_scratch() -> None:
 
 
 @pytest.mark.timeout(600)
-def test_time_of_the_papers_number_of_irregular_pokes() -> None:
+def test_time_to_simulate_as_many_irregular_pokes_as_in_the_paper() -> None:
     rng = rng_for(0, "benchmark")
     pokes_m = np.tile(one_pass_m(), (PASSES_N, 1))
     pokes_m += rng.normal(0, (0.05e-3, 0.05e-3, 0.01e-3), pokes_m.shape)

@@ -1,4 +1,6 @@
-"""Time to train networks for many folds: stacks of this project, a plain DataLoader loop, a loop over index tensors.
+"""Time to train networks for many folds, which this project trains in stacks (several networks at once).
+
+The time is compared with that of a plain loop over a DataLoader, and of a loop over index tensors.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_training_benchmark.py`. The test asserts only that the
 training converges. Time ratios are computed within a repeat, during which the load of the machine is about constant. If
@@ -200,7 +202,7 @@ STEP = {
     "backward": [(torch.Tensor, "backward")],
     "AdamW": [(AdamW, "step"), (Stack, "zero_grad")],
     "one-cycle rate": [(train_module, "one_cycle")],
-    "check for finite weights, keep them": [(Monitor, "check")],
+    "check that weights are finite and keep them": [(Monitor, "check")],
 }
 
 
@@ -211,7 +213,7 @@ def _unset_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.timeout(1800)
-def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
+def test_time_to_train_all_folds_compared_with_plain_loops_and_sgemm(tmp_path: Path) -> None:
     rows = make_rows()
     # the first call imports PyTorch
     plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))
@@ -222,9 +224,8 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
         columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
         with make_executor(imports="reskin.models.train") as executor:
             start_s = seconds(lambda: start_workers(executor))
-            beside = [
-                executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)
-            ]  # each product takes a quarter of a second
+            # Each product takes a quarter of a second.
+            beside = [executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)]
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
@@ -249,10 +250,10 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
             columns[f"{what} / grid with start of workers"].append(plain_s / (grid_s + start_s))
             columns[f"{what} / grid, CPU s"].append(plain_cpu_s / grid_cpu_s)
     print(
-        f"\n{len(jobs)} networks, {STEPS_N} steps of {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
+        f"\n{len(jobs)} networks, {STEPS_N} steps with {BATCH_N} of {ROWS_N:,} rows x {CHANNELS_N}; two processes;",
         end=" ",
     )
-    print(f"plain loops: {PLAIN_N} networks timed, scaled to {len(jobs)}; {REPEATS_N} repeats")
+    print(f"plain loops: {PLAIN_N} networks are timed, and the time is scaled to {len(jobs)}; {REPEATS_N} repeats")
     print(f"{'':67}{'lowest':>8} {'median':>8} {'highest':>8}")
     for name, values in columns.items():
         print(f"  {name:65}{min(values):8.2f} {median(values):8.2f} {max(values):8.2f}")
@@ -260,7 +261,7 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
-def test_cpu_time_of_the_parts_of_a_training_step(triplet_weight: float) -> None:
+def test_cpu_time_of_all_parts_of_a_training_step(triplet_weight: float) -> None:
     rows = make_rows()
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
     train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # the first call imports PyTorch
@@ -270,7 +271,7 @@ def test_cpu_time_of_the_parts_of_a_training_step(triplet_weight: float) -> None
             assert all(one.stopped_step is None for one in train_stack(jobs, rows))
         if whole["all"] < best_s:
             best_s, best = whole["all"], dict(spent_s)
-    best["rest: slices of batches, sums, the loop, the first copies of rows"] = best_s - sum(best.values())
+    best["rest (slicing batches, sums, the loop, copying rows at first)"] = best_s - sum(best.values())
     rate = len(jobs) * STEPS_N * flop(triplet_weight) / best_s
     print(f"\na step of {len(jobs)} networks{' with triplets' if triplet_weight else ''}: ", end="")
     print(f"{1e3 * best_s / STEPS_N:.2f} ms, {100 * rate / sgemm:.0f} % of sgemm; best of {REPEATS_N}")

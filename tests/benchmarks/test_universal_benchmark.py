@@ -1,8 +1,8 @@
 """Error of the universal model against its cost, for different lattices, numbers of training skins and steps.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints the table of docs/learning.md.
-The test skins were not used in training; they have law errors as in training and 65 presses each. All times are
-processor time of one thread.
+The test skins were not used in training, and have 65 presses each. As in training, their fields differ from those of
+the simulated law by random errors. All times are processor time of one thread.
 """
 
 import os
@@ -98,7 +98,7 @@ def evaluate(setting: str, tables: Tables, networks: Sequence[Weights], prior: S
     off_mm, off_log, took_s, read_n = [], [], 0.0, 0
     for i in range(len(skins)):
         b_uT, place_mm = calibrate(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)
-        model.estimate(b_uT[:1])  # prepares the map, so that the timed calls do not
+        model.estimate(b_uT[:1])  # this call prepares the map, so that the timed calls do not have to
         start_s = time.process_time()
         found = model.estimate(b_uT)
         took_s, read_n = took_s + time.process_time() - start_s, read_n + len(b_uT)

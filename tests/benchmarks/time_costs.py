@@ -26,13 +26,15 @@ HEAVIEST_N, BEST_OF_N = 3, 5
 LAYERS = paper_layers(15)
 WEIGHTS_N = sum(layer.in_n * layer.out_n + layer.out_n for layer in LAYERS)
 UNITS_N = sum(layer.out_n for layer in LAYERS)
-# memory accesses per weight and step: read weight, gradient, two moments; write gradient, weight, two moments
+# Memory accesses per weight and step: AdamW reads the weight, its gradient and two moments, and writes the same four.
 MOVES_N = 8
-# memory accesses per activation: a write and a read in the forward pass, and again in the backward pass
+# Memory accesses per activation: it is written and read once in the forward pass, and once in the backward pass.
 ACTIVATION_MOVES_N = 4
-# Batches through the first layers in each step, in addition to the labelled batch: triplets, unlabelled lines.
+# In each step, these numbers of batches pass through the first layers in addition to the labelled batch: positives
+# and negatives of triplets, and the anchors, positives and negatives of triplets of unlabelled pokes.
 EXTRA_PASSES_N = {"train_multi": 0, "train_single": 0, "train_triplet": 2, "adapt": 5}
-# networks that a sweep trains for each held-out board at each of its points, by the stage that trains such networks
+# For each sweep, the numbers of networks that it trains for each held-out board at each of its points. The keys are
+# the stages that train networks of the same kind.
 NETWORKS_BY_SWEEP: dict[str, Mapping[str, int]] = {
     "sweep_sensors": {"train_multi": 1, "train_triplet": 1, "adapt": 3},
     "sweep_pokes": {"adapt": 1},
@@ -136,8 +138,8 @@ def compare_heaviest(scene: str, rows: list[dict[str, Any]], rates: Mapping[str,
         if limits is None:
             found.append({"stage": row["stage"], "computed, s": short(took_s)})
             continue
-        named = {f"{name} alone, s": short(seconds) for name, seconds in limits.items()}
-        ratio = {"computed / the longest of them": f"{took_s / max(limits.values()):.2f}"}
+        named = {f"lower bound ({name}), s": short(seconds) for name, seconds in limits.items()}
+        ratio = {"computed / largest lower bound": f"{took_s / max(limits.values()):.2f}"}
         found.append({"stage": row["stage"], "computed, s": short(took_s)} | named | ratio)
     return found
 
@@ -149,7 +151,7 @@ def main() -> None:
     MEASURED.mkdir(exist_ok=True)
     (MEASURED / "rates.json").write_text(json.dumps({"machine": machine(), **rates}, indent=1) + "\n")
     parts = [
-        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of matrix products (float32) and "
+        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of matrix products (single precision) and "
         f"{rates['memory_bytes_per_s'] / 1e9:.1f} GB copied per CPU second of one thread; "
         f"{rates['disk_bytes_per_s'] / 1e6:.0f} MB written to disk per second."
     ]

@@ -33,8 +33,8 @@ from tests.benchmarks.pages import MEASURED
 from tests.stages.checkout import ROOT, copy_checkout, variables
 
 SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
-STEPS_N = 100  # per training run; the cost of a step does not depend on the number of rows
-READINGS_N = 40  # readings per recorded capture; few, so that the overhead per capture dominates
+STEPS_N = 100  # Steps per training run. They are few, because the cost of a step does not depend on the number of rows.
+READINGS_N = 40  # Readings per recorded capture. They are few, so that the overhead per capture dominates.
 
 
 def time_command(folder: Path, *words: str) -> dict[str, float]:

@@ -99,7 +99,7 @@ def main() -> None:
         nargs="*",
         choices=SETTINGS,
         default=list(SETTINGS),
-        help="settings to run in addition to the first",
+        help=f"settings to run in addition to '{FIRST}'",
     )
     arguments = parser.parse_args()
     named = {name: setting for name, setting in SETTINGS.items() if name in (FIRST, *arguments.settings)}
@@ -131,14 +131,14 @@ def show(found: Mapping[str, Any]) -> None:
     rows = [
         {
             "setting": name,
-            "values equal": run["equal_n"],
-            "of": run["values_n"],
+            "equal values": run["equal_n"],
+            "compared values": run["values_n"],
             "largest relative difference": f"{100 * run.get('largest_relative', 0.0):.3g} %",
-            "of which": run.get("of", "–"),
+            "value with this difference": run.get("of", "–"),
         }
         for name, run in found["runs"].items()
     ]
-    heading = f"Code {found['git']}, {found['machine']}; the first row is what the others are compared with."
+    heading = f"Code {found['git']}, {found['machine']}; the other rows are compared with the first row."
     write_block("repeat.md", "repeat", [heading, table(rows)])
 
 

@@ -1,6 +1,7 @@
 """Synthetic frames for tests.
 
-The bytes CR LF end a frame, so a chosen fraction of the values contains these bytes.
+The bytes CR LF end a frame. To test that they do not end a frame where they are part of a value, a chosen fraction of
+the values contains these bytes.
 """
 
 import numpy as np

@@ -48,14 +48,14 @@ def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | No
     return np.concatenate(masks)
 
 
-def test_board_that_works_has_no_fault() -> None:
+def test_no_fault_is_detected_on_a_working_board() -> None:
     assert not detect(board(2000)).any()
     assert not detect(board(2000), expected_lsb_uT=(0.15, 0.242)).any()
 
 
 @pytest.mark.parametrize("chips", [(1,), (0, 1, 2)])
 @pytest.mark.parametrize("expected_lsb_uT", [None, (0.15, 0.242)])
-def test_board_with_a_chip_at_power_on_settings_is_refused(
+def test_chip_at_power_on_settings_raises_an_error(
     chips: tuple[int, ...], expected_lsb_uT: tuple[float, float] | None
 ) -> None:
     frames, reset = board(2000), board(2000, steps_uT=RESET_uT)
@@ -67,7 +67,7 @@ def test_board_with_a_chip_at_power_on_settings_is_refused(
         detect(frames, 500, 1300, expected_lsb_uT=expected_lsb_uT)
 
 
-def test_board_whose_chips_all_change_their_step_is_refused() -> None:
+def test_change_of_the_step_of_all_chips_raises_an_error() -> None:
     frames, other = board(1600), board(1600, steps_uT=(0.6, 0.6, 0.968))
     for chip_i in range(CHIPS_N):
         frames = with_chip_values(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
@@ -75,7 +75,7 @@ def test_board_whose_chips_all_change_their_step_is_refused() -> None:
         detect(frames)
 
 
-def test_chip_that_repeats_its_reading_is_stuck() -> None:
+def test_chip_that_repeats_its_reading_counts_as_stuck() -> None:
     frames = board(1500)
     frozen = with_chip_values(frames, slice(500, None), 1, frames.b_uT[500, 3:6])
     stuck = detect(frozen)
@@ -85,7 +85,7 @@ def test_chip_that_repeats_its_reading_is_stuck() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(ends=st.lists(st.integers(0, 3 * SCALE_FRAMES_N), max_size=6))
-def test_detected_faults_do_not_depend_on_chunks(ends: list[int]) -> None:
+def test_detected_faults_do_not_depend_on_the_chunks_that_are_fed(ends: list[int]) -> None:
     frames = board(3 * SCALE_FRAMES_N)
     frozen = with_chip_values(frames, slice(100, 300), 1, frames.b_uT[100, 3:6])
     np.testing.assert_array_equal(detect(frozen, *ends), detect(frozen))

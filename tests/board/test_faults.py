@@ -9,7 +9,7 @@ from reskin import seeds
 from reskin.board import faults
 from tests.board.signals import frames_of
 
-NOISE_uT = 5.0  # The upper end of the noise of real boards, which is 3.0 to 5.0 uT.
+NOISE_uT = 5.0  # The noise of real boards is 3.0 to 5.0 uT.
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
 
 
@@ -38,7 +38,7 @@ class TestFailedReads:
         b_uT[0, 4] = 5194.2
         assert faults.failed_reads(b_uT, temperature_degC).tolist() == [[True, False, False]]
 
-    def test_read_without_a_temperature_is_judged_by_its_fields(self):
+    def test_failed_read_without_a_temperature_is_recognised_by_its_fields(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
 
@@ -49,12 +49,12 @@ class TestFailedReads:
     def test_real_recording_of_failed_reads_is_recognised(self, shared_data):
         assert faults.failed_reads(*load_ini(shared_data, "faults/b20_artillery_AFG_flex_50.head400.txt")).all()
 
-    def test_real_working_board(self, shared_data):
+    def test_no_fault_is_found_on_a_real_working_board(self, shared_data):
         assert not faults.failed_reads(*load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")).any()
 
 
 class TestZeroReads:
-    def test_read_of_zeros_needs_three_zero_fields(self):
+    def test_read_counts_as_zero_only_if_all_three_fields_are_zero(self):
         b_uT = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
         assert faults.zero_reads(b_uT).tolist() == [[True, False], [False, True]]
 
@@ -66,7 +66,7 @@ class TestZeroReads:
         zeros = faults.zero_reads(table[:, -15:])
         assert zeros.all(axis=1).sum() == zeros.any(axis=1).sum() == zeros_n
 
-    def test_real_working_boards(self, shared_data):
+    def test_no_fault_is_found_on_real_working_boards(self, shared_data):
         assert not faults.zero_reads(load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")[0]).any()
         for file in (shared_data / "lab").glob("*.csv"):
             table = np.genfromtxt(file, delimiter=",", names=True)
@@ -76,14 +76,14 @@ class TestZeroReads:
 
 class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 1000))
-    def test_step_of_readings_is_found(self, name, seed):
+    def test_find_lsb_returns_the_step_of_rounded_readings(self, name, seed):
         # The tolerance is 2 %, because rounding to two decimals changes a step of 0.15 uT by at most 2 %, and a mean of
         # steps by less.
         lsb_uT = faults.find_lsb(readings_on_grid([GRIDS_uT[name]], 400, seed))
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 
     @given(st.integers(0, 1000))
-    def test_values_that_are_not_multiples_of_a_step_have_no_step(self, seed):
+    def test_find_lsb_returns_nan_for_values_that_were_not_rounded(self, seed):
         field_uT = 5.0 * seeds.rng_for(seed, "smooth").standard_normal((400, 6))
         assert np.isnan(faults.find_lsb(field_uT)).all()
         assert not faults.reset_chips(field_uT, None).any()
@@ -110,7 +110,7 @@ class TestScale:
         assert faults.reset_chips(one_chip, GRIDS_uT["ini"]).tolist() == [False, False, False, True, False]
         assert faults.reset_chips(all_chips, None).all()
 
-    def test_real_working_boards(self, shared_data):
+    def test_no_fault_is_found_on_real_working_boards(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt", slice(0, 8000))
         for first in range(0, len(b_uT), 400):
             assert not faults.reset_chips(b_uT[first : first + 400], None).any()
@@ -142,10 +142,10 @@ class TestStuck:
         return stuck
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
-    def test_stuck_chips_equal_those_of_a_loop(self, stretches, chips_n):
-        """In each run of frames, chip 0 changes if bit 0 is set, and the last chip if bit 1 is set.
+    def test_stuck_chips_equal_those_found_by_a_loop(self, stretches, chips_n):
+        """The readings consist of stretches, in each of which some chips change from frame to frame.
 
-        The other chips are constant.
+        Chip 0 changes if bit 0 of the first number of the stretch is set, and chip 1 if bit 1 is set.
         """
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
@@ -153,7 +153,7 @@ class TestStuck:
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.stuck_naively(b_uT))
 
     @given(st.lists(st.integers(0, 200), max_size=4))
-    def test_result_does_not_depend_on_chunks(self, ends):
+    def test_stuck_chips_do_not_depend_on_the_chunks_that_are_fed(self, ends):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 2, 200, 0)
         b_uT[60:150, 3:6] = b_uT[60, 3:6]
         detector = faults.StuckChips(2)
@@ -170,6 +170,6 @@ class TestStuck:
     def test_board_on_which_no_chip_changes_does_not_count_as_stuck(self):
         assert not faults.stuck_chips(np.ones((100, 15))).any()
 
-    def test_real_working_board(self, shared_data):
+    def test_no_fault_is_found_on_a_real_working_board(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")
         assert not faults.stuck_chips(b_uT).any()

@@ -43,7 +43,8 @@ def test_frame_rate_of_the_emulator_is_measured(wire, rate_hz):
     board = recognise_at_due_times(script)
     rate = board.rate
     assert rate.arrived_hz == pytest.approx(rate_hz, rel=1e-6)
-    assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)  # The clock of the board is in single precision.
+    # The board sends the time of its clock in single precision.
+    assert rate.sent_hz == pytest.approx(rate_hz, rel=1e-3)
     assert rate.method == ("clock" if wire == "binary-clock" else "arrivals")
     assert board.frame_bytes_n == np.mean([len(piece) for piece in script.pieces])
     assert (rate.repeated_frames, rate.repeated_readings) == (0, 0)
@@ -61,7 +62,7 @@ def test_measured_rate_does_not_depend_on_the_size_of_portions(lengths):
     assert (parts.frames_n, *astuple(parts)[3:]) == (whole.frames_n, *astuple(whole)[3:])
 
 
-def test_silence_and_bytes_that_arrive_together_do_not_change_the_rate():
+def test_measured_rate_is_not_changed_by_silence_or_by_bytes_that_arrive_together():
     script = make_script(pokes_n=0)
     chunks = list(zip(script.pieces, script.t_s.tolist(), strict=True))
     waiting = [(b"".join(script.pieces[:200]), 0.0), *((piece, t_s - 0.4975) for piece, t_s in chunks[200:])]
@@ -86,7 +87,7 @@ def test_repeated_readings_are_counted_per_chip(every_n, stuck, frames):
     assert counter.frames == pytest.approx(frames, abs=0.002)
 
 
-def test_limits_of_the_rate_of_the_papers_board_equal_a_count_of_bits():
+def test_rate_limits_of_the_papers_board_equal_those_computed_from_a_count_of_bits():
     """The bits on the I2C bus are counted independently: 9 per byte, plus start, repeated start and stop."""
     read = ["address", "RM", "address", "status", *"TTXXYYZZ"]
     start = ["address", "SM", "address", "status"]
@@ -110,7 +111,7 @@ def test_limits_of_the_rate_of_the_papers_board_equal_a_count_of_bits():
 
 
 @given(st.integers(1, 64), st.floats(18, 2000), st.floats(1e-4, 0.3))
-def test_limits_of_the_rate_fall_with_more_chips_longer_frames_and_slower_conversion(
+def test_rate_limits_are_lower_for_more_chips_longer_frames_or_slower_conversion(
     chips_n, frame_bytes_n, conversion_time_s
 ):
     def rates(*arguments):

@@ -59,7 +59,7 @@ def test_encoded_frames_are_decoded_in_chunks_of_any_size(frames, wire, sizes):
 
 
 @given(st.integers(1, 5), st.binary(max_size=400))
-def test_frames_with_any_finite_numbers_are_decoded_unchanged(chips_n, payload):
+def test_frames_that_contain_any_finite_numbers_are_decoded_unchanged(chips_n, payload):
     values = np.frombuffer(payload[: len(payload) // (16 * chips_n) * 16 * chips_n], "<f4").reshape(-1, 4 * chips_n)
     values = np.where(np.isfinite(values), values, np.float32(0))
     data = b"".join(struct.pack(f"<{4 * chips_n}f", *row) + b"\r\n" for row in values)
@@ -68,7 +68,7 @@ def test_frames_with_any_finite_numbers_are_decoded_unchanged(chips_n, payload):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_stream_fed_byte_by_byte_decodes_like_the_whole(wire):
+def test_decoding_byte_by_byte_gives_the_same_frames_as_decoding_all_bytes_at_once(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
     whole, account = decode_portions([data], wire, 5)
@@ -88,7 +88,7 @@ def test_frame_is_returned_when_its_last_byte_has_arrived(wire):
 
 
 @given(st.binary(max_size=600), EVERY_WIRE, st.integers(1, 3), st.lists(st.integers(0, 50), max_size=8))
-def test_random_bytes_decode_equally_in_any_chunks(data, wire, chips_n, sizes):
+def test_decoding_of_random_bytes_does_not_depend_on_the_chunks(data, wire, chips_n, sizes):
     whole, account = decode_portions([data], wire, chips_n)
     chunks, chunks_account = decode_portions(split_bytes(data, sizes), wire, chips_n)
     check_equal(whole, chunks)
@@ -101,7 +101,7 @@ FRAGMENTS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"
 
 @settings(max_examples=150)
 @given(st.lists(st.sampled_from(FRAGMENTS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
-def test_terminators_decode_equally_in_any_chunks(data, chips_n, sizes):
+def test_decoding_of_bytes_with_many_terminators_does_not_depend_on_the_chunks(data, chips_n, sizes):
     whole, account = decode_portions([data], "binary", chips_n)
     chunks, chunks_account = decode_portions(split_bytes(data, sizes), "binary", chips_n)
     check_equal(whole, chunks)
@@ -109,13 +109,12 @@ def test_terminators_decode_equally_in_any_chunks(data, chips_n, sizes):
     check_account(account, data)
 
 
-# Damaged streams: `decode_damaged` checks which frames are lost, that there are no false frames, and the account of
-# bytes -------------
+# Damaged streams: `decode_damaged` compares the lost frames, false frames and counted bytes with the limits -----
 
 
 @settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.floats(0, 1))
-def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_share):
+def test_at_most_two_frames_are_lost_if_bytes_are_missing(frames, wire, where, missing_share):
     data = encode(frames, wire)
     missing_n = 1 + int(missing_share * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
@@ -127,14 +126,14 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_shar
 
 @settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.binary(max_size=300))
-def test_inserted_bytes_cost_at_most_two_frames(frames, wire, where, noise):
+def test_at_most_two_frames_are_lost_if_bytes_are_inserted(frames, wire, where, noise):
     data = encode(frames, wire)
     first = int(where * len(data))
     check_damage(frames, wire, [data[:first], noise, data[first:]], lost_n=2, false_n=len(noise))
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(TEXT_WIRES), st.floats(0, 1), st.integers(1, 40))
-def test_missing_bytes_of_text_cost_only_the_lines_that_contain_them(frames, wire, where, missing_n):
+def test_only_the_lines_that_contained_missing_bytes_of_text_are_lost(frames, wire, where, missing_n):
     data = encode(frames, wire)
     first = int(where * max(len(data) - missing_n, 0))
     damaged = data[:first] + data[first + missing_n :]
@@ -143,7 +142,7 @@ def test_missing_bytes_of_text_cost_only_the_lines_that_contain_them(frames, wir
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(BINARY_WIRES), st.floats(0, 1))
-def test_stream_that_starts_within_a_frame_loses_one_frame(frames, wire, where):
+def test_only_one_frame_is_lost_if_a_stream_starts_within_a_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
     # The cut is not between CR and LF. Otherwise, the next frame would be lost too.
     joined_n = 1 + int(where * (length_n - 3))
@@ -220,7 +219,7 @@ def test_rest_of_a_line_without_an_end_is_not_a_frame():
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
 
 
-def test_end_bytes_of_text_over_several_blocks(monkeypatch):
+def test_end_bytes_of_text_frames_are_right_in_several_blocks(monkeypatch):
     data = encode(make_frames(10, 2, 8), "text-xyzt")
     monkeypatch.setattr(stream, "BLOCK_LINES_N", 3)
     kept, _ = decode_portions([data[:20], data[20:]], "text-xyzt", 2)
@@ -267,7 +266,7 @@ def test_error_has_no_suggestion_if_no_wire_format_fits():
         decode_all(b"\0", "binary", 5, "a.bin")
 
 
-def test_dumped_stream_becomes_a_table_with_units():
+def test_decode_dump_returns_a_table_with_units():
     frames = make_frames(4, 2, seed=0)
     table, account = decode_dump(encode(frames, "binary"), "binary", 2, "dump.bin")
     assert account["frames_n"] == len(table) == 4

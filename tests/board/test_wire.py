@@ -36,22 +36,22 @@ def test_binary_frame_has_the_bytes_of_the_firmware():
     assert encode(one_frame(2), "binary") == struct.pack("<8f", *values) + b"\r\n"
 
 
-def test_clock_frame_starts_with_seconds():
+def test_binary_frame_with_a_clock_starts_with_its_seconds():
     frames = make_frames(3, 5, 0)
     data = encode(frames, "binary-clock")
     assert [struct.unpack_from("<f", data, 86 * i)[0] for i in range(3)] == frames.device_s.tolist()
     assert data[86 + 4 : 2 * 86] == encode(frames, "binary")[82 : 2 * 82]
 
 
-def test_text_line_is_that_of_the_reskin_firmware():
+def test_text_line_equals_that_of_the_reskin_firmware():
     assert encode(one_frame(2), "text-xyzt") == b"1.25\t-2.50\t56.78\t25.00\t4.25\t0.50\t59.78\t28.00\t\r\n"
 
 
-def test_text_of_anyskin_has_no_tab_between_chips():
+def test_text_line_of_the_anyskin_firmware_has_no_tab_between_chips():
     assert encode(one_frame(2), "text-txyz") == b"25.00\t1.25\t-2.50\t56.7828.00\t4.25\t0.50\t59.78\r\n"
 
 
-def test_values_without_tab_are_split_after_two_decimals():
+def test_values_that_no_tab_separates_are_split_after_two_decimals():
     frames, is_frame = lines_of(b"24.00\t1.00\t2.00\t-56.7825.00\t-3.00-4.000.05\n", "text-txyz", 2)
     assert is_frame.tolist() == [True]
     assert frames.temperature_degC.tolist() == [[24.0, 25.0]]

@@ -9,13 +9,13 @@ from reskin.seeds import rng_for
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 
 
-def test_field_change_equals_nested_loops():
+def test_field_changes_equal_those_computed_by_nested_loops():
     expected = [[float(B_uT[f, ch] - NOLOAD_uT[f, ch]) for ch in range(15)] for f in range(5)]
     assert subtract(B_uT, NOLOAD_uT).tolist() == expected
 
 
 @given(st.floats(-3000, 3000, width=32))
-def test_constant_field_does_not_change_field_changes(ambient_uT):
+def test_field_changes_are_not_affected_by_a_constant_external_field(ambient_uT):
     # The tolerance in uT is rounding: single precision rounds fields of a few thousand uT by about 1e-4 uT.
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
@@ -34,7 +34,7 @@ def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(runs_n, st.integers(1, 5))
-def test_no_load_readings_of_each_policy_equal_a_loop(runs_n, regular_n):
+def test_no_load_readings_chosen_by_each_policy_equal_those_of_a_loop(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     seen, first, last = [], None, None
     for i, number in enumerate(indentation.tolist()):
@@ -58,7 +58,7 @@ def test_all_policies_use_the_same_no_load_reading_at_the_first_indentation(runs
     assert (regular(noload_uT, indentation, regular_n=len(runs_n)) == initial(noload_uT, indentation)).all()
 
 
-def test_ranks_of_indentations_follow_their_order_in_time():
+def test_rank_numbers_indentations_in_their_order_in_time():
     assert rank(np.array([5, 5, 2, 9, 9])).tolist() == [0, 0, 1, 2, 2]
     assert rank(np.zeros(0, np.int32)).tolist() == []
 
@@ -87,7 +87,7 @@ def test_no_load_field_estimated_between_touches_follows_the_drift(rows_n):
     assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
 
 
-def test_during_a_long_slide_the_old_no_load_reading_is_kept():
+def test_no_load_reading_is_not_replaced_during_a_long_slide():
     b_uT, noload_uT, _ = make_touches(1, walk_uT=0.1)
     sent = [field for pair in zip(noload_uT, b_uT, strict=True) for field in pair]
     slid = [*sent[:100], *(sent[101] + 20 * i for i in range(60)), *sent[100:]]
@@ -96,7 +96,7 @@ def test_during_a_long_slide_the_old_no_load_reading_is_kept():
     np.testing.assert_array_equal(zeros[-1], sent[-2])
 
 
-def test_no_load_field_estimated_between_touches_uses_no_later_reading():
+def test_no_load_field_estimated_between_touches_does_not_depend_on_later_readings():
     b_uT, noload_uT, indentation = make_touches(2)
     whole, part = (free(b_uT[:n], noload_uT[:n], indentation[:n], within_uT=2.0) for n in (400, 123))
     np.testing.assert_array_equal(whole[:123], part)

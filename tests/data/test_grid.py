@@ -34,14 +34,14 @@ def test_order_of_places_equals_that_of_lab_recordings(shared_data):
     np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
 
 
-def test_six_depths_at_65_places_are_390_indentations():
+def test_pass_with_six_depths_has_390_indentations():
     plan = protocol((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), 26)
     assert len(plan) == 26 * 390
     assert np.bincount(plan.pass_i).tolist() == [390] * 26
 
 
 @given(depths_mm, st.integers(1, 3))
-def test_every_pass_covers_every_point_and_depth(depths, passes_n):
+def test_every_pass_visits_every_place_at_every_depth(depths, passes_n):
     plan = protocol(depths, passes_n)
     pokes = set(zip(plan.pass_i, plan.x_mm, plan.y_mm, plan.depth_mm, strict=True))
     assert len(pokes) == len(plan) == passes_n * len(depths) * 65

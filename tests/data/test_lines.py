@@ -71,7 +71,7 @@ places = st.lists(
 
 
 @given(places, st.data())
-def test_lines_of_a_grid_equal_nested_loops(labels, data):
+def test_lines_of_a_grid_equal_those_found_by_nested_loops(labels, data):
     table = rows_at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
     chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(labels) - 1), min_size=1))))
     lines, naive = grid_lines(table, chosen), grid_lines_naively(table, chosen)
@@ -80,7 +80,7 @@ def test_lines_of_a_grid_equal_nested_loops(labels, data):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_65_places_form_lines_along_9_rows_and_9_columns():
+def test_lines_of_the_65_places_are_9_rows_and_9_columns():
     lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
     # The lengths of lines along the rows of the grid, then along its columns.
@@ -90,7 +90,7 @@ def test_65_places_form_lines_along_9_rows_and_9_columns():
     assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
 
 
-def test_visits_to_one_place_have_the_same_lines_and_index():
+def test_all_indentations_at_one_place_are_on_the_same_lines():
     table = grid(depths_n=2, passes_n=3)
     lines = grid_lines(table, all_rows(table))
     of_row = {row: set() for row in range(len(table))}
@@ -131,7 +131,7 @@ def test_lines_do_not_depend_on_the_distances_between_places(labels, gaps_mm, or
         assert (getattr(one, field.name) == getattr(other, field.name)).all()
 
 
-def test_places_that_differ_by_rounding_are_one_place():
+def test_places_that_differ_only_by_rounding_count_as_one_place():
     lines = grid_lines(rows_at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
 
@@ -142,13 +142,13 @@ def test_missing_place_leaves_a_gap_in_the_indices_along_a_line():
     assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
 
 
-def test_no_rows_or_a_single_place_form_no_line():
+def test_a_single_place_forms_no_line():
     assert len(grid_lines(rows_at([(1, 1)] * 3), np.arange(3))) == 0
     assert len(grid_lines(rows_at([(1, 1)]), np.zeros(0, np.int64))) == 0
 
 
 @pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
-def test_lines_give_no_access_to_place_force_or_field(lines):
+def test_lines_contain_no_places_forces_or_fields(lines):
     assert [field.name for field in fields(lines)] == ["row", "line_i", "order_i"]
     assert set(vars(lines)) == {"row", "line_i", "order_i"}
     for array in vars(lines).values():
@@ -157,7 +157,7 @@ def test_lines_give_no_access_to_place_force_or_field(lines):
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
-def test_lines_of_hand_pokes_equal_nested_loops(pokes):
+def test_lines_of_hand_pokes_equal_those_found_by_nested_loops(pokes):
     pass_i, poke_i = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
     indentation = (10 * pass_i + poke_i).astype(np.int32)  # The numbers of indentations continue from pass to pass.
     naive = set()
@@ -231,13 +231,13 @@ def test_each_place_and_each_of_its_visits_is_equally_likely_to_be_chosen():
     assert all(abs(draws_n[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
-def test_choosing_more_pokes_than_there_are_is_refused():
+def test_take_pokes_raises_if_the_pool_has_too_few_pokes():
     table = grid()
     with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
         take_pokes(table, all_rows(table), 66, rng_for(0, "pokes"))
 
 
-def test_pokes_are_chosen_on_one_skin_only():
+def test_take_pokes_raises_if_the_pool_contains_several_skins():
     with pytest.raises(ParamsError, match="of several skins: s0, s1"):
         take_pokes(rows_at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
@@ -288,7 +288,7 @@ def test_lines_of_a_skin_contain_only_its_rows():
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
-def test_stacking_tables_with_other_channels_or_the_same_skin_is_refused():
+def test_stacking_raises_if_channels_differ_or_a_skin_occurs_twice():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], ALL_READINGS)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):

@@ -15,7 +15,7 @@ def test_field_change_uses_the_no_load_reading_of_the_row():
     assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_rows_without_place_or_force_are_counted():
+def test_dropped_rows_are_counted_by_reason():
     x_mm = np.array([0, np.nan, 2, 3, 4, 5], np.float32)
     y_mm = np.array([0, 1, 2, 3, np.nan, 5], np.float32)
     Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
@@ -30,7 +30,7 @@ def test_pass_numbers_continue_across_captures_of_a_skin():
     assert rows.pass_i.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 0, 0, 0, 1, 1, 1]
 
 
-def test_indentation_numbers_are_unique_in_a_scene():
+def test_indentations_of_all_captures_get_different_numbers():
     # Both captures use these indentation numbers, which do not start at 0.
     press = np.array([7, 7, 2, 2, 9, 9], np.int32)
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
@@ -64,22 +64,22 @@ def test_rows_do_not_depend_on_the_order_of_captures():
         ),
     ],
 )
-def test_captures_that_do_not_fit_together_are_refused(second, message):
+def test_gather_raises_if_captures_do_not_fit_together(second, message):
     with pytest.raises(ParamsError, match=message):
         gather([readings(), second], ALL)
 
 
-def test_capture_in_which_no_row_is_usable_is_refused():
+def test_gather_raises_if_no_row_of_a_capture_is_usable():
     with pytest.raises(ParamsError, match=r"capture c1: none of \d+ readings has a known place and at least 0.0 N"):
         gather([readings(), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, -3, np.float32))], ALL)
 
 
-def test_scene_without_captures_is_refused():
+def test_gather_raises_if_there_are_no_captures():
     with pytest.raises(ParamsError, match="reskin add"):
         gather([], ALL)
 
 
-def test_columns_of_the_targets_can_be_chosen():
+def test_targets_have_the_columns_that_the_caller_chooses():
     rows = gather(
         [readings(Fx_N=np.full(6, 0.5, np.float32), Fy_N=np.full(6, -0.25, np.float32))], ALL, targets=SHEAR_TARGETS
     )

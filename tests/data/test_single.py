@@ -1,6 +1,6 @@
-"""Tests of splits within a skin.
+"""Tests of splits of the rows of one skin into training rows and test rows.
 
-Only the paper's split puts readings of one indentation on both sides.
+Only the paper's split puts readings of one indentation into both.
 """
 
 from dataclasses import replace
@@ -34,7 +34,9 @@ def make_passes(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int =
 
 @pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
-def test_readings_of_an_indentation_or_pass_are_on_one_side(experiment, passes_n, pokes_n, split, seed):
+def test_readings_of_one_indentation_or_pass_are_all_for_training_or_all_for_tests(
+    experiment, passes_n, pokes_n, split, seed
+):
     table = make_passes(passes_n, pokes_n)
     group = getattr(table, UNSPLIT_BY[experiment])
     folds = draw_folds(table, [experiment], split, seed)
@@ -49,7 +51,7 @@ def test_readings_of_an_indentation_or_pass_are_on_one_side(experiment, passes_n
 
 @pytest.mark.parametrize("experiment", UNSPLIT_BY)
 @given(order=st.permutations(range(24)))
-def test_split_does_not_depend_on_the_order_of_rows(experiment, order):
+def test_split_into_training_and_test_rows_does_not_depend_on_the_order_of_rows(experiment, order):
     table = make_passes(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
@@ -59,7 +61,7 @@ def test_split_does_not_depend_on_the_order_of_rows(experiment, order):
         assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
 
 
-def test_papers_split_puts_readings_of_one_indentation_on_both_sides():
+def test_split_of_the_paper_puts_readings_of_one_indentation_into_training_and_test_rows():
     table = make_passes(4, 10, readings_n=5)
     (fold,) = draw_folds(table, ["single_random"], Split(random_test_fraction=0.1, random_repeats_n=1), 0)
     shared = {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
@@ -78,7 +80,7 @@ def test_split_of_single_readings_equals_scikit_learn(rows_n, fraction, state):
         assert test.tolist() == sorted(test_too)
 
 
-def test_at_least_one_pass_is_tested():
+def test_at_least_one_pass_is_held_out_for_tests():
     table = make_passes(4, 5)
     folds = draw_folds(table, ["single_pass"], Split(random_test_fraction=0.1, random_repeats_n=20), 0)
     assert {len({*table.pass_i[fold.test]}) for fold in folds} == {1}
@@ -86,7 +88,7 @@ def test_at_least_one_pass_is_tested():
     assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {0, 1, 2, 3}
 
 
-def test_skin_with_one_pass_is_refused():
+def test_split_by_passes_raises_if_a_skin_has_only_one_pass():
     split = Split(random_test_fraction=0.1, random_repeats_n=1)
     with pytest.raises(ParamsError, match="experiment single_pass: 1 passes of skin b0_s0 are too few to split"):
         draw_folds(make_passes(1, 5), ["single_pass"], split, 0)

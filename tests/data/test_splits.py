@@ -1,4 +1,4 @@
-"""Tests of folds, which divide rows into rows for training, for tests and for the pool (pokes for adaptation).
+"""Tests of folds, which divide rows into training rows, test rows and the pool (pokes for adaptation or for labels).
 
 Further tests are about the JSON format of folds.
 """
@@ -35,7 +35,7 @@ def six_by_three(readings_n: int = 4):
 
 
 @given(labels.filter(lambda pairs: len({board for board, _ in pairs}) > 1))
-def test_every_row_is_held_out_in_one_fold(pairs):
+def test_every_row_is_held_out_in_exactly_one_fold(pairs):
     table = rows_of_pairs(pairs)
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert sorted(np.concatenate([fold.test for fold in folds]).tolist()) == list(range(len(table)))
@@ -45,7 +45,7 @@ def test_every_row_is_held_out_in_one_fold(pairs):
             assert not set(names[fold.train]) & set(names[fold.test])
 
 
-def test_six_boards_make_six_folds():
+def test_six_boards_have_six_folds():
     table = six_by_three()
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert [fold.name for fold in folds] == [f"b{i}" for i in range(6)]
@@ -63,7 +63,7 @@ def test_folds_do_not_depend_on_the_order_of_rows(order):
             assert set(original.skin[one.test]) == set(shuffled.skin[other.test])
 
 
-def test_transfer_folds_train_on_three_skins_and_test_nine():
+def test_each_transfer_fold_trains_on_one_skin_and_tests_nine_skins_of_other_boards():
     table = six_by_three()
     folds = draw_folds(table, ["transfer"], TRANSFER, 0)
     assert [set(table.skin[fold.train]) for fold in folds] == [{"b0_s0"}, {"b1_s0"}, {"b2_s0"}]
@@ -72,7 +72,7 @@ def test_transfer_folds_train_on_three_skins_and_test_nine():
         assert not set(table.board[fold.train]) & set(table.board[fold.test])
 
 
-def test_randomly_split_readings_are_of_one_skin():
+def test_experiment_single_random_splits_the_readings_of_one_skin():
     table = six_by_three(50)
     folds = draw_folds(table, ["single_random"], RANDOM, 5)
     assert len(folds) == 4
@@ -86,14 +86,14 @@ def test_randomly_split_readings_are_of_one_skin():
 
 
 @given(st.integers(3, 30))
-def test_last_passes_are_test_rows(passes_n):
+def test_experiment_single_temporal_tests_the_last_passes(passes_n):
     table = rows(["b0"] * 2 * passes_n, ["s0"] * 2 * passes_n, [i // 2 for i in range(2 * passes_n)])
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
     assert table.pass_i[fold.train].max() < table.pass_i[fold.test].min()
     assert len(fold.train) + len(fold.test) == len(table)
 
 
-def test_of_fifty_passes_the_last_ten_are_tested():
+def test_experiment_single_temporal_tests_the_last_ten_of_fifty_passes():
     table = rows(["b0"] * 50, ["s0"] * 50, list(range(50)))
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
     assert (len(fold.train), len(fold.test)) == (40, 10)
@@ -139,7 +139,7 @@ def test_pool_and_chosen_skins_do_not_depend_on_the_order_of_rows(experiment, or
             assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
 
 
-def test_without_pool_all_held_out_rows_are_test_rows():
+def test_all_held_out_rows_are_test_rows_if_there_is_no_pool():
     table = six_by_three_in_passes(2)
     for experiment in ("lobo", "sensors"):
         for fold in draw_folds(table, [experiment], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
@@ -148,7 +148,7 @@ def test_without_pool_all_held_out_rows_are_test_rows():
 
 
 @pytest.mark.parametrize(("experiment", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
-def test_folds_without_adaptation_have_no_pool(experiment, split):
+def test_folds_of_experiments_without_adaptation_have_no_pool(experiment, split):
     table = six_by_three_in_passes(5)
     pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
     for fold, plain in zip(pooled, draw_folds(table, [experiment], split, 0), strict=True):
@@ -186,7 +186,7 @@ def test_fold_with_all_sensors_equals_the_leave_one_board_out_fold():
             np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
 
 
-def test_draws_of_sensors_are_independent():
+def test_skins_for_training_do_not_depend_on_the_number_of_draws():
     table = six_by_three_in_passes(1)
     few, many = (
         draw_folds(table, ["sensors"], Split(sensors_skins_n=(6,), sensors_draws_n=draws_n), 0) for draws_n in (2, 5)
@@ -196,7 +196,7 @@ def test_draws_of_sensors_are_independent():
     assert [fold.train.tolist() for fold in few[:2]] == [fold.train.tolist() for fold in first[:2]]
 
 
-def test_skins_are_drawn_independently_on_each_board():
+def test_skins_for_training_are_drawn_independently_for_each_held_out_board():
     table = six_by_three_in_passes(1)
     folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
     ranks = {
@@ -206,7 +206,7 @@ def test_skins_are_drawn_independently_on_each_board():
     assert len(ranks) > 1  # The three skins that are drawn are not the same on all boards.
 
 
-def test_repeated_number_of_sensors_is_refused():
+def test_numbers_of_skins_that_are_listed_twice_raise_an_error():
     with pytest.raises(ParamsError, match="must list each number of skins once"):
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
@@ -233,7 +233,7 @@ def poked_rows(boards_n: int = 3, readings_n: int = 2):
 
 
 @given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
-def test_held_out_board_has_a_pool_on_each_skin(seed, pool_n, draws_n):
+def test_label_pool_has_the_same_number_of_indentations_on_each_held_out_skin(seed, pool_n, draws_n):
     table = poked_rows()
     folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
@@ -258,7 +258,7 @@ def test_label_pool_is_spread_evenly_over_places(seed, pool_n):
             assert visits.max() <= -(-pool_n // PLACES_N)
 
 
-def test_label_pool_depends_only_on_seed_and_draw():
+def test_label_pool_depends_on_the_seed_but_not_on_the_number_of_draws():
     table = poked_rows()
     first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
     fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
@@ -319,7 +319,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
 )  # fmt: skip
-def test_settings_that_allow_no_fold_are_refused(table, experiment, split, message):
+def test_draw_folds_raises_if_the_settings_do_not_fit_the_rows(table, experiment, split, message):
     with pytest.raises(ParamsError, match=message):
         draw_folds(table, [experiment], split, 0)
 
@@ -327,7 +327,7 @@ def test_settings_that_allow_no_fold_are_refused(table, experiment, split, messa
 @pytest.mark.parametrize(
     ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
-def test_skin_on_two_boards_is_refused(experiment, split):
+def test_draw_folds_raises_if_a_skin_is_on_two_boards(experiment, split):
     with pytest.raises(ParamsError, match="is both trained on and held out"):
         draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)
 
@@ -366,7 +366,7 @@ def test_saved_folds_list_boards_and_skins():
     ]
 
 
-def test_folds_that_were_saved_for_other_rows_are_refused():
+def test_parse_folds_raises_if_folds_were_saved_for_other_rows():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
     with pytest.raises(SchemaError, match="but the captures have 2 rows"):
         parse_folds(document, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")

@@ -16,7 +16,7 @@ sizes = st.tuples(st.integers(1, 60), st.integers(1, 10), st.integers(0, 10), st
 
 
 @given(sizes)
-def test_windows_equal_a_loop(sizes):
+def test_windows_equal_those_found_by_a_loop(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     expected, cut_n, start = [], 0, every_n
@@ -37,7 +37,7 @@ def test_windows_equal_a_loop(sizes):
 
 
 @given(sizes)
-def test_each_test_unit_is_tested_once_and_never_used_for_training(sizes):
+def test_no_unit_is_in_two_windows(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     windows = make_windows(
@@ -47,21 +47,21 @@ def test_each_test_unit_is_tested_once_and_never_used_for_training(sizes):
     assert len(used) == len(set(used))
 
 
-def test_last_window_ends_with_the_shortest_capture():
+def test_no_window_extends_beyond_the_end_of_the_shortest_capture():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    # The last window ends with the shorter capture; the longer capture has these units later.
+    # The last window ends with the shorter capture, so the last units of the longer capture are in no window.
     assert windows.left_out_units_n == 24 - 15
 
 
-def test_part_of_a_capture_contains_whole_rows():
+def test_take_selects_rows_with_all_their_columns():
     taken = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
     assert taken.x_mm.tolist() == [1, 4] == taken.indentation.tolist()
     assert taken.b_uT[:, 0].tolist() == [101, 104]
     assert (taken.capture, len(taken)) == ("c0", 2)
 
 
-def test_two_captures_of_one_skin_are_refused():
+def test_check_one_per_skin_raises_if_a_skin_has_two_captures():
     with pytest.raises(ParamsError, match="the order in time of the 2 captures of skin s0 is unknown: c0, c1"):
         check_one_per_skin([readings("c0"), readings("c1")])
     check_one_per_skin([readings("c0"), readings("c1", skin="s1")])
@@ -94,7 +94,7 @@ def example_parts(*skins: str):
     return make_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
 
 
-def test_each_window_has_the_field_changes_of_each_no_load_policy():
+def test_parts_have_the_field_changes_of_their_window_and_no_load_policy():
     for part in example_parts("s0", "s1"):
         start, end = {TRAIN: (0, 6), 0: (8, 12), 1: (16, 20)}[part.window_i]
         strong = [i for i in range(start, end) if i % 5]
@@ -104,13 +104,13 @@ def test_each_window_has_the_field_changes_of_each_no_load_policy():
         np.testing.assert_allclose(part.noload_off_uT, np.sqrt(np.mean(off)))
 
 
-def test_first_no_load_reading_may_belong_to_a_row_that_is_not_selected():
+def test_policy_initial_uses_the_first_no_load_reading_even_if_its_row_is_not_selected():
     first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
     # The initial no-load field is that of reading 0, whose row is not selected because its force is too low.
     assert (first.rows.db_uT == 100).all()
 
 
-def test_parts_contain_the_indices_of_their_rows():
+def test_row_i_of_a_part_contains_the_indices_of_its_rows():
     parts = example_parts("s0", "s1")
     rows = stack(parts)
     assert np.concatenate([part.row_i for part in parts]).tolist() == list(range(len(rows)))
@@ -125,7 +125,7 @@ def test_rows_that_are_not_selected_are_counted_once():
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
-def test_parts_under_policy_each_equal_gathered_rows(train_n, test_n, more_n):
+def test_parts_with_policy_each_equal_the_gathered_rows_of_their_window(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
     windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)

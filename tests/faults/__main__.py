@@ -26,8 +26,10 @@ OUT = ROOT / "docs/faults.md"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", default=[], help="faults whose name contains one of these")
-    parser.add_argument("--work", type=Path, help="a folder to keep the finished checkout and the rows in")
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="inject only the faults whose name contains one of these words"
+    )
+    parser.add_argument("--work", type=Path, help="a folder in which the finished checkout and the table rows are kept")
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     work = (arguments.work or Path(tempfile.mkdtemp())).resolve()
@@ -87,8 +89,9 @@ restores outputs from its cache without reading them. `reskin check-cache` reads
 objects aside and removes their copies. Arrays (safetensors) and tables (Parquet) contain checksums, so reading a
 damaged file is an error.
 
-{green_n} of {faults_n} green, {not_run_n} not run. Code (`git rev-parse HEAD:pipeline`) {code};
-{cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.
+{green_n} of {faults_n} rows are green, and {not_run_n} faults have not been injected yet. Code
+(`git rev-parse HEAD:pipeline`): {code}. Machine: {cores_n} cores, load {load:.0f} at the end, Python {python}. All
+faults together took {minutes:.0f} min.
 
 """
 

@@ -10,7 +10,7 @@ from tests.faults.harness import NOT_RUN, SCENE, Checkout, Row, fault, judge
 from tests.faults.kills import address
 
 TRIPLET = address("train_triplet")
-# the mounts are removed when the process ends
+# The command runs in a mount namespace of its own, so its mounts are removed when it ends.
 IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")
 
 
@@ -26,7 +26,7 @@ def full_cells(checkout: Checkout) -> Row:
 
 @fault(
     "full disk under everything",
-    "the checkout is on a tmpfs with 150 kB of free space; the next run has space again",
+    "the checkout is on a tmpfs with 150 kB of free space; before the next run, space is freed",
 )
 def full_disk(checkout: Checkout) -> Row:
     checkout.reset(TRIPLET)
@@ -60,7 +60,10 @@ def read_only_reports(checkout: Checkout) -> Row:
     return _read_only(checkout, keep=True)
 
 
-@fault("read-only `reports/`, nothing in it", "the same, without former outputs")
+@fault(
+    "read-only `reports/`, nothing in it",
+    "`reports/` is mounted read-only and contains no former outputs; `report` has to run",
+)
 def read_only_new_reports(checkout: Checkout) -> Row:
     return _read_only(checkout, keep=False)
 
@@ -109,7 +112,7 @@ def cut_all(checkout: Checkout) -> Row:
     row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], fails=False)
     row.message = row.message or f"ran {', '.join(first.ran) or 'no stage: the files are restored from DVC’s cache'}"
     row.faults += ["finished stages ran again"] if first.ran else []
-    row.faults += [] if first.status == 0 else ["it fails"]
+    row.faults += [] if first.status == 0 else ["`dvc repro` fails"]
     return row
 
 
@@ -177,11 +180,11 @@ def add_cache_damage(what: str, folder: str, pattern: str, writer: str, reader: 
         first, cells = checkout.run("dvc", "repro"), checkout.trainings()
         checked = checkout.run(*CHECK)
         row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
-        row.faults += [] if "check-cache" in row.message else ["the remedy is missing"]
+        row.faults += [] if "check-cache" in row.message else ["the message does not name `reskin check-cache`"]
         row.faults += (
             []
             if (checked.status, str(file.relative_to(checkout.folder)) in checked.output) == (1, True)
-            else ["not found"]
+            else ["`reskin check-cache` does not find the damaged file"]
         )
         row.faults += [] if file.read_bytes() == content else ["the changed file is in use"]
         return row
@@ -202,7 +205,7 @@ def cached_folds(checkout: Checkout) -> Row:
     row = judge(checkout, checkout.run(*CHECK), checkout.run("dvc", "repro"), may_run=[address("split")])
     row.faults += [] if (restored.status, restored.ran) == (0, []) else ["the folds were not restored"]
     row.faults += [] if file.read_bytes() == content else ["the changed folds are in use"]
-    row.known = "JSON and CSV files have no checksum: only `reskin check-cache` finds what a disk changed in them"
+    row.known = "JSON and CSV files have no checksum, so only `reskin check-cache` detects that a disk has changed them"
     return row
 
 
@@ -219,7 +222,9 @@ def cache_folder(checkout: Checkout) -> Row:
     shutil.rmtree(checkout.folder / f"data/models/{SCENE}/train_triplet")
     before, checked, after = (checkout.run(*command) for command in (("dvc", "repro"), CHECK, ("dvc", "repro")))
     row = judge(checkout, checked, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings())
-    row.faults += [] if before.ran == after.ran == [TRIPLET] else [f"ran {before.ran}, {after.ran}"]
+    row.faults += (
+        [] if before.ran == after.ran == [TRIPLET] else [f"the two `dvc repro` ran {before.ran} and {after.ran}"]
+    )
     row.known = (
         "DVC prints nothing, and runs the stage at every `dvc repro` until the cache is checked; no training run is "
         "repeated"
@@ -244,7 +249,7 @@ def add_training_damage(name: str, how: str, damage) -> None:
         )
         row.lost = f"{len(cells) - len(whole)} training run and the others of its stack; {fresh_n} repeated"
         row.faults += [] if 1 <= fresh_n <= 3 else ["training runs of other stacks are repeated too"]
-        row.faults += [] if "is damaged" in row.message else ["no message"]
+        row.faults += [] if "is damaged" in row.message else ["no message says that a file is damaged"]
         return row
 
 

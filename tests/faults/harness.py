@@ -1,4 +1,4 @@
-"""Copies of a finished checkout, into which faults are injected, and the judgement of what each fault causes."""
+"""Copies of a finished checkout, into which faults are injected, and checks of what each fault causes."""
 
 import os
 import re
@@ -183,7 +183,7 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 
 
 def message_of(output: Sequence[str] | str) -> str:
-    """Return the error message in a command's output: that of the stage if there is one, else that of DVC."""
+    """Return the error message in a command's output: the message of the stage if there is one, else that of DVC."""
     lines = output.splitlines() if isinstance(output, str) else list(output)
     # DVC reports its own damaged files with the words "is invalid".
     for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):
@@ -193,8 +193,17 @@ def message_of(output: Sequence[str] | str) -> str:
     return ""
 
 
-ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # paths of this machine, shortened in the table
-TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", "the next run", "s", "verdict")
+ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # the table shortens these paths of this machine
+TITLES = (
+    "fault",
+    "how it is injected",
+    "what the user sees",
+    "exit status",
+    "lost work",
+    "the next run",
+    "s",
+    "verdict",
+)
 
 
 @dataclass
@@ -242,13 +251,13 @@ def judge(
     different = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
     unexpected = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
     checks = {
-        "a traceback": TRACES in first.output + again.output,
-        "a hang": first.status is None or again.status is None,
-        "no failure": fails and first.status == 0,
+        "a command prints a traceback": TRACES in first.output + again.output,
+        "a command reaches the time limit": first.status is None or again.status is None,
+        "the run with the fault does not fail": fails and first.status == 0,
         # a negative status means a killed process, which prints nothing
-        "no message": (first.status or 0) > 0 and not message_of(first.output),
+        "the failed run prints no message": (first.status or 0) > 0 and not message_of(first.output),
         f"the next run fails: {message_of(again.output)}": again.status not in (0, None),
-        f"other results: {', '.join(different)}": bool(different),
+        f"the results of these stages differ: {', '.join(different)}": bool(different),
         f"finished stages ran again: {', '.join(unexpected)}": bool(unexpected),
         f"{len(again_trained)} finished training runs repeated": bool(again_trained),
     }
@@ -257,7 +266,7 @@ def judge(
         next_run += f"; {len(reused)} training runs reused, {trained} computed"
     next_run += "" if different else "; results equal byte for byte"
     faults = [fault for fault, is_true in checks.items() if is_true]
-    lost = f"{torn_n} training runs of a stack whose files were being written" if torn_n else "nothing finished"
+    lost = f"{torn_n} training runs of a stack whose files were being written" if torn_n else "no finished work"
     return Row(message_of(first.output), first.status, lost, next_run, faults)
 
 

@@ -14,7 +14,7 @@ STAGES = (
     "sensitivity", "audit", "report", "publish",
 )  # fmt: skip
 ATTEMPTS_N = 4
-ADDRESS_SPACE_MAX = 100 * 2**20  # bytes of address space
+ADDRESS_SPACE_MAX = 100 * 2**20  # in bytes; less than a worker uses
 
 
 def address(stage: str) -> str:
@@ -23,7 +23,10 @@ def address(stage: str) -> str:
 
 
 def run_and_kill(checkout: Checkout, stage: str, part: float) -> Result | None:
-    """Run a stage by DVC; kill the stage after the fraction `part` of its previous duration; None if it ends first."""
+    """Run a stage by DVC and kill it after the fraction `part` of its previous duration.
+
+    A training stage is instead killed as soon as a training run is finished. Returns None if the stage ends before.
+    """
     cost = checkout.folder / ".reskin/costs" / SCENE / f"{stage}.json"
     wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
     if stage == "publish":
@@ -48,7 +51,7 @@ def add_kill(stage: str) -> None:
 
     @fault(
         f"kill -9 in `{stage}`",
-        "SIGKILL to the stage's process in mid-run"
+        "SIGKILL to the stage's process while it runs"
         + ("" if stage not in TRAINING_STAGES else ", as soon as a training run is finished"),
     )
     def case(checkout: Checkout) -> Row:

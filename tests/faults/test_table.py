@@ -5,18 +5,18 @@ from tests.faults.__main__ import OUT
 from tests.faults.harness import CASES, Row, line, message_of
 
 
-def test_table_has_a_row_for_every_fault():
+def test_table_in_docs_has_a_row_for_every_fault():
     rows = [row.split(" | ")[0].removeprefix("| ") for row in OUT.read_text().splitlines() if row.startswith("| ")]
     assert rows == ["fault", *CASES]
 
 
-def test_failed_check_makes_a_row_red():
+def test_row_with_a_failed_check_has_the_verdict_red():
     row = Row("error: no room", None, "nothing", "ran adapt", ["a hang"], "Known: DVC waits.")
     cells = "| “error: no room” | hang | nothing | ran adapt | 3 | red: a hang. Known: DVC waits. |"
     assert line("f", "h", row, 3.2).endswith(cells)
 
 
-def test_stage_message_precedes_that_of_dvc():
+def test_message_of_prefers_the_message_of_the_stage_to_that_of_dvc():
     lines = ["x: stage 2 of 3", "error: split: a must b; got c.", "ERROR: failed to reproduce 'split@a'"]
     assert message_of(lines) == lines[1]
     assert message_of(lines[2:]) == lines[2]
@@ -24,6 +24,6 @@ def test_stage_message_precedes_that_of_dvc():
     assert message_of([lock, "", "Mapping values are not allowed"]) == lock
 
 
-def test_paths_of_this_machine_are_shortened():
+def test_paths_of_this_machine_are_shortened_in_the_table():
     row = Row("error: /tmp/x1/case/data must be; delete .dvc/tmp/rwlock", 2, "nothing", "ran adapt")
     assert "“error: …/data must be; delete .dvc/tmp/rwlock”" in line("f", "h", row, 1.0)

@@ -49,12 +49,12 @@ def two_stages(checkout: Checkout) -> Row:
     checkout.until(lambda: bool(checkout.trainings()), checkout.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
     one, finished = checkout.end(first, start_s), checkout.trainings()
-    # if the second command was refused, its stage still has to run
+    # If the second command was refused, the next run has to run its stage.
     yet_to_run = [address("sensitivity")] if second.status else []
     row = judge(checkout, second, checkout.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
-    row.faults += ["refused, and it ran"] if second.status and second.ran else []
-    row.message = row.message or "nothing: both run to their end"
+    row.faults += ["the second command was refused, but ran a stage"] if second.status and second.ran else []
+    row.message = row.message or "no message: both commands succeed"
     return row
 
 
@@ -86,14 +86,15 @@ def add_beside(checkout: Checkout) -> Row:
     one = checkout.end(first, start_s)
     later = checkout.run(*command)
     row = judge(checkout, added, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
-    row.faults += [] if (one.status, later.status) == (0, 0) else ["the run, or the later add, fails"]
-    row.next_run = f"added after its end; {row.next_run}"
+    row.faults += [] if (one.status, later.status) == (0, 0) else ["`dvc repro` or the later `reskin add` fails"]
+    row.next_run = f"the recording is added after the end of `dvc repro`; {row.next_run}"
     return row
 
 
 @fault(
     "kill -9 of `reskin add`",
-    "SIGKILL as soon as its folder exists; `dvc repro`; `reskin add`; what its message says, and `reskin add` again",
+    "SIGKILL as soon as the folder of the capture exists; then `dvc repro`, `reskin add`, the deletion of the folder "
+    "that its message asks for, and `reskin add` again",
 )
 def kill_add(checkout: Checkout) -> Row:
     command, start_s = _add(checkout), time.monotonic()
@@ -129,7 +130,11 @@ def kill_ingest(checkout: Checkout) -> Row:
     checkout.stage("ingest").kill()
     result = checkout.end(repro, start_s)
     row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
-    row.faults += [] if (undisturbed.status, checkout.lock()[INGEST]) == (0, expected) else ["other readings"]
+    row.faults += (
+        []
+        if (undisturbed.status, checkout.lock()[INGEST]) == (0, expected)
+        else ["the readings differ from those of an undisturbed run"]
+    )
     return row
 
 
@@ -184,7 +189,7 @@ def clock(checkout: Checkout) -> Row:
     first = checkout.run("dvc", "repro", PYTHONPATH=f"{shim}:{checkout.folder}")
     row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False)
     row.faults += [] if set(first.ran) == set(stages) else [f"ran {first.ran}"]
-    row.message = row.message or "nothing"
+    row.message = row.message or "no message"
     return row
 
 
@@ -211,7 +216,7 @@ def conflict_lock(checkout: Checkout) -> Row:
 
 @fault(
     "git: conflict left in data/captures.yaml",
-    "conflict markers; `reskin scenes check`; `git restore` for the next run",
+    "conflict markers in `data/captures.yaml`; `reskin scenes check`; `git restore` of this file for the next run",
 )
 def conflict_captures(checkout: Checkout) -> Row:
     command = ("python", "-m", "pipeline", "scenes", "check")
@@ -219,11 +224,13 @@ def conflict_captures(checkout: Checkout) -> Row:
     return _damage_and_restore(checkout, "data/captures.yaml", text, command)
 
 
-@fault("dvc.lock cut", "its last twentieth is cut off; `dvc repro`; `git restore dvc.lock` for the next run")
+@fault(
+    "dvc.lock cut", "the last twentieth of `dvc.lock` is cut off; `dvc repro`; `git restore dvc.lock` for the next run"
+)
 def cut_lock(checkout: Checkout) -> Row:
     text = (checkout.folder / "dvc.lock").read_text()
     row = _damage_and_restore(checkout, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
-    row.message = row.message or "nothing: stages that are missing in it run again"
+    row.message = row.message or "no message: stages that are missing in `dvc.lock` run again"
     return row
 
 
@@ -238,5 +245,5 @@ def index_lock(checkout: Checkout) -> Row:
     Path(checkout.folder / ".git/index.lock").unlink()
     row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False)
     row.faults += [] if first.ran == [address("split")] else [f"ran {first.ran}"]
-    row.message = row.message or "nothing: no stage needs it"
+    row.message = row.message or "no message: no stage needs git's index"
     return row

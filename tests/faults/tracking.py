@@ -22,16 +22,16 @@ from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, j
 def _report(checkout: Checkout, first: Result, again: Result | None) -> Row:
     """Judge stage publish: it must succeed soon, with one warning; a later `reskin publish` must send all runs."""
     row, warned_n = judge(checkout, first, again or NOT_RUN, fails=False), first.output.count("warning:")
-    row.lost, row.next_run = "nothing", "as for a server that refuses"
+    row.lost, row.next_run = "nothing", "same as after 'tracking server refuses'"
     if again:
         counts = re.findall(r"MLflow runs (\{.*\})", again.output)
         row.next_run = f"`reskin publish`: {counts[-1] if counts else again.output.strip()[-200:]}"
-        row.faults += [] if counts else ["not sent later"]
-    row.faults += [f"{warned_n} warnings"] if warned_n != 1 else []
+        row.faults += [] if counts else ["`reskin publish` does not send the runs later"]
+    row.faults += [f"{warned_n} warnings instead of one"] if warned_n != 1 else []
     row.faults += [f"exit status {first.status}"] if first.status else []
     took_s, undisturbed_s = (_took_s(each) for each in (checkout, checkout.template))
     row.message += f" (stage publish: {took_s:.0f} s; undisturbed {undisturbed_s:.0f} s)"
-    row.faults += ["held up"] if took_s > 2 * undisturbed_s + 60 else []
+    row.faults += ["the stage takes much longer than undisturbed"] if took_s > 2 * undisturbed_s + 60 else []
     return row
 
 
@@ -46,7 +46,7 @@ def _publish_to(checkout: Checkout, uri: str) -> Row:
 
 @fault(
     "tracking server refuses",
-    "MLFLOW_TRACKING_URI names a port where nobody listens; stage `publish` runs",
+    "MLFLOW_TRACKING_URI names a port on which no program listens; stage `publish` runs",
 )
 def refused(checkout: Checkout) -> Row:
     (checkout.folder / "mlflow.db").unlink()
@@ -150,7 +150,7 @@ def _signal_server_in_mid_run(checkout: Checkout, number: signal.Signals) -> Row
     written_n = _finished_n(checkout.folder / "team.db")
     with _mlflow_server(checkout, port):
         row = _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
-    row.next_run += f", {written_n} runs were there"
+    row.next_run += f", {written_n} runs were in the store before"
     return row
 
 

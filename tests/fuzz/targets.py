@@ -52,7 +52,7 @@ def stream(data: bytes) -> None:
 
 
 def page(data: bytes) -> None:
-    """Receive a message from a page: there are three commands; all other messages must be ignored."""
+    """Receive a message from the live page. All messages except the three known commands must be ignored."""
     receive(LIVE, data.decode(errors="replace"))
 
 
@@ -73,7 +73,7 @@ def request(data: bytes) -> None:
 
 
 def card(data: bytes) -> None:
-    """Read a network whose card is `data` and whose weights file is empty."""
+    """Read a network with an empty weights file; `data` is the content of its model card (the JSON file)."""
     (FOLDER / "m.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{}      ")
     (FOLDER / "m.json").write_bytes(data)
     read_network(FOLDER / "m.safetensors")
@@ -97,7 +97,7 @@ def _log(data: bytes) -> None:
 
 
 def labels(data: bytes) -> None:
-    """Read rows of a robot's table in chunks: the probe log written from them must be valid, if there is one."""
+    """Read the rows of a robot's table in chunks; if a probe log is written from the rows, it must be valid."""
     table, dwells, cut_n = SampleTable("labels"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell

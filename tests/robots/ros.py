@@ -122,7 +122,7 @@ def fake_modules(node: Node, spin: Any) -> dict[str, ModuleType]:
         "spin_once": lambda spun, timeout_sec: spin(),
     }  # fmt: skip
     for name in list(contents):
-        contents[name.partition(".")[0]]  # the package itself
+        contents[name.partition(".")[0]]  # creates the content of the package itself, e.g. of std_msgs for std_msgs.msg
     modules = {name: ModuleType(name) for name in contents}
     for name, module in modules.items():
         vars(module).update(contents[name])

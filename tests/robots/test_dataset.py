@@ -70,7 +70,7 @@ def load_with_lerobot(exported: Path, folder: Path, *options: str) -> list[dict]
     return json.loads((folder / "frames.json").read_text())
 
 
-def test_capture_becomes_an_episode_with_all_readings(tmp_path):
+def test_capture_is_exported_as_one_episode_with_all_readings(tmp_path):
     counts = export_lerobot([write_stream(tmp_path, "binary")], tmp_path / "out", task="touch")
     assert counts == {"episodes_n": 1, "frames_n": 500, "fps": 250, **EXACT}
     frames, episodes, info, statistics = read(tmp_path / "out")
@@ -87,7 +87,7 @@ def test_capture_becomes_an_episode_with_all_readings(tmp_path):
     assert values_of(episodes, "stats/observation.field_uT/max")[0].tolist() == b_uT.max(axis=0).tolist()
 
 
-def test_frames_are_the_latest_readings_and_gaps_end_episodes(tmp_path):
+def test_export_at_a_given_rate_uses_the_latest_reading_before_each_frame(tmp_path):
     t_s, b_uT, temperature_degC = log_of()
     kept = (t_s < 0.5) | (t_s > 0.9)
     io.write_text(tmp_path / "log.csv", dataset.sd_card.render(t_s[kept], b_uT[kept], temperature_degC[kept]))
@@ -106,7 +106,7 @@ def test_frames_are_the_latest_readings_and_gaps_end_episodes(tmp_path):
     assert 0 < counts["timestamp_error_max_s"] <= 1 / RATE_HZ + 1e-6
 
 
-def test_faulty_frames_are_counted(tmp_path):
+def test_faulty_frames_are_dropped_and_counted(tmp_path):
     t_s, b_uT, temperature_degC = log_of()
     b_uT[10:14, :3], temperature_degC[10:14, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     io.write_text(tmp_path / "log.csv", dataset.sd_card.render(t_s, b_uT, temperature_degC))
@@ -114,16 +114,16 @@ def test_faulty_frames_are_counted(tmp_path):
     assert (counts["frames_n"], counts["dropped_faulty_frames_n"]) == (496, 4)
 
 
-def test_readings_become_frames_one_to_one_if_no_rate_is_given(tmp_path):
+def test_each_reading_becomes_one_frame_if_no_rate_is_given(tmp_path):
     t_s, b_uT, temperature_degC = log_of()
-    t_s = t_s + np.where(np.arange(len(t_s)) >= 100, 0.05, 0.0)  # frames were lost
+    t_s = t_s + np.where(np.arange(len(t_s)) >= 100, 0.05, 0.0)  # a gap of 0.05 s, as if frames were lost
     io.write_text(tmp_path / "log.csv", dataset.sd_card.render(t_s, b_uT, temperature_degC))
     counts = export_lerobot([tmp_path / "log.csv"], tmp_path / "out", task="touch")
     np.testing.assert_array_equal(values_of(read(tmp_path / "out")[0], "observation.field_uT"), b_uT)
     assert counts["timestamp_error_max_s"] == pytest.approx(0.05)
 
 
-def test_labels_of_a_capture_are_those_of_its_dwells(tmp_path):
+def test_readings_during_a_dwell_of_the_probe_log_have_its_labels(tmp_path):
     folder = write_stream(tmp_path, "binary")
     header = json.loads((folder / HEADER_FILE).read_text())
     header["clock"] = Clock(kind="arrivals", rate_hz=None, marks=((1.0, 101.0),)).model_dump(mode="json")
@@ -139,11 +139,11 @@ def test_labels_of_a_capture_are_those_of_its_dwells(tmp_path):
     assert (force_N[touched] == 0.5).all()
     assert (force_N[lifted] == 0).all()
     assert np.isnan(force_N[~touched & ~lifted]).all()
-    assert info["features"]["label.force_N"]["names"] == ["Fz_N"]  # the other components are unknown
+    assert info["features"]["label.force_N"]["names"] == ["Fz_N"]  # the log has no sideways forces
     assert "label.depth_mm" not in info["features"]
 
 
-def test_ingested_readings_have_an_episode_per_indentation(tmp_path):
+def test_each_indentation_of_ingested_readings_becomes_an_episode(tmp_path):
     files = [write_readings(tmp_path / f"c{i}.parquet", capture=f"c{i}") for i in range(2)]
     counts = export_lerobot(files, tmp_path / "out", task="touch")
     assert counts == {"episodes_n": 8, "frames_n": 80, "fps": 100, **EXACT}
@@ -160,7 +160,7 @@ def test_ingested_readings_have_an_episode_per_indentation(tmp_path):
     assert tasks.loc["touch"].task_index == 0
 
 
-def test_readings_without_times_need_their_rate(tmp_path):
+def test_export_of_readings_without_times_raises_unless_their_rate_is_given(tmp_path):
     file = write_readings(tmp_path / "c.parquet", t_s=np.full(40, np.nan))
     stream = write_stream(tmp_path, "binary") / STREAM_FILE
     io.write_table(tmp_path / "frames.parquet", decode_dump(stream.read_bytes(), "binary", 5, "stream")[0])
@@ -174,7 +174,7 @@ def test_readings_without_times_need_their_rate(tmp_path):
     assert export_lerobot([tmp_path / "frames.parquet"], tmp_path / "out2", task="touch", rate_hz=RATE_HZ)["fps"] == 250
 
 
-def test_wrong_input_is_an_error_and_leaves_nothing_behind(tmp_path):
+def test_export_of_wrong_input_raises_and_writes_no_files(tmp_path):
     good, out = write_readings(tmp_path / "a.parquet"), tmp_path / "out"
     simulated = write_readings(tmp_path / "b.parquet", source="simulated")
     unlabelled = write_readings(tmp_path / "c.parquet", Fz_N=np.full(40, np.nan, np.float32))
@@ -207,7 +207,7 @@ def test_wrong_input_is_an_error_and_leaves_nothing_behind(tmp_path):
 
 
 @needs_lerobot
-def test_lerobot_loads_the_dataset_and_would_write_the_same(tmp_path):
+def test_exported_dataset_equals_the_one_that_lerobot_writes_from_the_same_frames(tmp_path):
     file = write_readings(tmp_path / "c.parquet", x_mm=np.arange(-5, 35).astype(np.float32))
     for source, name in ((file, "readings"), (write_stream(tmp_path, "binary"), "stream")):
         export_lerobot([source], tmp_path / name, task="touch")
@@ -218,7 +218,7 @@ def test_lerobot_loads_the_dataset_and_would_write_the_same(tmp_path):
 
 
 @needs_lerobot
-def test_lerobot_loads_unknown_values_and_several_files(tmp_path, monkeypatch):
+def test_lerobot_loads_a_dataset_of_several_files_with_unknown_values(tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "FILE_MB", 0.001)
     place_mm = np.where(np.arange(40) < 5, np.nan, np.arange(40)).astype(np.float32)
     export_lerobot([write_readings(tmp_path / "c.parquet", x_mm=place_mm)], tmp_path / "out", task="touch")

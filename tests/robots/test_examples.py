@@ -28,7 +28,7 @@ def command(beginning: str) -> list[str]:
     return shlex.split(line)
 
 
-def test_export_command(tmp_path, monkeypatch, capsys):
+def test_export_command_of_the_page_writes_a_dataset(tmp_path, monkeypatch, capsys):
     captures = tmp_path / "captures"
     captures.mkdir()
     write_stream(captures, "binary")
@@ -44,7 +44,7 @@ def test_export_command(tmp_path, monkeypatch, capsys):
     assert all(f"`{name}`" in PAGE for name in features if "." in name)
 
 
-def test_lerobot_example(monkeypatch):
+def test_lerobot_example_of_the_page_records_an_episode(monkeypatch):
     frames, calls = [], []
 
     class FakeSensor(sensor.SkinSensor):
@@ -78,13 +78,13 @@ def test_lerobot_example(monkeypatch):
     np.testing.assert_array_equal(frames[0]["observation.skin"], np.arange(8))
 
 
-def test_ros_2_command_has_parameters_of_the_node():
+def test_ros_2_command_of_the_page_uses_only_parameters_of_the_node():
     given = [word.partition(":=")[0] for word in command("python -m reskin.robots.ros2") if ":=" in word]
     assert given
     assert set(given) <= set(ros2.PARAMETERS)
 
 
-def test_onnx_examples(tmp_path, monkeypatch):
+def test_onnx_examples_of_the_page_export_and_run_a_model(tmp_path, monkeypatch):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
     monkeypatch.chdir(tmp_path)

@@ -53,7 +53,7 @@ class FakeSkin:
 
 @pytest.fixture
 def run(monkeypatch):
-    """Return a function that runs the node on a skin, and returns what it publishes, by topic."""
+    """Return a function that runs the node on a skin and returns the published messages of each topic."""
 
     def run(skin, spin=lambda: None, **parameters) -> dict[str, list[Message]]:
         node = Node({"rate_hz": 1e6, "port": "played"} | parameters)
@@ -69,7 +69,7 @@ def run(monkeypatch):
     return run
 
 
-def test_contact_is_published_in_SI_units_with_covariance(run):
+def test_contact_is_published_in_SI_units_with_its_covariance(run):
     published = run(FakeSkin([TOUCHED]), frame_id="finger")
     (place,), (force,), (sd,) = (published[topic] for topic in ("~/place", "~/force", "~/force_sd"))
     assert published["~/contact"][0].data is True
@@ -90,14 +90,14 @@ def test_contact_is_published_in_SI_units_with_covariance(run):
     assert {place.header.frame_id, force.header.frame_id, sd.header.frame_id} == {"finger"}
 
 
-def test_without_contact_there_is_no_place(run):
+def test_no_place_is_published_without_contact(run):
     published = run(FakeSkin([UNTOUCHED]))
     assert [message.data for message in published["~/contact"]] == [False]
     assert to_plain(published["~/force"][0].wrench.force) == {"x": 0.0, "y": 0.0, "z": 0.0}
     assert not {"~/place", "~/force_sd"} & set(published)
 
 
-def test_unusable_readings_are_only_in_the_diagnostics(run):
+def test_unusable_readings_are_published_only_as_diagnostics(run):
     published = run(FakeSkin([FAULTY, SILENT]))
     assert set(published) == {"/diagnostics"}
     statuses = [message.status[0] for message in published["/diagnostics"]]
@@ -106,14 +106,14 @@ def test_unusable_readings_are_only_in_the_diagnostics(run):
     assert to_plain(statuses[0].values) == [{"key": "lost_bytes_n", "value": "7"}]
 
 
-def test_board_without_a_model_has_only_fields(run):
+def test_node_without_a_model_publishes_fields_but_no_estimates(run):
     contacts = [contact._replace(x_mm=np.nan, y_mm=np.nan, F_N=np.nan) for contact in (TOUCHED, FAULTY, UNTOUCHED)]
     published = run(FakeSkin(contacts, has_model=False))
     assert len(published["~/chip4/field"]) == 2
     assert not ESTIMATES & set(published)
 
 
-def test_diagnostics_are_published_when_alarms_change(run, monkeypatch):
+def test_diagnostics_are_published_each_time_the_alarms_change(run, monkeypatch):
     monkeypatch.setattr(ros2, "DIAGNOSTICS_S", math.inf)
     published = run(FakeSkin([TOUCHED, UNTOUCHED, FAULTY, FAULTY, UNTOUCHED]))
     assert [message.status[0].message for message in published["/diagnostics"]] == [
@@ -121,7 +121,7 @@ def test_diagnostics_are_published_when_alarms_change(run, monkeypatch):
     ]  # fmt: skip
 
 
-def test_service_takes_a_new_noload_reading(run):
+def test_service_zero_takes_a_new_noload_reading(run):
     skin = FakeSkin([UNTOUCHED])
     run(skin)
     kind, zero = run.node.services["~/zero"]
@@ -129,7 +129,7 @@ def test_service_takes_a_new_noload_reading(run):
     assert (skin.zeros_n, response.success, bool(response.message)) == (1, True, True)
 
 
-def test_rate_is_limited(monkeypatch):
+def test_limit_rate_keeps_contacts_at_the_given_rate(monkeypatch):
     now_s = iter(np.arange(4000) / 400)
     monkeypatch.setattr(ros2, "time", SimpleNamespace(monotonic=lambda: next(now_s)))
     kept = [contact is not None for contact in ros2.limit_rate(iter([TOUCHED] * 4000), 30.0)]
@@ -159,14 +159,14 @@ def test_error_ends_the_node_with_a_message(run, monkeypatch, capsys):
         assert message in capsys.readouterr().out
 
 
-def test_models_are_selected_by_parameters():
+def test_find_model_selects_models_by_the_parameters_of_the_node():
     assert ros2.find_model("", "", 0.0) == []
     assert ros2.find_model("a.safetensors", "b.safetensors", 0.0) == ["a.safetensors", "b.safetensors"]
     assert ros2.find_model("", "", 30.0).external_uT == 30.0
 
 
 @pytest.mark.skipif(ROSBAGS is None, reason="RESKIN_ROSBAGS=PYTHON is not set; PYTHON must have the package rosbags")
-def test_definitions_and_messages_are_those_of_ROS_2(run, tmp_path):
+def test_definitions_and_messages_of_the_fake_equal_those_of_ROS_2(run, tmp_path):
     published = run(FakeSkin([TOUCHED, UNTOUCHED, SILENT]))
     types = {"~/contact": "std_msgs/msg/Bool", "~/place": "geometry_msgs/msg/PoseWithCovarianceStamped"}
     types |= {"~/force": "geometry_msgs/msg/WrenchStamped", "~/force_sd": "geometry_msgs/msg/WrenchStamped"}

@@ -1,4 +1,7 @@
-"""Tests of the LeRobot-style sensor, on a pseudo-terminal and with a reader whose frames a test releases."""
+"""Tests of `SkinSensor`, which has the methods of a LeRobot sensor.
+
+The sensor reads an emulated board on a pseudo-terminal, or a reader that returns frames when a test allows it.
+"""
 
 import math
 import os
@@ -20,7 +23,7 @@ FIELDS = [f"B{axis}{chip}_uT" for chip in range(5) for axis in "xyz"]
 
 
 class GatedReader(ScriptReader):
-    """A reader that returns only the frames before the frame `allow`."""
+    """A reader that returns only as many frames as a test has allowed by a call of `allow`."""
 
     def __init__(self, script) -> None:
         super().__init__(script)
@@ -74,7 +77,7 @@ def test_sensor_reads_an_emulated_board(tmp_path):
         assert not sensor.is_connected
 
 
-def test_readings_are_returned_once_and_in_time(gated):
+def test_async_read_returns_each_reading_only_once(gated):
     sensor, reader = gated(make_script(), without_contact=-1.0)
     sensor.connect(warmup=False)
     try:
@@ -100,7 +103,7 @@ def test_readings_are_returned_once_and_in_time(gated):
         sensor.disconnect()
 
 
-def test_unusable_readings_are_not_returned(gated):
+def test_async_read_returns_no_unusable_readings(gated):
     sensor, reader = gated(inject(make_script(), parse_fault("failed-read@1.5+1")))
     with sensor:
         reader.wait()
@@ -112,7 +115,7 @@ def test_unusable_readings_are_not_returned(gated):
             sensor.async_read(timeout_ms=0)
 
 
-def test_errors_of_the_connection(gated, monkeypatch):
+def test_wrong_calls_and_failures_of_the_connection_raise(gated, monkeypatch):
     sensor, _ = gated(make_script())
     for method in (sensor.read, sensor.async_read, sensor.read_latest, sensor.zero, sensor.disconnect):
         with pytest.raises(ConnectionError, match=r"SkinSensor\(gated\) is not connected. Call connect first."):

@@ -20,7 +20,7 @@ ENVIRONMENT = {
     "PYTHONDONTWRITEBYTECODE": "",  # write bytecode, because about a hundred processes import the code
 }  # fmt: skip
 
-DONE, FAILED = "these stages ended", "these stages did not end"  # lines that warm.py prints
+DONE, FAILED = "all stages have succeeded", "a stage has failed"  # lines that warm.py prints
 
 
 @cache
@@ -62,7 +62,7 @@ def copy_without_code(checkout: Path, folder: Path) -> Path:
 def variables(folder: Path, **environment: str) -> dict[str, str]:
     """Return environment variables with which programs use the code and the MLflow store of the copy."""
     inherited = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
-    # so that `python` in commands of stages is the project's Python
+    # The virtual environment is first, so that `python` in the commands of stages is the project's Python.
     path = f"{folder / '.venv/bin'}{os.pathsep}{inherited['PATH']}"
     return {**inherited, **ENVIRONMENT, "PYTHONPATH": str(folder), "PATH": path, **environment}
 
@@ -85,7 +85,7 @@ def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
                 output.append(line)
             if line.strip() != (DONE if succeed else FAILED):
                 raise AssertionError(
-                    f"{names or 'stages'} must {'' if succeed else 'not '}end:\n{''.join(output)[-3000:]}"
+                    f"stages {names or '(all)'} must {'succeed' if succeed else 'fail'}:\n{''.join(output)[-3000:]}"
                 )
             return "".join(output)
 

@@ -38,7 +38,7 @@ def run(tmp_path, monkeypatch):
     return run
 
 
-def test_only_new_captures_are_read(run):
+def test_only_captures_that_are_not_cached_are_read(run):
     assert run() == ["c0", "c1", "c2"]
     assert run() == []
     run.names.remove("c1")
@@ -48,7 +48,7 @@ def test_only_new_captures_are_read(run):
     assert run() == ["c1"]
 
 
-def test_captures_are_read_again_after_changes_of_bytes_settings_or_code(run):
+def test_captures_are_read_again_if_their_bytes_the_settings_or_the_code_change(run):
     run()
     io.write_text(run.folder / "raw/c1/stream.bin", "other")
     assert run() == ["c1"]
@@ -57,7 +57,7 @@ def test_captures_are_read_again_after_changes_of_bytes_settings_or_code(run):
     assert run() == ["c0", "c1", "c2"]
 
 
-def test_finished_captures_are_kept_if_another_is_broken(run):
+def test_captures_that_were_read_stay_cached_if_another_capture_is_broken(run):
     io.write_text(run.folder / "raw/c2/stream.bin", "broken")
     with pytest.raises(CaptureError):
         run()
@@ -65,7 +65,7 @@ def test_finished_captures_are_kept_if_another_is_broken(run):
     assert run() == ["c2"]
 
 
-def test_damaged_cached_file_is_read_again(run, capsys):
+def test_capture_is_read_again_if_its_cached_file_is_damaged(run, capsys):
     run()
     (cached,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
     cached.write_text("c9")
@@ -74,7 +74,7 @@ def test_damaged_cached_file_is_read_again(run, capsys):
     assert run() == []
 
 
-def test_capture_with_a_partial_file_of_a_killed_stage_is_read_again(run):
+def test_capture_is_read_again_if_a_killed_stage_left_a_partial_file(run):
     run()
     cached = run.folder / stage.CACHE / "lab"
     (file,) = [file for file in cached.iterdir() if file.read_text() == "c2"]

@@ -1,4 +1,7 @@
-"""Tests of the whole pipeline on scene ci: results, repeated and killed runs, deleted outputs, wrong settings."""
+"""Tests that run the whole pipeline on scene ci, the small scene for tests.
+
+They check the results, repeated and killed runs, deleted outputs, and wrong settings.
+"""
 
 import json
 import os
@@ -39,7 +42,7 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
-# Experiments that scene ci does not run: those on recordings and those on many skins.
+# Scene ci runs all experiments except these, which need recordings or many skins.
 EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
     "reference_methods",
@@ -52,7 +55,8 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "worlds",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
-# time limit for tests that hang; a busy machine needs four times as long as an idle one
+# The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
+# one.
 pytestmark = pytest.mark.timeout(1800)
 slow = pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 
@@ -82,7 +86,7 @@ def numbers(story) -> dict[str, Any]:
     return json.loads((story / "reports/ci/numbers.json").read_text())
 
 
-def test_first_tables_have_all_numbers_and_their_source(story, numbers):
+def test_report_contains_provenance_scores_and_byte_counts(story, numbers):
     assert numbers["provenance"]["source"] == "simulated"
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
     assert {"git", "trained", "device", "versions", "seconds", "runtime"} == set(provenance)
@@ -102,17 +106,17 @@ def test_stages_print_their_position_in_the_run(story):
     order = json.loads((story / ".reskin/order.json").read_text())["stages"]
     output = (story / OUTPUT).read_text()
     numbers = {int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)}
-    assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, prints nothing
+    assert sorted(numbers) == list(range(2, len(order) + 1))  # the first stage, `code`, prints no position
 
 
-def test_early_table_2_equals_that_of_the_report(story, numbers):
+def test_stage_table2_writes_the_same_table_as_the_report(story, numbers):
     assert (story / "data/table2/ci/headline.svg").read_text() == table2_figure(numbers, "simulated")
     table = (story / "data/table2/ci/table2.md").read_text()
     assert table == to_markdown(table_2_summary(numbers))
     assert table in (story / OUTPUT).read_text()
 
 
-def test_dvc_metrics_are_numbers_of_the_report(story, numbers):
+def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
     shown = json.loads(run(story, "dvc", "metrics", "show", "--json").stdout)
     scores = shown[""]["data"]["reports/ci/scores.json"]["data"]
     assert set(scores) == {"table2", "single_sensor", "drift_end", "shear"}
@@ -140,12 +144,12 @@ def test_protocols_are_simulated_into_separate_folders(story):
     )
     assert np.isnan(hand.x_mm).all()
     assert np.isnan(hand.Fz_N).all()
-    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # a line has a stop every 2 mm
-    assert np.abs(drag.Fx_N).max() > 0.3  # friction when dragged along x
+    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # there is a stop every 2 mm along a line
+    assert np.abs(drag.Fx_N).max() > 0.3  # dragging along x causes friction
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
-def test_experiments_on_many_skins_share_test_rows(story, numbers):
+def test_experiments_on_many_skins_have_scores_for_each_board(story, numbers):
     assert [row["pokes_n"] for row in numbers["sweep_pokes"]] == [0, 30, 65]
     assert {(row["method"], row["skins_n"]) for row in numbers["sweep_sensors"]} == {
         (method, skins_n) for method in ("multi", "triplet", "adapted") for skins_n in (1, 4)
@@ -191,7 +195,7 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert f'src="figures/{figure.name}"' in page
 
 
-def test_commit_machine_and_times_change_only_provenance(story, tmp_path):
+def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(story, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(
         story, again, symlinks=True, ignore=shutil.ignore_patterns(".dvc", "raw", "mlflow.db", "mlartifacts")
@@ -217,7 +221,7 @@ def test_commit_machine_and_times_change_only_provenance(story, tmp_path):
     assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
 
 
-def test_experiments_on_single_boards_report_spread_over_seeds(story, numbers):
+def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(story, numbers):
     for experiment in ("manual", "flexible"):
         assert numbers[experiment]["seeds_n"] == 2
         assert all(
@@ -239,12 +243,12 @@ def test_experiments_on_single_boards_report_spread_over_seeds(story, numbers):
         assert re.search("over (2 |the )?network seeds", table)
 
 
-def test_checklist_rows_resolve_to_numbers_and_files(story):
+def test_rows_of_the_checklist_refer_to_existing_numbers_and_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
-    assert [row.id for row in missing] == ["plateau"]  # not reached, because the sweep is too short
+    assert [row.id for row in missing] == ["plateau"]  # the sweep of scene ci is too short to reach a plateau
     assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     resolved = [row for row in rows if row not in missing]
@@ -254,7 +258,7 @@ def test_checklist_rows_resolve_to_numbers_and_files(story):
     assert {name for row in rows for name in row.shown} - files == set()
 
 
-def test_losses_of_all_protocols_are_counted(story, numbers):
+def test_captures_and_frames_of_each_protocol_are_counted(story, numbers):
     for protocol in ("wear", "drag", "hand", "flexible", "sleeve"):
         account = numbers["capture_by_protocol"][protocol]
         files = list((story / f"data/indentations/ci-{protocol}").glob("*.parquet"))
@@ -262,7 +266,7 @@ def test_losses_of_all_protocols_are_counted(story, numbers):
         assert account["frames_n"] == sum(io.read_ingest_counts(file)["frames_n"] for file in files)
 
 
-def test_model_predicts_contacts_of_an_sd_card_log(story):
+def test_reskin_predict_estimates_contacts_from_a_log_of_an_sd_card(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
     run(story, "reskin", "predict", str(log), "--model", str(model), "--out", "contacts.csv")
@@ -273,7 +277,7 @@ def test_model_predicts_contacts_of_an_sd_card_log(story):
     assert np.isfinite(estimates.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
 
 
-def test_physics_studies_have_numbers_and_tables(story, numbers):
+def test_studies_of_the_simulation_have_numbers_and_tables(story, numbers):
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
     costs = json.loads((story / "reports/ci/provenance.json").read_text())
     runtime = join(numbers, costs)["runtime"]
@@ -285,20 +289,20 @@ def test_physics_studies_have_numbers_and_tables(story, numbers):
     assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
 
 
-def test_captures_have_parquet_files_with_units(story):
+def test_each_capture_has_a_parquet_file_with_units(story):
     files = sorted((story / "data/indentations/ci").glob("*.parquet"))
     assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]
     assert pq.read_schema(files[0]).field("b_uT").metadata[b"unit"] == b"uT"
 
 
-def test_score_equals_a_naive_loop(story):
+def test_score_equals_the_score_computed_by_a_naive_loop(story):
     card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
     predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
     predicted = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
-            # The first pass is the adaptation pool; the scene selects forces of 0 N or more.
+            # The first pass is kept for adaptation, and the scene selects forces of 0 N or more.
             if reading["pass_i"] >= 1 and reading["Fz_N"] >= 0:
                 truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
     assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in predicted] == truths
@@ -309,7 +313,7 @@ def test_score_equals_a_naive_loop(story):
     assert card["scores"]["all"]["accuracy_pct"] == pytest.approx(100 * hits / len(truths))
 
 
-def test_predictions_equal_those_of_the_saved_model(story):
+def test_saved_predictions_equal_those_computed_from_the_saved_weights(story):
     folder = story / "data/models/ci/train_multi"
     tensors, _ = io.read_tensors(folder / "lobo.paper.b1.seed0.safetensors")
     reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").filter(pc.field("pass_i") == 1).slice(0, 1)
@@ -322,12 +326,12 @@ def test_predictions_equal_those_of_the_saved_model(story):
         features = np.maximum(features, 0) if i in (1, 4, 5) else features
     expected = scaler.decode(features[None].astype(np.float32))[0]
     first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
-    # tolerance: float32 sums in another order
+    # The tolerance allows for single-precision sums in another order.
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore")  # importing mlflow.pyfunc causes warnings about MLflow's types
-def test_mlflow_model_predicts_like_the_saved_model(story, monkeypatch):
+def test_model_loaded_from_mlflow_has_the_predictions_of_the_saved_model(story, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
     client = mlflow.MlflowClient()
     query = "tags.kind = 'training' and tags.question = 'lobo' and tags.current = 'true'"
@@ -339,7 +343,7 @@ def test_mlflow_model_predicts_like_the_saved_model(story, monkeypatch):
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
-def test_report_publishes_runs_that_last_as_long_as_their_training(story):
+def test_mlflow_runs_have_the_duration_and_the_loss_curve_of_their_training(story):
     client = mlflow.MlflowClient(f"sqlite:///{story / 'mlflow.db'}")
     query = "tags.kind = 'training' and tags.stage = 'train_multi' and tags.current = 'true'"
     found = client.search_runs([client.get_experiment_by_name("ci").experiment_id], query)
@@ -366,7 +370,7 @@ def test_repeated_training_gives_the_same_lock_file(story, run_stages):
     assert (story / "dvc.lock").read_text() == before
 
 
-def test_second_repro_restores_deleted_models(story):
+def test_dvc_repro_restores_deleted_models_without_running_stages(story):
     models = sorted((story / "data/models/ci/train_multi").iterdir())
     content = models[0].read_bytes()
     for file in models:
@@ -380,7 +384,7 @@ def test_second_repro_restores_deleted_models(story):
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
 
 
-def test_dvc_detects_an_edited_report(story):
+def test_dvc_status_lists_an_edited_report(story):
     file = story / "reports/ci/numbers.json"
     content = file.read_text()
     file.write_text(content.replace("simulated", "recorded", 1))
@@ -389,7 +393,7 @@ def test_dvc_detects_an_edited_report(story):
     assert re.search(r"modified:\s+reports/ci/numbers.json", output)
 
 
-def test_killed_stage_keeps_finished_folds(story):
+def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     models = story / "data/models/killed"
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci",
              "--folds", "data/models/ci/folds.json", "--models", str(models)]  # fmt: skip
@@ -427,7 +431,7 @@ def test_missing_tracking_server_is_reported_quickly(story):
 
 
 @slow
-def test_removed_experiment_leaves_no_files(story, run_stages):
+def test_no_files_of_a_removed_experiment_remain(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["experiments"].remove("sleeve")  # its settings stay

@@ -75,7 +75,7 @@ def preload(protocols: set[tuple[str, str]]) -> None:
             simulation.skin, simulation.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m
         )
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches the deformation tables of the skin
-    gc.freeze()  # so that garbage collection in forks does not copy memory
+    gc.freeze()  # garbage collection in forks then does not copy memory
 
 
 def run_stages(names: list[str]) -> str:
