@@ -207,7 +207,7 @@ def test_skins_are_drawn_independently_on_each_board():
 
 
 def test_repeated_number_of_sensors_is_refused():
-    with pytest.raises(ParamsError, match="must list each number of skins once"):
+    with pytest.raises(ParamsError, match="must list each number of skins only once"):
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
@@ -328,7 +328,7 @@ def test_settings_that_allow_no_fold_are_refused(table, experiment, split, messa
     ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
 def test_skin_on_two_boards_is_refused(experiment, split):
-    with pytest.raises(ParamsError, match="is both trained on and held out"):
+    with pytest.raises(ParamsError, match="is both in the training rows and in the held-out rows"):
         draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)
 
 

@@ -152,7 +152,7 @@ def test_error_for_another_file_names_the_file(tmp_path):
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "cut.parquet").read_bytes()[:-20])
     for name, message in (
         ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "column 1 is 'a'"),
-        ("other.parquet", "not the columns of reskin decode"), ("cut.parquet", "not readable as Parquet"),
+        ("other.parquet", "not the columns of reskin decode"), ("cut.parquet", "cannot be read as a Parquet file"),
     ):  # fmt: skip
         with pytest.raises(ReskinError, match=rf"{name}.*{message}"):
             reskin.load_recording(tmp_path / name)
