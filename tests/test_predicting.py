@@ -99,7 +99,7 @@ def test_networks_cannot_expect_external_fields(tmp_path, model):
 
 
 def test_fields_in_mT_are_refused(tmp_path, model):
-    with pytest.raises(CaptureError, match="field must be 20 uT or more .* Convert mT or G to uT"):
+    with pytest.raises(CaptureError, match="field must be 20 uT or more .* If the unit of the file is mT or G"):
         predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
 
 

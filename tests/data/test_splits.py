@@ -314,7 +314,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         ),
         (
             poked_rows(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
-            "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
+            "skin b0_s0: the number of pokes to draw must be at most the 10 indentations of the skin's pool; got 11",
         ),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
