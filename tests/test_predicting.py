@@ -105,7 +105,7 @@ def test_fields_in_mT_are_refused(tmp_path, model):
 
 def test_unsuitable_tables_and_labelled_recordings_are_an_error(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
-    with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
+    with pytest.raises(CaptureError, match="the columns x are not those that `reskin decode` writes"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
     write_capture(tmp_path / "c0", make_header(capture="c0"), {})
     with pytest.raises(CaptureError, match="cannot predict from a capture of layout"):

@@ -160,7 +160,7 @@ def test_error_for_another_file_names_the_file(tmp_path):
     with pytest.raises(CaptureError, match="late.*set frames=True"):
         reskin.load_recording(stream)
     assert len(reskin.load_recording(stream, frames=True)) == FRAMES_N
-    with pytest.raises(CaptureError, match="stream.bin.*run `reskin decode`"):
+    with pytest.raises(CaptureError, match="stream.bin.*with `reskin decode`"):
         reskin.load_recording(stream / STREAM_FILE)
 
 

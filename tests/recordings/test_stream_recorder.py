@@ -332,7 +332,7 @@ class TestErrors:
             stream_recorder.record(board.name, tmp_path, settings=SETTINGS, stop=threading.Event())
 
     def test_port_that_sends_nothing_is_reported(self, board, clock, tmp_path):
-        with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Is the"):
+        with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Check that the"):
             record(board, tmp_path, lambda _: setattr(clock, "s", 0.7), silence_s=0.6)
 
     def test_port_unplugged_before_the_first_byte_is_reported(self, board, tmp_path):

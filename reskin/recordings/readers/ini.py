@@ -53,8 +53,8 @@ def collect(recording: Path) -> dict[str, Path]:
     truths = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
     if not truths:
         raise CaptureError(
-            f"{recording}: there is no {' or '.join(names)} in the same folder. Copy the truths file to this folder, under "
-            "one of these names."
+            f"{recording}: there is no {' or '.join(names)} in the same folder. Copy the truths file to this folder, "
+            "under one of these names."
         )
     return {READINGS: recording, TRUTHS: truths[0]}
 

@@ -309,7 +309,7 @@ def test_file_of_labels_is_found_by_its_name(tmp_path: Path, name: str) -> None:
     files = ini.collect(recording)
     assert files == {ini.READINGS: recording, ini.TRUTHS: truths}
     assert ini.count_chips(files) == CHIPS_N
-    with pytest.raises(CaptureError, match="not truths_"):
+    with pytest.raises(CaptureError, match="instead of truths_"):
         ini.collect(truths)
 
 
