@@ -34,10 +34,12 @@ def read_yaml(path: Path) -> Any:
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ParamsError(f"{path}: file not found. Check the name.") from None
+        raise ParamsError(f"{path}: file not found. Check the path.") from None
     except (YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
-        raise ParamsError(f"{path}: the file is not YAML: {problem}. Correct the line that is named here.") from None
+        raise ParamsError(
+            f"{path}: the file is not valid YAML: {problem}. Correct the line of the file that this message names."
+        ) from None
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
@@ -61,20 +63,25 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         name = ", ".join(names) or "the file"
         got = repr(first.get("input"))[:80]
         if first["type"] == "missing":
-            raise ParamsError(f"{where}: {name} {'are' if ', ' in name else 'is'} missing. Add it there.") from None
+            are, remedy = "is", "Add this key, and give it a value."
+            if len(names) > 1:
+                are, remedy = "are", "Add these keys, and give each of them a value."
+            raise ParamsError(f"{where}: {name} {are} missing. {remedy}") from None
         if first["type"] == "extra_forbidden":
             raise ParamsError(
-                f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there."
+                f"{where}: {name} is not a known parameter (its value: {got}). Correct the name of this key, or remove "
+                "the key."
             ) from None
         rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
         # This is the error of a validator that the model defines. Its message already names the keys and their values.
         if first["type"] == "value_error":
             place = f"{where}: {name}" if first["loc"] else where
             end = "" if rule.endswith("?") else "."
-            raise ParamsError(f"{place}: {rule}{end} Correct it there.") from None
+            remedy = "Correct this value." if first["loc"] else "Correct these settings."
+            raise ParamsError(f"{place}: {rule}{end} {remedy}") from None
         choices = re.findall("'([^']*)'", rule) if first["type"] == "literal_error" else []
         guess = did_you_mean(first.get("input"), choices)
-        raise ParamsError(where, name, rule, got, f"Correct it there.{guess}") from None
+        raise ParamsError(where, name, rule, got, f"Correct this value.{guess}") from None
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:

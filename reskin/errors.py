@@ -74,13 +74,17 @@ DISK_REMEDIES = {  # what the user can do about an error of the disk, by the err
     getattr(errno, name): remedy
     for names, remedy in (
         ("ENOSPC EDQUOT EFBIG", "Free some disk space."),
-        ("EROFS EACCES EPERM", "Check its permissions and its mount."),
-        ("EIO", "Check the disk."),
+        ("EROFS EACCES EPERM", "Check the permissions of this file, and whether its disk is mounted read-only."),
+        ("EIO", "Check the disk for errors."),
     )
     for name in names.split()
     if hasattr(errno, name)
 }
-RETRY = "Run it again: finished work is kept."
+RETRY = "Then run the same command again. Work that was finished before is kept, and is not repeated."
+
+LESS_MEMORY = (
+    "Set the environment variable RESKIN_EXECUTOR=processes:1, so that a single worker process runs at a time."
+)
 
 
 @contextmanager
@@ -94,7 +98,7 @@ def explaining(where: str) -> Iterator[None]:
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")
     Traceback (most recent call last):
     reskin.errors.MachineError: split: data/folds/lab.json: No space left on device. Free some disk space. \
-Run it again: finished work is kept.
+Then run the same command again. Work that was finished before is kept, and is not repeated.
     """
     try:
         yield
@@ -104,12 +108,13 @@ Run it again: finished work is kept.
             raise
         raise missing_package(package, where) from None
     except BrokenExecutor:
-        remedy = f"Try RESKIN_EXECUTOR=processes:1. {RETRY}"
-        raise MachineError(f"{where}: a worker process died, perhaps out of memory. {remedy}") from None
+        raise MachineError(
+            f"{where}: a worker process died, perhaps because it ran out of memory. {LESS_MEMORY} {RETRY}"
+        ) from None
     except (MemoryError, OSError) as error:
         if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
-            detail = " ".join(str(error).split()) or "nothing is left"
-            raise MachineError(f"{where}: out of memory: {detail}. Try RESKIN_EXECUTOR=processes:1. {RETRY}") from None
+            detail = " ".join(str(error).split()) or "no memory is left"
+            raise MachineError(f"{where}: out of memory: {detail}. {LESS_MEMORY} {RETRY}") from None
         if error.errno not in DISK_REMEDIES:
             raise
         file, remedy = error.filename or "the disk", DISK_REMEDIES[error.errno]
@@ -145,5 +150,6 @@ def missing_package(package: str, where: object, *, extra: str | None = None) ->
     """
     extra = extra or EXTRAS.get(package, "pipeline")
     return ParamsError(
-        f"{where}: the Python package `{package}` is not installed. In the checkout: pip install '.[{extra}]'"
+        f"{where}: the Python package `{package}` is not installed. To install it, run in the checkout: pip install "
+        f"'.[{extra}]'"
     )

@@ -26,15 +26,15 @@ import safetensors.numpy
 from reskin.code import package_digest
 from reskin.errors import DISK_REMEDIES, SchemaError
 from reskin.numerics import signature
-from reskin.schema import Readings, arrow_schema, from_table, to_table
+from reskin.schema import INGEST_AGAIN, Readings, arrow_schema, from_table, to_table
 
 PARQUET_MAGIC = b"PAR1"  # first bytes of a Parquet file
 COUNTS_KEY = b"reskin.account"  # key of the ingestion counts in the metadata of a Parquet file of readings
 DIGEST = "digest"  # key of the digest in the metadata of a safetensors file
 HEADER_AT = 8  # position of the header in a safetensors file; the bytes before it contain the length of the header
 REMEDY = (
-    "It was cut or changed. If `dvc repro` wrote it, delete it, then run `reskin check-cache` and `dvc repro`. "
-    "Otherwise copy it again."
+    "The file is incomplete, or it was changed after it was written. If `dvc repro` wrote the file, delete the file, "
+    "then run `reskin check-cache` and `dvc repro`. Otherwise, copy the file again from where you got it."
 )
 MACHINE_ERRNOS = {
     errno.EACCES,
@@ -61,7 +61,10 @@ def replacing(path: Path) -> Iterator[Path]:
         if temporary.is_dir():
             remove(path)
         elif path.is_dir():
-            raise SchemaError(f"{path}: a folder of this name exists. Choose another name for the file.")
+            raise SchemaError(
+                f"{path}: a file cannot be written here, because there is a folder with this name. Choose another name "
+                "for the file."
+            )
         temporary.replace(path)
     except BaseException as error:
         if isinstance(error, OSError) and error.errno in DISK_REMEDIES and _is_written(error, temporary):
@@ -167,7 +170,9 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SchemaError(f"{path}: the file is not JSON: {error}. Run the stage that wrote it again.") from None
+        raise SchemaError(
+            f"{path}: the file is not JSON: {error}. Run the stage again that writes this file."
+        ) from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -201,7 +206,10 @@ def read_tensors(
             metadata: dict[str, str] = file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
         _raise_machine_error(error)
-        raise SchemaError(f"{path}: the file is not safetensors: {error}. Is it a trained model? {REMEDY}") from None
+        raise SchemaError(
+            f"{path}: the file cannot be read as a safetensors file: {error}. Check that the path is that of a trained "
+            f"model. {REMEDY}"
+        ) from None
     written = metadata.pop(DIGEST, None)
     is_checked = not names and (digest_needed or written is not None)
     if is_checked and written != _digest(tensors, metadata):
@@ -218,8 +226,8 @@ def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> s
 
 
 def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
-    # The safetensors library writes the entries of the metadata in an order that differs from process to process. They
-    # are sorted here, so that equal contents give equal bytes.
+    # The safetensors library writes the entries of the metadata in an order that differs from process to process. The
+    # entries are sorted here, so that equal contents give equal bytes.
     length = int.from_bytes(content[:HEADER_AT], "little")
     header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(metadata.items()))}
     return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
@@ -261,7 +269,10 @@ def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, 
                 writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(to_table(block))
         if writer is None:
-            raise SchemaError(f"{path}: all readings of the capture were dropped. Check its labels and its faults.")
+            raise SchemaError(
+                f"{path}: all readings of the capture were dropped. Check the labels (places and forces) of the "
+                "capture, and look for faults of the board, such as failed reads."
+            )
         writer.add_key_value_metadata({COUNTS_KEY.decode(): json.dumps(dict(counts), sort_keys=True)})
         writer.close()
 
@@ -279,14 +290,14 @@ def read_ingest_counts(path: Path) -> dict[str, int]:
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
-        raise SchemaError(f"{path}: the file's metadata lacks the ingestion counts. Ingest it again.")
+        raise SchemaError(f"{path}: the metadata of the file lacks the ingestion counts. {INGEST_AGAIN}")
     counts: dict[str, int] = json.loads(metadata[COUNTS_KEY])
     return counts
 
 
 def _check_is_file(path: Path) -> None:
     if not path.exists():
-        raise SchemaError(f"{path}: file not found. Check the path, or run the stage that writes it.")
+        raise SchemaError(f"{path}: file not found. Check the path, or run the stage that writes this file.")
 
 
 def _raise_machine_error(error: Exception) -> None:
@@ -306,7 +317,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
         _raise_machine_error(error)
         reason = " ".join(str(error).split()).rstrip(".")
-        raise SchemaError(f"{path}: the file is not readable as Parquet: {reason}. {REMEDY}") from None
+        raise SchemaError(f"{path}: the file cannot be read as a Parquet file: {reason}. {REMEDY}") from None
 
 
 # --- Cache of computed arrays. It is in the folder __pycache__ of the package that computes them. ---

@@ -109,5 +109,7 @@ def device() -> str:
     """
     name = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
     if name not in DEVICES:
-        raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(name), "Unset it for cpu.")
+        raise ParamsError(
+            DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(name), "Unset this variable to use the CPU."
+        )
     return name

@@ -29,6 +29,7 @@ FORCE_SIGNS = (
     "Fz_N positive in compression."
 )
 AXES_PER_CHIP_N = 3
+INGEST_AGAIN = "Run the ingestion stage again, which converts the capture to this file."
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,9 @@ def from_table(table: pa.Table, where: str) -> Readings:
     for name in LABELS:
         distinct = table.column(name).unique().to_pylist()
         if len(distinct) != 1:
-            raise SchemaError(f"{where}: column {name} has several values, {distinct[:3]}. Write one capture per file.")
+            raise SchemaError(
+                f"{where}: column {name} has several values, {distinct[:3]}. Write each capture to a file of its own."
+            )
         values[name] = distinct[0]
     for name in UNITS:
         column = table.column(name).combine_chunks()
@@ -148,18 +151,18 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     """Check that a table has the columns, types and units of `arrow_schema`, and return the number of its chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
-        raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest the capture again.")
+        raise SchemaError(f"{where}: column {', '.join(missing)} is missing. {INGEST_AGAIN}")
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
-        raise SchemaError(where, "b_uT", "a fixed list of 3 values per chip", b_type, "Ingest it again.")
+        raise SchemaError(where, "b_uT", "a list of fixed length with 3 values per chip", b_type, INGEST_AGAIN)
     chips_n = b_type.list_size // AXES_PER_CHIP_N
     for expected in arrow_schema(chips_n):
         actual = schema.field(expected.name)
         if actual.type != expected.type:
-            raise SchemaError(where, f"column {expected.name}", expected.type, actual.type, "Ingest it again.")
+            raise SchemaError(where, f"column {expected.name}", expected.type, actual.type, INGEST_AGAIN)
         actual_unit, expected_unit = (actual.metadata or {}).get(b"unit"), (expected.metadata or {})[b"unit"]
         if actual_unit != expected_unit:
             got = "no unit" if actual_unit is None else actual_unit.decode()
-            remedy = "Convert the column to this unit, and write the unit to the column's metadata."
+            remedy = "Convert the values of the column to this unit, and write the unit to the metadata of the column."
             raise SchemaError(where, f"unit of {expected.name}", repr(expected_unit.decode()), got, remedy)
     return chips_n

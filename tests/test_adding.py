@@ -371,7 +371,7 @@ def test_error_for_a_wrong_number_of_chips_suggests_the_right_one(root, tmp_path
     assert_refused(
         root,
         lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
-        "It fits binary with 2 chips",
+        "The bytes fit binary with 2 chips",
     )
     assert_refused(
         root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None, ())), "Add --probe"

@@ -78,7 +78,7 @@ def test_unknown_device_is_an_error(monkeypatch, value):
     with pytest.raises(ParamsError) as error:
         device()
     assert str(error.value) == (
-        f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {value!r}. Unset it for cpu."
+        f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {value!r}. Unset this variable to use the CPU."
     )
 
 

@@ -135,7 +135,7 @@ def test_old_folder_is_kept_if_writing_one_of_its_texts_fails(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
 def test_non_parquet_file_is_an_error(tmp_path, content):
     (tmp_path / "c0.parquet").write_bytes(content)
-    with pytest.raises(SchemaError, match=r"c0.parquet: the file is not readable as Parquet"):
+    with pytest.raises(SchemaError, match=r"c0.parquet: the file cannot be read as a Parquet file"):
         io.read_readings(tmp_path / "c0.parquet")
 
 
@@ -164,7 +164,7 @@ def test_write_json_raises_if_a_value_is_nan(tmp_path):
 
 def test_broken_safetensors_are_an_error(tmp_path):
     (tmp_path / "m.safetensors").write_bytes(b"junk")
-    with pytest.raises(SchemaError, match="is not safetensors"):
+    with pytest.raises(SchemaError, match="cannot be read as a safetensors file"):
         io.read_tensors(tmp_path / "m.safetensors")
 
 
@@ -208,7 +208,7 @@ def test_flipped_bits_of_tables_are_detected(tmp_path):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
-            detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
+            detected_n += i <= end and "c0.parquet: the file cannot be read as a Parquet file" in str(error)
     assert detected_n > end // 6  # The other flipped bits are in headers of pages and do not affect the values.
 
 

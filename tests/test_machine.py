@@ -11,24 +11,27 @@ import pytest
 
 from pipeline import stage
 from reskin import io
-from reskin.errors import MachineError, SchemaError, explaining
+from reskin.errors import RETRY, MachineError, SchemaError, explaining
 
 
 @pytest.mark.parametrize(
     ("error", "message"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "models"), "split: models: No space left on device. Free"),
-        (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports: Read-only file system. Check its"),
+        (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports: Read-only file system. Check the"),
         (OSError(errno.ENOSPC, "No space left on device"), "split: the disk: No space left on device"),
-        (BrokenProcessPool("gone"), "split: a worker process died, perhaps out of memory. Try RESKIN_EXECUTOR"),
-        (MemoryError("Unable to allocate 8 GiB"), "split: out of memory: Unable to allocate 8 GiB. Try RESKIN_EXEC"),
+        (
+            BrokenProcessPool("gone"),
+            "split: a worker process died, perhaps because it ran out of memory. Set the env",
+        ),
+        (MemoryError("Unable to allocate 8 GiB"), "split: out of memory: Unable to allocate 8 GiB. Set the env"),
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: out of memory: .*Cannot allocate memory"),
     ],
 )
 def test_os_errors_are_explained(error, message):
     with pytest.raises(MachineError, match=f"^{message}") as error_info, explaining("split"):
         raise error
-    assert str(error_info.value).endswith("Run it again: finished work is kept.")
+    assert str(error_info.value).endswith(RETRY)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +63,9 @@ def test_damaged_table_is_an_error(tmp_path):
     content = (tmp_path / "t.parquet").read_bytes()
     for damaged in (content[:-20], bytes(500) + content[500:], b""):
         (tmp_path / "t.parquet").write_bytes(damaged)
-        with pytest.raises(SchemaError, match="not readable as Parquet: .* `reskin check-cache` and `dvc repro`"):
+        with pytest.raises(
+            SchemaError, match="cannot be read as a Parquet file: .* `reskin check-cache` and `dvc repro`"
+        ):
             io.read_table(tmp_path / "t.parquet")
 
 

@@ -82,7 +82,7 @@ def test_missing_required_experiment_is_an_error(experiment, others):
     assert experiment in scene(*others, experiment).experiments
     with pytest.raises(ParamsError) as error:
         scene(*others[:-1], experiment)
-    message = f"scene.yaml: experiment {experiment} needs {others[-1]} in the same scene. Correct it there."
+    message = f"scene.yaml: experiment {experiment} needs {others[-1]} in the same scene. Correct these settings."
     assert str(error.value) == message
 
 
@@ -182,7 +182,7 @@ def test_scene_with_one_experiment_runs_only_its_stage():
 def test_scene_needs_only_the_sections_of_its_experiments(experiment):
     ((section, settings),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
-    with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct it there."):
+    with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct these settings."):
         parse_scene(lacking, "scene.yaml")
     assert section in scene("single_temporal" if experiment == "lobo" else "lobo", **{section: settings}).unused
 
@@ -250,7 +250,7 @@ def test_numbers_with_an_exponent_in_yaml_are_read_as_numbers(tmp_path):
 @pytest.mark.parametrize("content", [b"a: [1", b"a: 1\na: 2\n", b"\xff\xfe\x00"])
 def test_broken_yaml_is_an_error(tmp_path, content):
     (tmp_path / "a.yaml").write_bytes(content)
-    with pytest.raises(ParamsError, match="a.yaml: the file is not YAML"):
+    with pytest.raises(ParamsError, match="a.yaml: the file is not valid YAML"):
         read_yaml(tmp_path / "a.yaml")
 
 

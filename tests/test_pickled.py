@@ -130,9 +130,9 @@ def test_converted_archive_is_read_as_a_recording_of_layout_lab(tmp_path):
 @pytest.mark.parametrize(
     ("archive", "message"),
     [
-        (b"", "not a .npz with samples under bl_arr and cont_arr: BadZipFile"),
+        (b"", "not an .npz archive with samples in the arrays bl_arr and cont_arr: BadZipFile"),
         (archive_of(bl_arr=[sample(0, [0, 0], FIELDS, [0, 0, 0])]), "cont_arr.npy"),
-        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array contains float64, not objects"),
+        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array contains values of type float64 instead of objects"),
         (archive_of(bl_arr=[{"a": 1}], cont_arr=[{"a": 1}]), "KeyError 'Indent'"),
         (
             archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]),

@@ -99,13 +99,13 @@ def test_predicting_with_a_network_raises_if_external_fields_are_expected(tmp_pa
 
 
 def test_fields_in_mT_are_refused(tmp_path, model):
-    with pytest.raises(CaptureError, match="field must be 20 uT or more .* Convert mT or G to uT"):
+    with pytest.raises(CaptureError, match="field must be 20 uT or more .* If the unit of the file is mT or G"):
         predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
 
 
 def test_unsuitable_tables_and_labelled_recordings_are_an_error(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
-    with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
+    with pytest.raises(CaptureError, match="the columns x are not those that `reskin decode` writes"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
     write_capture(tmp_path / "c0", make_header(capture="c0"), {})
     with pytest.raises(CaptureError, match="cannot predict from a capture of layout"):

@@ -64,7 +64,7 @@ class DetectedBoard(NamedTuple):
         if np.isfinite(self.lsb_uT).all():
             gain = "of no known gain" if self.gain_sel is None else f"GAIN_SEL {self.gain_sel}"
             return f"steps {self.lsb_uT[0]:.3f} uT in x, y and {self.lsb_uT[1]:.3f} uT in z, {gain}"
-        return "steps not known yet: do the readings change?"
+        return "steps not known yet (if the readings do not change, touch the skin)"
 
     def describe_rate(self, conversion_time_s: float = CONVERSION_S) -> str:
         """Return a text of several lines with the measured rate, a possible explanation, and the computed limits."""
@@ -111,7 +111,7 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     if not boards:
         problems = "; ".join(map(str, results)) or "no serial port found"
         raise CaptureError(
-            f"no board found ({problems}). Plug one in, or use --port. Without a board, try: "
+            f"no board found ({problems}). Plug in a board, or state its port with --port. Without a board, use: "
             "reskin live --emulate nominal"
         )
     return boards
@@ -129,7 +129,7 @@ def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
     except CaptureError as error:
         return DetectedBoard(port, str(error).removeprefix(f"{port}: "))
     except OSError as error:
-        return DetectedBoard(port, f"disappeared while it was read: {error}")
+        return DetectedBoard(port, f"the port disappeared while it was read: {error}")
     return recognise(port, chunks)
 
 
@@ -137,10 +137,12 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     """Detect a board from the chunks of bytes that its port sent."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
-        return DetectedBoard(port, "no bytes arrived: is the board running?")
+        return DetectedBoard(port, "no bytes arrived. Check that the board is running")
     formats = matching_formats(data)
     if not formats:
-        return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
+        return DetectedBoard(
+            port, f"no frame in {len(data)} bytes, so the baud rate is wrong or the device is not a board"
+        )
     decoded = [(*decode_all(data, wire, chips_n, port), wire, chips_n) for wire, chips_n in formats]
     # The bytes of a text frame fit both text formats, which differ only in the order of the numbers: a chip's
     # temperature is its first number in one format, and its last number in the other. Temperatures vary less than
@@ -177,7 +179,7 @@ def find_replugged_port(
     say("Unplug the board.")
     before = set(names())
     unplugged = _wait(lambda: before - set(names()), pause, timeout_s, "disappeared")
-    say(f"{', '.join(sorted(unplugged))} disappeared. Plug it in again.")
+    say(f"{', '.join(sorted(unplugged))} disappeared. Plug the board in again.")
     remaining = before - unplugged
     return min(_wait(lambda: set(names()) - remaining, pause, timeout_s, "appeared"))
 
@@ -188,7 +190,7 @@ def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], ti
         if ports := find_ports():
             return ports
         pause(POLL_S)
-    raise CaptureError(f"no port {what} within {timeout_s:g} s. Does the board have a serial port?")
+    raise CaptureError(f"no port {what} within {timeout_s:g} s. Check that the board has a serial port.")
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:

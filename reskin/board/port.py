@@ -38,7 +38,7 @@ def open_port(port: str, baud: int) -> Device:
         if number == errno.ENOENT:
             reason = f"no such port. {found_ports()}"
         elif number == errno.EAGAIN:
-            reason = "another program uses it (reskin live, a serial monitor?). Close that program."
+            reason = "another program uses it (perhaps reskin live or a serial monitor). Close this program."
         elif "Could not configure port" in str(error):  # pyserial's text for devices without a baud rate
             reason = f"it is not a serial port. {found_ports()}"
         raise CaptureError(f"{port}: cannot open the port: {reason}") from None
@@ -58,7 +58,7 @@ def check_name(port: str) -> None:
     elif os.path.isdir(port):  # unlike `Path.is_dir`, never raises for names such as COM3
         reason = f"it is a folder. {found_ports()}"
     elif os.path.isfile(port):
-        reason = "it is a file. Read files with reskin decode or reskin predict."
+        reason = "it is a file. To read a file, use reskin decode or reskin predict."
     if reason:
         raise CaptureError(f"{port}: cannot open the port: {reason}")
 
@@ -82,4 +82,8 @@ def port_names() -> list[str]:
 def found_ports() -> str:
     """Return a sentence that lists the ports of this machine, for error messages."""
     names = port_names()
-    return f"Ports found: {', '.join(names)}." if names else "No serial port was found: is the board plugged in?"
+    return (
+        f"Ports found: {', '.join(names)}."
+        if names
+        else "No serial port was found. Check that the board is plugged in."
+    )

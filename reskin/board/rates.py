@@ -248,7 +248,7 @@ def find_limits(
 def explain(rate: RateMeasurement, limits: Sequence[Limit]) -> str:
     """Return a sentence on what may limit a measured rate; `limits` is the result of `find_limits`."""
     if not rate.known:
-        return f"{rate.frames_n} frames are too few to measure a rate: listen longer"
+        return f"{rate.frames_n} frames are too few to measure a rate. Listen for a longer time"
     arrive = f"{_hz(rate.arrived_hz)} arrive"
     if rate.method == "clock":
         arrive += f" of {_hz(rate.sent_hz)} that the board sends by its own clock"

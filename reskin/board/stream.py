@@ -107,9 +107,11 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     The message suggests those formats in which `data`, the first bytes of the stream, can be decoded.
     """
     hint = " or ".join(f"{fit} with {k} chips" for fit, k in matching_formats(data))
-    remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
+    remedy = "Check the baud rate, the number of chips and the wire format." + (
+        f" The bytes fit {hint}." if hint else ""
+    )
     if not data:
-        remedy = "Is the board running and sending?"
+        remedy = "Check that the board is running and sends data."
     return CaptureError(
         f"{where}: no frame found in {len(data)} bytes, read as {chips_n} chips in wire format {wire}. {remedy}"
     )

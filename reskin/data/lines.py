@@ -83,8 +83,8 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
     lines: dict[str, Lines] = {}
     for readings in captures:
         if readings.skin in lines:
-            what = f"skin {readings.skin} has manual pokes in another capture too"
-            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two captures.")
+            what = f"skin {readings.skin} also has manual pokes in another capture"
+            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two captures from the scene.")
         lines[readings.skin] = shift_rows(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
         f = len(readings)
         parts.append(
@@ -176,9 +176,9 @@ def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) 
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
         raise ParamsError(
-            f"the pool has pokes of several skins: {', '.join(skins)}. Choose pokes of one skin at a time."
+            f"the pool contains pokes of several skins: {', '.join(skins)}. Use a pool with pokes of one skin only."
         )
     if indentations_n > pool_n:
-        rule = f"at most the {pool_n} indentations of its pool"
-        remedy = "Choose fewer, or enlarge the pool in section split."
-        raise ParamsError(f"skin {', '.join(skins)}", "pokes to choose", rule, indentations_n, remedy)
+        rule = f"at most the {pool_n} indentations of the skin's pool"
+        remedy = "Draw fewer pokes, or increase the pool of the skin in section split of the scene."
+        raise ParamsError(f"skin {', '.join(skins)}", "the number of pokes to draw", rule, indentations_n, remedy)

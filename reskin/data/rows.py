@@ -87,7 +87,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
     `Rows.target`.
     """
     if not captures:
-        raise ParamsError("the scene has no captures. Add one with `reskin add`.")
+        raise ParamsError("the scene has no captures. Add a capture with `reskin add`.")
     _check_one_kind(captures)
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
@@ -95,7 +95,9 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
     for readings, keep in pairs:
         if not keep.any():
             what = f"none of {len(readings)} readings has a known place and at least {selection.force_min_N} N"
-            raise ParamsError(f"capture {readings.capture}: {what}. Check its places and the sign of its force.")
+            raise ParamsError(
+                f"capture {readings.capture}: {what}. Check the places of the capture and the sign of its forces."
+            )
     passes_n: dict[str, int] = {}
     pass_i = []
     for readings, keep in pairs:
@@ -164,10 +166,10 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
         where, skin = f"capture {readings.capture}", readings.skin
         if readings.chips_n != first.chips_n:
             what = f"{readings.chips_n} chips, but {first.capture} in the same scene has {first.chips_n}"
-            raise ParamsError(f"{where}: {what}. Add it to a separate scene.")
+            raise ParamsError(f"{where}: {what}. Add this capture to a separate scene.")
         if readings.source != first.source:
             rule = f"{first.source}, as {first.capture} is"
-            remedy = "Simulated and recorded captures belong to different scenes."
+            remedy = "Put simulated and recorded captures into different scenes."
             raise ParamsError(where, "source", rule, readings.source, remedy)
         if boards.setdefault(skin, readings.board) != readings.board:
             remedy = "A skin that is moved to another board counts as a new skin: give it a new name."

@@ -54,7 +54,7 @@ class Split(Strict):
     @classmethod
     def _sensors_differ(cls, skins_n: tuple[int, ...] | None) -> tuple[int, ...] | None:
         if skins_n is not None and len(set(skins_n)) < len(skins_n):
-            raise ValueError(f"sensors_skins_n must list each number of skins once, not {list(skins_n)}")
+            raise ValueError(f"sensors_skins_n must list each number of skins only once; got {list(skins_n)}")
         return skins_n
 
 
@@ -133,7 +133,7 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """
     boards = np.unique(rows.board)
     if len(boards) < 2:
-        remedy = "Add another board's recording, or remove lobo from the scene's experiments."
+        remedy = "Add the recording of another board, or remove lobo from the experiments of the scene."
         raise ParamsError("experiment lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
     folds = []
     for board in boards:
@@ -160,7 +160,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         held, skins = np.flatnonzero(rows.board == board), np.unique(rows.skin[rows.board != board])
         if max(split.sensors_skins_n) > len(skins):
             rule = f"at most the {len(skins)} skins of all boards but {board}"
-            remedy = "Reduce it, or add another board's recording."
+            remedy = "Reduce split.sensors_skins_n in the scene, or add the recording of another board."
             raise ParamsError("experiment sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
         draws = range(split.sensors_draws_n)
         orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
@@ -195,7 +195,7 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
             test = np.setdiff1d(board_fold.test, pool)
             if not len(test):
                 what, rule = "split.labels_pool_n", "less than the number of indentations per skin"
-                remedy = "Reduce it, or record more."
+                remedy = "Reduce split.labels_pool_n in the scene, or record more indentations of each skin."
                 raise ParamsError(f"fold labels/{board_fold.name}", what, rule, split.labels_pool_n, remedy)
             folds.append(Fold("labels", f"{board_fold.name}{DRAW}{draw_i}", board_fold.train, test, pool))
     return folds
@@ -224,7 +224,9 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
     if train_n >= len(boards):
         rule = f"less than the number of boards in the scene, {len(boards)}"
-        remedy = "Each training skin is from a different board, and at least one board must remain for testing."
+        remedy = (
+            "Reduce split.transfer_skins_n: each training skin is from another board, and one board is for testing."
+        )
         raise ParamsError("experiment transfer", "split.transfer_skins_n", rule, train_n, remedy)
     held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
     folds = []
@@ -250,7 +252,10 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
             passes = np.unique(rows.pass_i[held[on_skin]])
             if len(passes) <= split.pool_passes_n:
                 what, rule = f"passes of held-out skin {skin}", f"more than split.pool_passes_n, {split.pool_passes_n}"
-                remedy = "Record more passes, reduce it, or remove it with experiment adapt."
+                remedy = (
+                    "Record more passes or reduce split.pool_passes_n, or remove both this setting and experiment "
+                    "adapt."
+                )
                 raise ParamsError(f"experiment {experiment}", what, rule, len(passes), remedy)
             pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
     fold = Fold(experiment, name, train, held[~pooled], held[pooled])
@@ -286,7 +291,7 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         captures = np.unique(rows.capture[skin_rows])
         if len(captures) > 1:
             what = f"the order in time of the {len(captures)} captures of skin {skin} is unknown: {', '.join(captures)}"
-            remedy = "Record the passes in one capture, or run single_random instead."
+            remedy = "Record all passes of the skin in one capture, or run experiment single_random instead."
             raise ParamsError(f"experiment single_temporal: {what}. {remedy}")
         pass_i = rows.pass_i[skin_rows]
         passes, what = np.unique(pass_i), f"passes of skin {skin}"
@@ -321,9 +326,10 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
     """
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
-        remedy = "Record more, change the fraction, or remove the experiment from the scene."
+        remedy = f"Record more {what}, change this fraction in the scene, or remove the experiment from the scene."
         raise ParamsError(
-            f"{where}: {all_n} {what} are too few to split: a fraction of {fraction:g} holds out {test_n}. {remedy}"
+            f"{where}: {all_n} {what} are too few to split: a test fraction of {fraction:g} holds out {test_n}. "
+            f"{remedy}"
         )
     return test_n
 
@@ -335,8 +341,10 @@ def _check_disjoint(rows: Rows, fold: Fold) -> None:
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
             where = f"fold {fold.experiment}/{fold.name}"
-            remedy = "Give every skin its own name and exactly one board."
-            raise ParamsError(f"{where}: {what} {', '.join(both)} is both trained on and held out. {remedy}")
+            remedy = "Give each skin a name that no other skin has, and assign each skin to one board only."
+            raise ParamsError(
+                f"{where}: {what} {', '.join(both)} is both in the training rows and in the held-out rows. {remedy}"
+            )
 
 
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
@@ -378,8 +386,8 @@ def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
     """
     if content["rows_n"] != len(rows):
         raise SchemaError(
-            f"{where}: the folds were drawn from {content['rows_n']} rows, but the captures have {len(rows)} rows. Run "
-            "stage split again."
+            f"{where}: the folds were drawn from {content['rows_n']} rows, but the captures have {len(rows)} rows now. "
+            "Run stage split again, which draws new folds."
         )
     return [
         Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES))

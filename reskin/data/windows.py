@@ -70,7 +70,7 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
     windows_n = max(0, (min(units_n) - test_n) // every_n)
     if not windows_n:
         rule = f"at least drift.every_n + drift.test_n = {every_n + test_n} units long"
-        remedy = "Record more, or reduce the size of the windows."
+        remedy = "Record a longer capture, or reduce drift.every_n or drift.test_n in the scene."
         raise ParamsError("experiment drift", "the shortest capture", rule, min(units_n), remedy)
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))
     left_out_n = sum(max(0, length_n - (windows_n + 1) * every_n) for length_n in units_n)
@@ -91,7 +91,9 @@ def check_one_per_skin(captures: Sequence[Readings]) -> None:
     for skin, captures_of_skin in names.items():
         if len(captures_of_skin) > 1:
             what = f"the order in time of the {len(captures_of_skin)} captures of skin {skin} is unknown"
-            remedy = "Record its contacts in one capture, or give each skin its own name."
+            remedy = (
+                "Record all contacts of the skin in one capture. If the skins differ, give each skin a name of its own."
+            )
             raise ParamsError(f"experiment drift: {what}: {', '.join(captures_of_skin)}. {remedy}")
 
 

@@ -45,7 +45,9 @@ def parse(source: str | Path, where: str) -> Arrivals:
     table = tables.parse_csv(source, TYPES, where)
     if len(table) < 2:
         raise CaptureError(
-            f"{where}: {len(table)} rows of arrivals; two or more are needed. Set a rate in the header instead."
+            f"{where}: the file has {len(table)} rows, but two or more times of arrival are needed. Record the capture "
+            "again, or state a constant frame rate in header.json: set kind to rate and rate_hz to the rate in section "
+            "clock."
         )
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
     for bad, name, rule in (
@@ -57,7 +59,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
     ):
         tables.refuse_row(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
     if t_s[-1] == t_s[0]:
-        raise CaptureError(f"{where}: t_s is {t_s[0]} in every row. Check the recorder's clock.")
+        raise CaptureError(f"{where}: t_s is {t_s[0]} in every row. Check the clock of the recorder, and record again.")
     return Arrivals(byte_end, t_s)
 
 
@@ -130,7 +132,7 @@ AWAY_NOISES = 1.5
 STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4  # the no-load field at the start of the stream is the median field of this many frames
 REFERENCE_FRAMES_N = 4096  # about this many frames of a stretch, at most, are used to estimate the no-load field
-_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S (the times of one event on the two clocks)."
+_REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, where both numbers are times of the same event."
 
 # A block of frames: their stream times [f] and their fields in uT [f ch]. The annotations do not name the axes, because
 # the number of frames f differs from block to block.
@@ -164,9 +166,14 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
     """
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
-        raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Correct them.")
+        raise CaptureError(
+            where, "clock.marks", "one or more pairs of finite times", given, "Correct the marks in header.json."
+        )
     if len(np.unique(marks[:, 0])) < len(marks):
-        raise CaptureError(f"{where}: clock.marks has two marks at one stream time: {given}. Keep one of them.")
+        raise CaptureError(
+            f"{where}: two marks in clock.marks have the same stream time: {given}. Remove one of these marks from "
+            "header.json."
+        )
     return _line(marks[:, 0], marks[:, 1] - marks[:, 0], 1.0, where)
 
 
@@ -195,7 +202,8 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
     if matched <= EXPLAINED_MIN * overlap:
         agreed = matched / max(overlap, 1e-9)
         raise CaptureError(
-            f"{where}: the field agrees with {agreed:.0%} of the dwells; over {EXPLAINED_MIN:.0%} must agree. {_REMEDY}"
+            f"{where}: the contacts that the field shows agree with only {agreed:.0%} of the dwells of the probe log, "
+            f"but more than {EXPLAINED_MIN:.0%} must agree. {_REMEDY}"
         )
     return _line(np.array(mid_s), np.array(offsets_s), matched / overlap, where)
 
@@ -255,8 +263,8 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     unexplained = (1 - EXPLAINED_MIN) * overlap[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
-            f"{where}: the field fits the dwells at two times almost equally well, with matches that differ by "
-            f"{margin:.2g} of {unsigned.sum():.0f} indentations. {_REMEDY}"
+            f"{where}: two offsets between the clocks align the contacts in the field with the probe log almost "
+            f"equally well. The two offsets differ by {margin:.2g} of {unsigned.sum():.0f} indentations. {_REMEDY}"
         )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
@@ -321,7 +329,7 @@ def _contact_signal(
         start_s = t_s[0] if start_s is None else start_s
         step_i = (t_s - start_s) / step_s
         if step_i[-1] > STEPS_MAX_N:
-            rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
+            rule = f"at most {STEPS_MAX_N * step_s:.0f} s long, because the dwells of its probe log are so short"
             raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
         first_i, index_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
         # If there are several frames in a step, the majority of these frames decides whether it is in contact.
@@ -383,7 +391,8 @@ def _line(
     residual_s = float(np.abs(offset_s - mean_s - slope * (stream_s - mid_s)).max())
     if abs(slope) > RATE_LIMIT:
         raise CaptureError(
-            f"{where}: clock.marks give the clock a rate of {1 + slope:.6g}, not 1 within {RATE_LIMIT}. Check that "
-            "each mark is one event, in seconds."
+            f"{where}: the clocks of rig and stream differ in speed by a factor of {1 + slope:.6g}, but this factor "
+            f"must be between {1 - RATE_LIMIT:g} and {1 + RATE_LIMIT:g}. If the header contains clock.marks, check "
+            "that both times of each mark belong to the same event and are in seconds."
         )
     return ClockMap(float(mean_s - slope * mid_s), 1 + slope, residual_s, explained)

@@ -38,7 +38,8 @@ def read_frames(
     if table.column_names != list(frame_columns(chips_n)):
         names = ", ".join(table.column_names)[:80]
         raise CaptureError(
-            f"{where}: these are not the columns of reskin decode: {names}. Decode the dump again: reskin decode."
+            f"{where}: the columns {names} are not those that `reskin decode` writes. Decode the dump again, with "
+            "`reskin decode`."
         )
     values = [np.asarray(column) for column in table.columns]
     device_s, end_byte = values[-2:]

@@ -26,7 +26,7 @@ from reskin.board.faults import (
 from reskin.config import Strict
 from reskin.errors import CaptureError, ParamsError, did_you_mean
 
-USUAL_LSB = "that of the other chips, and not that of a reset chip"
+USUAL_LSB = "the LSB of the other chips, and not the LSB of a chip with its power-on settings"
 
 Action = Literal["drop", "flag", "refuse"]
 DropOrRefuse = Literal["drop", "refuse"]  # actions for stray bytes between frames, which cannot be kept as readings
@@ -87,7 +87,8 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
             guess = did_you_mean(name, FaultPolicy.model_fields).replace("?", f"={action}?")
             names = ", ".join(FaultPolicy.model_fields)
             raise ParamsError(
-                f"{where}: {repr(text)[:40]} is not NAME=drop|flag|refuse with a known fault.{guess} Faults: {names}"
+                f"{where}: {repr(text)[:40]} must be NAME=ACTION, where ACTION is drop, flag or refuse.{guess} The "
+                f"possible NAMEs are: {names}"
             )
         changes[name] = action
     return policy.model_copy(update=changes)
@@ -168,8 +169,8 @@ class FaultLog:
             if action == "refuse":
                 place = f"{self._unit} {first * self._per_unit:.0f}" if len(known) else "an unknown time"
                 raise CaptureError(
-                    f"{self._where}: found fault {fault.replace('_', ' ')} {count_n} x, the first at {place}. Repair "
-                    f"the board and record again, or change faults: {fault} in params.yaml."
+                    f"{self._where}: found fault {fault.replace('_', ' ')} (count {count_n}, first at {place}). Repair "
+                    f"the board and record again, or choose another action for faults.{fault} in params.yaml."
                 )
             record = self.records.setdefault(fault, FaultRecord(0, first, last, action))
             record.count_n += count_n
@@ -183,8 +184,8 @@ class FaultLog:
         """
         failed, out_of_range = self.record_readings(faults.readings, t_s)
         for window in faults.scale:
-            where = f"{self._where} from sound frame {window.first_frame}"
-            wrong, rule = window.unusual | window.changed, f"as before, {USUAL_LSB}"
+            where = f"{self._where} from frame {window.first_frame} on (counted without failed reads)"
+            wrong, rule = window.unusual | window.changed, f"the same as before, {USUAL_LSB}"
             self.record_scale(wrong, window.lsb_uT, window.expected_lsb_uT, where, rule, window.t_s)
         stuck = self.record("stuck", np.asarray(faults.stuck.any(axis=1)), t_s)
         self.record("clock_jump", faults.clock_jump, t_s)
@@ -233,9 +234,12 @@ class FaultLog:
             chips = np.flatnonzero(wrong)
             xy_uT, z_uT = lsb_uT[chips[0]]
             known = np.isfinite([xy_uT, z_uT]).any()
-            got = f"{xy_uT:.3g} uT in x, y and {z_uT:.3g} uT in z" if known else "no common step"
+            got = f"{xy_uT:.3g} uT in x, y and {z_uT:.3g} uT in z" if known else "values without a common step"
             rule = rule if expected_lsb_uT is None else f"{expected_lsb_uT} uT"
-            remedy = "A chip lost its settings: reset the board, record again."
+            remedy = (
+                "A chip has probably lost its settings. Reset the board, so that its firmware configures the chips "
+                "again, and record again."
+            )
             raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
         if wrong.any():
             self.record("chip_reset", np.ones(len(position), bool), position)
@@ -251,8 +255,8 @@ class FaultLog:
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
                 f"{self._where}: {', '.join(channels)} never changed in the whole recording. Check the wiring, the "
-                "chip and the columns, and record again. To accept such channels, set faults.constant_channel: flag in "
-                "params.yaml."
+                "chip and the columns, and record again. To accept such channels, set faults.constant_channel to flag "
+                "in params.yaml."
             )
         if channels:
             position = np.array(self._span) if position is None else position
@@ -303,7 +307,7 @@ def check_rows(
     failed, out_of_range = log.record_readings(readings, row)
     read = ~readings.failed_rows
     if not read.any():
-        raise CaptureError(f"{where}: every row has failed I2C reads. Check the wiring, and record again.")
+        raise CaptureError(f"{where}: in every row, the I2C read of a chip failed. Check the wiring, and record again.")
     rows = np.flatnonzero(read)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         lsb_uT = find_lsb(b_uT[block])

@@ -126,7 +126,9 @@ def parse(text: str, where: str) -> Header:
         field = ".".join(map(str, first["loc"])) or "header"
         value = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = first["msg"].removeprefix("Value error, ")
-        raise CaptureError(f"{where}: {field}: {rule}; got {value}. Correct the header or record again.") from None
+        raise CaptureError(
+            f"{where}: {field}: {rule}; got {value}. Correct the header, or record the capture again."
+        ) from None
 
 
 def make_header(where: str, **fields: Any) -> Header:
@@ -155,8 +157,14 @@ def render(header: Header) -> str:
 def check_same_capture(header: Header, folder: str) -> None:
     """Raise if the name of a capture's folder is not the name in its header, for example because it was renamed."""
     if header.capture != folder:
-        rule = f"the folder's name {folder!r}"
-        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename the folder.")
+        rule = f"the name of the folder, {folder!r}"
+        raise CaptureError(
+            f"{folder}/{HEADER_FILE}",
+            "capture",
+            rule,
+            repr(header.capture),
+            "Rename the folder to the name in the header.",
+        )
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:

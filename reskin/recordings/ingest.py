@@ -268,16 +268,18 @@ def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
         if not (folder / name).is_file():
-            raise CaptureError(f"{folder / name}: file not found, but the header lists it. Add the capture again.")
+            raise CaptureError(
+                f"{folder / name}: file not found, although the header lists this file. Add the recording again."
+            )
         if io.sha256(folder / name) != digest:
             raise CaptureError(
-                f"{folder / name}: the file has changed since it was added (another hash). Remove the capture and add "
-                "it again."
+                f"{folder / name}: the file has changed since it was added (its hash differs). Remove the capture, and "
+                "add the recording again."
             )
     if header.layout == "native":
         return OpenedCapture(header, *read_native(folder, header, policy))
     if header.layout not in READERS:
-        remedy = "An SD card's log has no labels to learn from; try: reskin predict."
+        remedy = "The log of an SD card has no labels from which a model could learn. Use: reskin predict."
         raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
     readings, account = READERS[header.layout].read(folder, header, policy)
     return OpenedCapture(header, [readings], account)
@@ -286,8 +288,8 @@ def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
 def read_header(folder: Path) -> Header:
     file = folder / HEADER_FILE
     if not file.is_file():
-        fault = "this is a file" if folder.is_file() else f"there is no {HEADER_FILE} in it"
-        raise CaptureError(f"{folder}: not a capture folder: {fault}. Use a folder that `reskin record` wrote.")
+        fault = "it is a file" if folder.is_file() else f"there is no {HEADER_FILE} in it"
+        raise CaptureError(f"{folder}: this is not a capture folder: {fault}. Use a folder that `reskin record` wrote.")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
@@ -299,7 +301,9 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
         if lost_n > limit * account.get(total, 0):
             reasons = ", ".join(f"{account[key]} {key.removesuffix('_n')}" for key in lost if account[key])
             problem = f"more than {limit:.0%} of {account[total]} {total.removesuffix('_n')} are lost: {reasons}"
-            raise CaptureError(f"{where}: {problem}. Record again, or raise lost_fraction_max in params.yaml.")
+            raise CaptureError(
+                f"{where}: {problem}. Record the capture again, or increase lost_fraction_max in params.yaml."
+            )
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
@@ -310,7 +314,7 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
-        raise CaptureError(f"{stream}: file not found. Copy the whole capture folder.")
+        raise CaptureError(f"{stream}: file not found. Copy the whole folder of the capture again.")
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
     times_of = timer(folder, header)
@@ -378,8 +382,8 @@ def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
         (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
         is_swapped = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
         if not _mostly_possible(temperature_degC) or (is_swapped and _mostly_possible(swapped_degC)):
-            rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and similar on all chips"
-            remedy = f"Is the wire format {other}?"
+            rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and similar for all chips"
+            remedy = f"If the board sends wire format {other}, state this format in header.json."
             raise CaptureError(where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
     check_fields(b_uT, where, first_line_n=1)
     return True
@@ -398,7 +402,9 @@ def timer(folder: Path, header: Header) -> Timer:
         return lambda frames, _: clocks.times_of(frames.end_byte, table)
     if rate_hz is None:
         got = repr(header.clock.kind)
-        raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Correct the header.")
+        raise CaptureError(
+            folder, "clock.kind", "'arrivals' or 'rate', if a port was recorded", got, "Correct header.json."
+        )
     if header.wire in TEXT_WIRES:
         return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
     frame_bytes_n = record_type(_wire(header), header.chips_n).itemsize
@@ -412,7 +418,7 @@ def _arrivals(folder: Path) -> Arrivals:
     if bytes_n < arrived_n:
         raise CaptureError(
             f"{folder / STREAM_FILE}: the file has {bytes_n} bytes, but {ARRIVALS_FILE} lists {arrived_n}. Copy the "
-            "capture again."
+            "whole folder of the capture again."
         )
     return table
 

@@ -71,7 +71,7 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
     def run(context: LabelContext) -> str:
         for label in label_iterator:
             if not isinstance(label, Label):
-                remedy = "Yield reskin.lifted() or reskin.touch(x_mm, y_mm)."
+                remedy = "Yield or return the result of reskin.lifted() or reskin.touch(x_mm, y_mm)."
                 raise ParamsError(
                     "labels", "each label", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
                 )
@@ -156,7 +156,9 @@ def parse_places(text: str) -> Places | None:
     along_n, up_n = (int(match[1]), 1) if match[1] else (int(match[2]), int(match[3]))
     step_mm, x_mm, y_mm = float(match[4]), float(match[5] or 0), float(match[6] or 0)
     if not 0 < along_n * up_n <= PLACES_MAX_N or step_mm <= 0:
-        raise ParamsError("--labels", "places", f"1 to {PLACES_MAX_N}, with a step above 0", text, "Try: grid:9x9:2")
+        raise ParamsError(
+            "--labels", "places", f"1 to {PLACES_MAX_N} places, with a step above 0", text, "Example: grid:9x9:2"
+        )
     xy_mm = [(x_mm + step_mm * i, y_mm + step_mm * j) for j in range(up_n) for i in range(along_n)]
     return Places(text, xy_mm, along_n)
 
@@ -193,7 +195,11 @@ def from_table(file: Path) -> LabelSource:
 
 
 def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
-    return f"{where}: {lines.bad_n} lines could not be read, the first {lines.first_bad!a}" if lines.bad_n else ""
+    return (
+        f"{where}: {lines.bad_n} lines could not be read; the first of them is {lines.first_bad!a}"
+        if lines.bad_n
+        else ""
+    )
 
 
 def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
@@ -220,7 +226,7 @@ def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
 
 def _check_grows(file: Path, stream: BinaryIO) -> None:
     """Raise `CaptureError` if the file was replaced or shortened."""
-    remedy = "Append rows to it; do not rewrite it."
+    remedy = "The program of the robot must append rows to this file, and must not replace or shorten the file."
     try:
         status = file.stat()
     except FileNotFoundError:
@@ -229,7 +235,8 @@ def _check_grows(file: Path, stream: BinaryIO) -> None:
         raise CaptureError(f"{file}: the file was replaced while it was read. {remedy}")
     if status.st_size < stream.tell():
         raise CaptureError(
-            f"{file}: the file was shortened to {status.st_size} bytes, but {stream.tell()} were read. {remedy}"
+            f"{file}: the file was shortened to {status.st_size} bytes, but {stream.tell()} bytes had already been "
+            f"read. {remedy}"
         )
 
 
@@ -283,7 +290,7 @@ class ForceGauge:
         try:
             self.read(device, context, self._kept.extend)
         except CaptureError as error:
-            self._problem = f"{error} Later forces are missing"
+            self._problem = f"{error} All later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
         """Read samples from the gauge, and pass them to the function `use`, until the recording stops.
@@ -295,7 +302,8 @@ class ForceGauge:
                 chunk = read_waiting(device)
             except OSError as error:
                 raise CaptureError(
-                    f"{self.port}: lost the force gauge: {error}. What it sent is kept; plug it in and record again."
+                    f"{self.port}: lost the connection to the force gauge: {error}. The forces that it sent are kept. "
+                    "Plug the gauge in, and record again."
                 ) from None
             if chunk:
                 use(self._gauge.feed(chunk, context.unix_s()))
@@ -349,17 +357,19 @@ class Prompts:
 
     def _ask(self, context: LabelContext, typed: Iterator[str]) -> None:
         n = len(self.places.xy_mm)
-        self.say(f"{n} places, {self.scan} order. Press Enter when the tip is still; or type the number of another "
-                 "place, a force such as 0.8N, or both; s skips a place, q ends.")  # fmt: skip
+        self.say(f"{n} places in {self.scan} order. When you press a place, hold the tip still, and hit Enter. If you "
+                 "press another place, type its number before you hit Enter. If you know the force, type it too, as "
+                 "0.8N. "
+                 "Type s to skip a place, and q to end the recording.")  # fmt: skip
         for pass_i in count():
             order = self.places.order(self.scan, self.rng)
             for i, place_i in enumerate(order):
-                self.say(f"pass {pass_i}, {i + 1} of {n}: lift off, Enter")
+                self.say(f"pass {pass_i}, {i + 1} of {n}: lift the tip off the skin, and hit Enter")
                 if next(typed, ENDS[0]) in ENDS:
                     return
                 context.writer.write(context.hold(Label(False), self.dwell_s))
-                following = f"; then {self._name(order[i + 1])}" if i + 1 < n else ""
-                self.say(f"  press {self._name(place_i)}, hold, Enter{following}")
+                following = f"; the next place is {self._name(order[i + 1])}" if i + 1 < n else ""
+                self.say(f"  press {self._name(place_i)}, hold the tip still, and hit Enter{following}")
                 label = self._read_label(typed, place_i)
                 if label is None:
                     return

@@ -151,16 +151,17 @@ def _row(dwell: Dwell, indentation: int, pass_i: int) -> str:
 
 
 def _check(dwell: Dwell) -> None:
-    label, remedy = dwell.label, "Leave out what is not known."
+    label, remedy = dwell.label, "Leave out numbers that are not known."
     for name in LABELS:
         value = getattr(label, name)
         if math.isinf(value) or abs(value) > FLOAT32_MAX:
-            raise CaptureError("a label", name, "a number", value, remedy)
+            raise CaptureError("a label", name, "a finite number", value, remedy)
     if not 0 <= label.pass_i < 2**31:
-        raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count passes from 0.")
+        raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Number the passes from 0.")
     if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # False for NaN
         raise CaptureError(
-            f"a label: {dwell.t_start_s} to {dwell.t_end_s} s is not a span of time. Is the clock in seconds?"
+            f"a label: {dwell.t_start_s} to {dwell.t_end_s} s is not a valid time span. Check that the clock is in "
+            "seconds."
         )
 
 
@@ -217,9 +218,12 @@ class SampleTable:
         clocks = [name for name in CLOCKS if name in names]
         shows_touch = "phase" in names or "Fz_N" in names
         if len(clocks) != 1 or not shows_touch or len(set(names)) < len(names):
-            needed = f"either {' or '.join(CLOCKS)}, phase or Fz_N or both, and no column twice"
+            needed = (
+                f"exactly one of the columns {' and '.join(CLOCKS)}, at least one of phase and Fz_N, and no column "
+                "twice"
+            )
             raise CaptureError(
-                f"{self._where}: row 1 must name {needed}; found {ascii(names)[:120]}. Known columns: "
+                f"{self._where}: row 1 must name {needed}; got {ascii(names)[:120]}. Possible columns: "
                 f"{', '.join(COLUMNS)}."
             )
         self.clock, self._names = clocks[0], names
@@ -312,8 +316,8 @@ class DwellBuilder:
         """
         if not self.short_n:
             return ""
-        least = f"{DWELL_MIN_s:g} s from first to last line"
-        return f"{self.short_n} touches left out: a touch needs {least}, so write lines continuously"
+        least = f"at least {DWELL_MIN_s:g} s must lie between the first and the last line of a touch"
+        return f"{self.short_n} touches left out: {least}, so write lines continuously"
 
     def _lasts_s(self) -> float:
         return self._run[-1].t_s - self._run[0].t_s if self._run else 0.0

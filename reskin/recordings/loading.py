@@ -37,7 +37,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
     if log.is_dir():
         return _read_capture(log)
     if not 0 < rate_hz <= RATE_MAX_HZ:
-        raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} is not above 0 and at most {RATE_MAX_HZ:g}.")
+        raise ParamsError(f"--rate-hz (rate_hz): {rate_hz:g} must be above 0 and at most {RATE_MAX_HZ:g}.")
     if log.is_file():
         if io.is_parquet(log):
             return sd_card.keep_whole(*read_frames(io.read_table(log), rate_hz, str(log)), str(log))
@@ -81,10 +81,14 @@ def _hint(path: Path, *, frames: bool) -> str:
     """Return a text with advice on how to load a recording that cannot be loaded; "" if there is no advice."""
     layouts = [layout for layout in layouts_of(path) if layout != "table"]
     if layouts == ["capture"]:
-        return "" if frames else "To load the frames without labels, try: frames=True"
+        return "" if frames else "To load the frames without labels, set frames=True."
     if set(layouts) <= READERS.keys():
-        return f"This is layout {' or '.join(layouts)}: run `reskin add`, and load the capture." if layouts else ""
-    return "This is a dump of a serial port: run `reskin decode`, and load its output."
+        return (
+            f"This is layout {' or '.join(layouts)}. Convert it to a capture with `reskin add`, and load this capture."
+            if layouts
+            else ""
+        )
+    return "This is a dump of a serial port. Convert it to a table with `reskin decode`, and load this table."
 
 
 def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame":
@@ -98,7 +102,9 @@ def _load(pd: Any, path: Path, *, frames: bool, rate_hz: float) -> "pd.DataFrame
         kind = _kind_of(path)
     if kind != "log":
         if frames:
-            raise ParamsError(f"{path}: only a capture of `reskin record` has frames. Omit frames=True.")
+            raise ParamsError(
+                f"{path}: only captures that `reskin record` wrote have frames. Omit the argument frames=True."
+            )
         readings, counts = READ[kind](path)
         return _readings_frame(pd, readings, counts)
     t_s, b_uT, temperature_degC, counts = read_any_log(path, rate_hz)
@@ -125,7 +131,10 @@ def _read_labelled(folder: Path) -> tuple[Readings, Mapping[str, int]]:
     _, blocks, account = open_capture(folder, STANDARD_POLICY)
     parts = list(blocks)
     if not parts:
-        raise CaptureError(f"{folder}: no reading can be used: {dict(account)}. Check its labels and its faults.")
+        raise CaptureError(
+            f"{folder}: no reading can be used (counts: {dict(account)}). Check the labels of the capture and the "
+            "faults in these counts."
+        )
     joined: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in UNITS}
     return replace(parts[0], **joined), account
 

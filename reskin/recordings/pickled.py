@@ -20,7 +20,7 @@ CHIPS_N = 5
 COLUMNS = [f"{quantity}{chip}" for chip in range(CHIPS_N) for quantity in ("T", "Bx", "By", "Bz")]
 HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
 PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # phase -> name of its samples in the archive
-REMEDY = "Is it the recording of one port and depth, copied whole?"
+REMEDY = "Check that the archive is a complete copy, and that it contains the recording of one port at one depth."
 BYTES_MAX_N = 500_000_000  # the archives of scene lab have 10 to 30 MB
 MARK = object()  # the mark that opcode MARK puts on the stack
 
@@ -35,7 +35,8 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         with zipfile.ZipFile(BytesIO(archive)) as file:
             if (bytes_n := sum(member.file_size for member in file.infolist())) > BYTES_MAX_N:
                 raise CaptureError(
-                    f"{where}: the archive unpacks to {bytes_n} bytes, more than {BYTES_MAX_N}. {REMEDY}"
+                    f"{where}: the unpacked archive would have {bytes_n} bytes, which is more than {BYTES_MAX_N}. "
+                    f"{REMEDY}"
                 )
             samples = {phase: decode_array(file.read(f"{name}.npy"), where) for phase, name in PHASES.items()}
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
@@ -45,7 +46,7 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
     except Exception as error:
         samples_of = " and ".join(PHASES.values())
         raise CaptureError(
-            f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
+            f"{where}: not an .npz archive with samples in the arrays {samples_of}: {_describe(error)}. {REMEDY}"
         ) from None
     rows.sort(key=lambda row: row[0])  # the sort is stable, so the no-load rows of an indentation stay first
     return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
@@ -66,7 +67,7 @@ def decode_array(npy: bytes, where: str) -> Any:
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = read_header(stream)
     if not dtype.hasobject:
-        raise CaptureError(f"{where}: the array contains {dtype}, not objects. {REMEDY}")
+        raise CaptureError(f"{where}: the array contains values of type {dtype} instead of objects. {REMEDY}")
     return decode(stream.read(), where)
 
 

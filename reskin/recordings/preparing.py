@@ -64,7 +64,7 @@ def parse_marks(texts: list[str]) -> Marks:
     marks = []
     for text in texts:
         if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", text):
-            raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(text), "Try: --mark 0,12.5")
+            raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(text), "Example: --mark 0,12.5")
         stream_s, probe_s = map(float, text.split(","))
         marks.append((stream_s, probe_s))
     return tuple(marks)
@@ -132,8 +132,10 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
     _check_exists(recording)
     _check_exists(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
-        rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
-        raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count the frames per second.")
+        rule = f"above 0 and at most {headers.RATE_MAX_HZ:g}"
+        raise CaptureError(
+            "--rate-hz", "the rate", rule, what.rate_hz, "State how many frames the board sends per second."
+        )
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
     header = _header(names, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
     return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
@@ -149,8 +151,8 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):
         if in_header not in (given, UNNAMED):
             raise CaptureError(
-                f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct the option or the "
-                "header."
+                f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct the option, "
+                "or correct header.json."
             )
     # The recorder lists its files in the header when it ends. If it was killed, the list is empty, so the files that
     # exist are collected too.
@@ -167,7 +169,9 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     for name, file in files.items():
         _check_exists(file)
         if file.parent == recording and header.files.get(name, io.sha256(file)) != io.sha256(file):
-            raise CaptureError(f"{file}: the file has changed since it was recorded (another hash). Record it again.")
+            raise CaptureError(
+                f"{file}: the file has changed since it was recorded (its hash differs). Record the capture again."
+            )
     _check_names(names)
     clock = header.clock.model_copy(update={"marks": (*marks_before, *marks)})
     named = {"capture": names.name or header.capture, "board": names.board, "skin": names.skin}
@@ -177,7 +181,13 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
 def _check_names(names: CaptureNames) -> None:
     for option, name in (("--board", names.board), ("--skin", names.skin), ("--name", names.name)):
         if name is not None and not re.fullmatch(headers.NAME, name):
-            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another name.")
+            raise CaptureError(
+                option,
+                "a name",
+                "1 to 64 of the characters A-Z a-z 0-9 _ -, and begin with a letter or a digit",
+                repr(name),
+                "Choose another name.",
+            )
 
 
 def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:

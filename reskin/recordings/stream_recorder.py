@@ -174,7 +174,7 @@ class _Recorder:
         account = self._writer.decoder.account()
         duration_s = time.monotonic() - self._start_s
         if not self._head:
-            remedy = f"Is the board running, and this its port? {found_ports()}"
+            remedy = f"Check that the board is running, and that this is the port of the board. {found_ports()}"
             raise CaptureError(f"{self._port}: no bytes arrived in {duration_s:.1f} s. {remedy}")
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)

@@ -19,6 +19,8 @@ from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
+COPY_AGAIN = "The file may have been cut or edited. Copy the file again, or correct it."
+SEMICOLONS = "line 1 contains semicolons. Export the file with commas between columns, and with decimal points."
 FIRST_ROW = 2  # the first row with values; row 1 of the file has the column names
 # Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
 CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
@@ -44,14 +46,16 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         if match := CONVERSION.search(got):
             name, rule = _column_names(source)[int(match[1])], "a whole number" if "int" in match[3] else "a number"
             raise CaptureError(
-                f"{where} row {match[2]}", name, rule, f"'{match[4][:20]}'", "Correct or remove that row."
+                f"{where} row {match[2]}", name, rule, f"'{match[4][:20]}'", "Correct or remove this row."
             ) from None
         if match := COLUMNS_N.search(got):
-            what = f"{match[3]} columns, but row 1 has {match[2]}"
-            raise CaptureError(f"{where} row {match[1]}: {what}. Was the file cut or edited?") from None
-        raise CaptureError(f"{where}: not a CSV with columns {_list(types)}: {got}. Correct that row.") from None
+            what = f"the row has {match[3]} columns, but row 1 has {match[2]}"
+            raise CaptureError(f"{where} row {match[1]}: {what}. {COPY_AGAIN}") from None
+        raise CaptureError(
+            f"{where}: not a CSV file with columns {_list(types)}: {got}. Correct the row that this message names."
+        ) from None
     except FileNotFoundError:
-        raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
+        raise CaptureError(f"{where}: file not found. Copy the whole folder of the capture again.") from None
     _check_names(table.column_names, types, where)
     return table.select(list(types)).combine_chunks()
 
@@ -91,7 +95,9 @@ def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str)
     unknown = [name for name in names if name not in types]
     if missing or unknown or len(names) != len(types):
         got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in total"
-        raise CaptureError(where, "row 1, the column names,", _list(types), got, "Rename or remove columns.")
+        raise CaptureError(
+            where, "the column names in row 1", _list(types), got, "Correct the names, or remove unknown columns."
+        )
 
 
 def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
@@ -111,14 +117,12 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
     """
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
-        raise CaptureError(
-            f"{where}: semicolons in line 1. Export it with commas between columns and points in numbers."
-        )
+        raise CaptureError(f"{where}: {SEMICOLONS}")
     cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):
-            problem = f"{len(row)} columns in line {line_i + 1}, but {len(cells[0])} in line 1"
-            raise CaptureError(f"{where}: {problem}. Was the file cut or edited?")
+            problem = f"line {line_i + 1} has {len(row)} columns, but line 1 has {len(cells[0])}"
+            raise CaptureError(f"{where}: {problem}. {COPY_AGAIN}")
     return cells
 
 
@@ -130,8 +134,8 @@ def to_numbers(
     Errors name the column and the line of a wrong cell; `first_line_n` is the number of the line with `cells[0]`.
     """
     if cells and len(cells[0]) != len(names):
-        problem = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
-        raise CaptureError(f"{where}: {problem}. Are the layout and the number of chips right?")
+        problem = f"the file has {len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
+        raise CaptureError(f"{where}: {problem}. Check the layout and the number of chips.")
     if not cells:
         raise CaptureError(f"{where}: the file has no row of numbers. Copy the recording again.")
     try:
@@ -177,9 +181,9 @@ def _read_text(path: Path, where: str) -> str:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a byte order mark
     except UnicodeDecodeError as error:
-        byte = f"{error.object[error.start]:#04x} at {error.start}"
+        byte = f"{error.object[error.start]:#04x} at position {error.start}"
         raise CaptureError(
-            f"{where}: the file is not text: byte {byte}. Is this the right file? Check its content."
+            f"{where}: the file is not a text file: it contains byte {byte}. Check that this is the right file."
         ) from None
     except OSError as error:
         raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
@@ -187,8 +191,8 @@ def _read_text(path: Path, where: str) -> str:
         if not text:
             raise CaptureError(f"{where}: the file is empty. Copy the recording again.")
         raise CaptureError(
-            f"{where}: the last line has no line break; it ends in {text[-12:]!r}. If it was cut, copy the recording "
-            "again; if it is whole, end it with a line break."
+            f"{where}: the last line has no line break; it ends in {text[-12:]!r}. If the file was cut, copy the "
+            "recording again. If the last line is complete, add a line break after it."
         )
     return text
 
@@ -230,12 +234,12 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
     missing = [name for name in wanted if name not in names]
     if missing:
         raise CaptureError(
-            f"{where}: no column {', '.join(missing)}. Is this layout {layout}, with column names in line 1? See "
-            "data/README.md."
+            f"{where}: no column {', '.join(missing)}. Check that the layout is {layout}, and that line 1 has the "
+            "column names. See data/README.md."
         )
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:
-        raise CaptureError(f"{where}: two columns are named {twice[0]}. Remove one of them.")
+        raise CaptureError(f"{where}: two columns have the name {twice[0]}. Remove one of these columns.")
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
@@ -246,9 +250,11 @@ def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.nd
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"
-            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct this cell.")
+            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct the text of this cell.")
     if "contact" not in phases:
-        raise CaptureError(f"{where}: no rows of phase contact. Was the recording cut?")
+        raise CaptureError(
+            f"{where}: no row has phase contact. If the recording was cut, copy the whole recording again."
+        )
     return np.array([phase == "contact" for phase in phases])
 
 

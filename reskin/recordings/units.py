@@ -32,6 +32,7 @@ EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0  # limits of the extent of all places,
 # to be wrong. If they are a larger fraction, the unit is assumed to be wrong.
 FAR_SHARE_MAX = 0.1
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0  # limits of the greatest depth of a recording
+STEP_RULE = "0.15 to 9.68 uT, which are the steps that an MLX90393 can have"
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
@@ -44,13 +45,15 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
-        rule = f"{WEAKEST_uT:g} uT or more on most chips, like the earth's field"
-        raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT.")
+        rule = f"{WEAKEST_uT:g} uT or more on most chips, because the earth's field alone is stronger"
+        raise CaptureError(
+            where, "field", rule, f"{usual_uT:.4g}", "If the unit of the file is mT or G, convert the fields to uT."
+        )
     step_uT = _find_step(b_uT)
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
         unit = "nT" if step_uT > NANO_STEP_MIN else "G"
-        rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(where, "field", rule, f"steps of {step_uT:.3g}", f"Convert {unit} to uT.")
+        remedy = f"The unit is probably {unit}. Convert the fields to uT."
+        raise CaptureError(where, "the step between values of the field", STEP_RULE, f"{step_uT:.3g}", remedy)
 
 
 def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
@@ -62,8 +65,8 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
     _check_full_scale(db_uT, where, first_line_n)
     step_uT = _find_step(db_uT)
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
-        rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(where, "field change", rule, f"steps of {step_uT:.3g}", "Convert nT, mT or G to uT.")
+        remedy = "The unit is probably nT, mT or G. Convert the field changes to uT."
+        raise CaptureError(where, "the step between values of the field change", STEP_RULE, f"{step_uT:.3g}", remedy)
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
@@ -71,7 +74,13 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
     too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
     if len(too_strong):
         got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
-        raise CaptureError(where, "force", f"below {FORCE_MAX_N:g} N", got, "Convert grams or mN to N.")
+        raise CaptureError(
+            where,
+            "force",
+            f"below {FORCE_MAX_N:g} N",
+            got,
+            "If the unit of the file is g or mN, convert the forces to N.",
+        )
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
@@ -81,9 +90,11 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
     """
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
-        got = f"{strongest_N:.3g} at most"
+        got = f"{strongest_N:.3g} N at most"
         rule = f"at least {FORCE_MIN_N:g} N in one or more rows with contact"
-        raise CaptureError(where, "force", rule, got, "Convert kg or kN to N, or press the skin.")
+        raise CaptureError(
+            where, "force", rule, got, "If the unit is kg or kN, convert the forces to N; otherwise, press harder."
+        )
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
@@ -95,8 +106,8 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
     known_mm = place_mm[known]
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
-        rule = f"equal, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
-        got, remedy = f"{extent_mm:.4g}", "Convert m or um to mm."
+        rule = f"all equal, or spread over a range of {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
+        got, remedy = f"a range of {extent_mm:.4g}", "If the unit of the file is m or um, convert the places to mm."
         is_far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
         if 0 < is_far.sum() <= FAR_SHARE_MAX * len(is_far):
             i = int(is_far.argmax())
@@ -104,7 +115,7 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
                 first_line_n + int(np.flatnonzero(known)[i]),
                 ", ".join(f"{value:g}" for value in known_mm[i]),
             )
-            got += f": line {line_n} ({place} mm) is far from the others"
+            got += f", because the place in line {line_n} ({place} mm) is far from the other places"
             remedy = "Correct that place, or convert its unit to mm."
         raise CaptureError(where, "places", rule, got, remedy)
 
@@ -116,8 +127,9 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
     """
     deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
-        rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
-        raise CaptureError(where, "depth", rule, f"{deepest_mm:.4g}", "Convert m or um to mm.")
+        rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm"
+        remedy = "If the unit of the file is m or um, convert the depths to mm."
+        raise CaptureError(where, "the greatest depth", rule, f"{deepest_mm:.4g}", remedy)
 
 
 def check_log(log: ProbeLog, where: str) -> None:
@@ -136,16 +148,18 @@ def check_log(log: ProbeLog, where: str) -> None:
     known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
     if len(known_N) and np.median(known_N) < 0:
         got = f"{np.median(known_N):.4g} N"
-        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Reverse its sign.")
+        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, "Reverse the sign of Fz_N.")
 
 
 def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:
     b_max_uT = np.abs(b_uT).max(axis=1)
     if b_max_uT.max() > FULL_SCALE_uT:
         place = f"line {first_line_n + int(b_max_uT.argmax())}"
-        rule = f"below the full scale of {FULL_SCALE_uT:.0f} uT"
+        rule = f"below the full scale of the chip, {FULL_SCALE_uT:.0f} uT"
         got = f"{b_max_uT.max():.6g} in {place}"
-        raise CaptureError(where, "field", rule, got, "Are the columns in order, and in uT?")
+        raise CaptureError(
+            where, "field", rule, got, "Check that the columns have the right order, and that the unit is uT."
+        )
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:

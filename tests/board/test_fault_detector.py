@@ -62,7 +62,7 @@ def test_chip_at_power_on_settings_raises_an_error(
     for chip_i in chips:
         columns = slice(3 * chip_i, 3 * chip_i + 3)
         frames = with_chip_values(frames, slice(1200, None), chip_i, reset.b_uT[1200:, columns])
-    message = rf"stream.bin from sound frame 1201: the LSB of chip {', '.join(map(str, chips))} must .* got 0.98 uT"
+    message = rf"stream.bin from frame 1201 on .*: the LSB of chip {', '.join(map(str, chips))} must .* got 0.98 uT"
     with pytest.raises(CaptureError, match=message):
         detect(frames, 500, 1300, expected_lsb_uT=expected_lsb_uT)
 
@@ -71,7 +71,7 @@ def test_change_of_the_step_of_all_chips_raises_an_error() -> None:
     frames, other = board(1600), board(1600, steps_uT=(0.6, 0.6, 0.968))
     for chip_i in range(CHIPS_N):
         frames = with_chip_values(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
-    with pytest.raises(CaptureError, match="from sound frame 801: the LSB of chip 0, 1, 2 must be as before"):
+    with pytest.raises(CaptureError, match="from frame 801 on .*: the LSB of chip 0, 1, 2 must be the same as before"):
         detect(frames)
 
 

@@ -257,12 +257,17 @@ def test_empty_stream_is_refused(wire):
 
 def test_error_suggests_the_wire_format_that_fits():
     data = encode(make_frames(20, 4, 10), "binary")
-    with pytest.raises(CaptureError, match="Wrong baud rate, chip count or wire format\\? It fits binary with 4 chips"):
+    with pytest.raises(
+        CaptureError,
+        match="Check the baud rate, the number of chips and the wire format. The bytes fit binary with 4 chips",
+    ):
         decode_all(data, "binary", 5, "a.bin")
 
 
 def test_error_has_no_suggestion_if_no_wire_format_fits():
-    with pytest.raises(CaptureError, match="in 1 bytes, .* Wrong baud rate, chip count or wire format\\?$"):
+    with pytest.raises(
+        CaptureError, match="in 1 bytes, .* Check the baud rate, the number of chips and the wire format.$"
+    ):
         decode_all(b"\0", "binary", 5, "a.bin")
 
 

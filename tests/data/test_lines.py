@@ -233,7 +233,9 @@ def test_each_place_and_each_of_its_visits_is_equally_likely_to_be_chosen():
 
 def test_take_pokes_raises_if_the_pool_has_too_few_pokes():
     table = grid()
-    with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
+    with pytest.raises(
+        ParamsError, match="skin s0: the number of pokes to draw must be at most the 65 indentations.*; got 66"
+    ):
         take_pokes(table, all_rows(table), 66, rng_for(0, "pokes"))
 
 
@@ -293,5 +295,5 @@ def test_stacking_raises_if_channels_differ_or_a_skin_occurs_twice():
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], ALL_READINGS)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
         stack(gather([readings("c0")], ALL_READINGS), other)
-    with pytest.raises(ParamsError, match="skin s0 has manual pokes in another capture too"):
+    with pytest.raises(ParamsError, match="skin s0 also has manual pokes in another capture"):
         hand_rows([hand_readings("s0"), hand_readings("s0")])

@@ -207,7 +207,7 @@ def test_skins_for_training_are_drawn_independently_for_each_held_out_board():
 
 
 def test_numbers_of_skins_that_are_listed_twice_raise_an_error():
-    with pytest.raises(ParamsError, match="must list each number of skins once"):
+    with pytest.raises(ParamsError, match="must list each number of skins only once"):
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
@@ -314,7 +314,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         ),
         (
             poked_rows(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
-            "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
+            "skin b0_s0: the number of pokes to draw must be at most the 10 indentations of the skin's pool; got 11",
         ),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
@@ -328,7 +328,7 @@ def test_draw_folds_raises_if_the_settings_do_not_fit_the_rows(table, experiment
     ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
 def test_draw_folds_raises_if_a_skin_is_on_two_boards(experiment, split):
-    with pytest.raises(ParamsError, match="is both trained on and held out"):
+    with pytest.raises(ParamsError, match="is both in the training rows and in the held-out rows"):
         draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)
 
 

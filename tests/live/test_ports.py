@@ -46,7 +46,7 @@ def test_wire_format_number_of_chips_rate_and_steps_are_detected(wire, chips_n, 
 def test_devices_that_send_other_bytes_are_not_taken_for_boards():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
-    assert "wrong baud rate" in str(find.recognise("port", wrong_baud))
+    assert "the baud rate is wrong" in str(find.recognise("port", wrong_baud))
     assert "no bytes arrived" in str(find.recognise("port", []))
     assert "cannot open the port" in str(find.detect_board("/dev/none"))
 
@@ -147,7 +147,7 @@ class TestReplugging:
     def test_port_of_a_board_that_is_plugged_in_again_is_found(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
         assert found == "c"  # The board may then have another port.
-        assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]
+        assert printed == ["Unplug the board.", "a disappeared. Plug the board in again."]
 
     def test_waiting_for_a_board_ends_at_the_time_limit(self):
         with pytest.raises(CaptureError, match="no port disappeared within 1 s"):

@@ -82,7 +82,7 @@ def test_written_arrival_times_are_read_unchanged(steps: Steps, first: tuple[int
         ("300,", ",", "row 4: byte_end must be known"),
         ("\n0,", "\n-5,", "row 2: byte_end must be 0 or more; got -5"),
         ("300", "three", "row 4: byte_end must be a whole number; got 'three'"),
-        ("100,10.5\n300,10.5\n400,11.5\n", "", "1 rows of arrivals"),
+        ("100,10.5\n300,10.5\n400,11.5\n", "", "the file has 1 rows"),
         (GOOD, "", "CSV"),
         (GOOD, "byte_end,t_s\n1,2\n3,2\n", "t_s is 2.0 in every row"),
     ],

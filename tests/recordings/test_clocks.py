@@ -104,12 +104,12 @@ def test_marks_with_errors_of_1_ms_suffice_for_ten_minutes_of_clock_drift() -> N
     [
         (np.zeros((0, 2)), "one or more pairs"),
         (np.array([[0.0, np.nan]]), "finite"),
-        (np.array([[1.0, 2.0], [1.0, 3.0]]), "two marks at one stream time"),
-        (np.array([[1.0, 2.0], [2.0, 1002.0]]), "a rate of 1000, not 1 within 0.1"),
+        (np.array([[1.0, 2.0], [1.0, 3.0]]), "two marks in clock.marks have the same stream time"),
+        (np.array([[1.0, 2.0], [2.0, 1002.0]]), "by a factor of 1000, but this factor must be between 0.9 and 1.1"),
     ],
 )
 def test_invalid_marks_are_refused(marks: np.ndarray, message: str) -> None:
-    with pytest.raises(CaptureError, match=f"^header.json: clock.marks .*{message}"):
+    with pytest.raises(CaptureError, match=f"^header.json: .*{message}"):
         from_marks(marks, "header.json")
 
 
@@ -152,7 +152,7 @@ def test_part_of_a_stream_suffices_if_travel_times_are_irregular() -> None:
 def test_stream_of_a_periodic_protocol_is_refused_because_several_offsets_fit(part: slice) -> None:
     log = log_of(40, 0.25, (0.25, 0.25))
     t_s, b_uT = stream_of(log, clock_map(7.0), margin_s=3.0)
-    with pytest.raises(CaptureError, match="at two times almost equally well, .* Add sync marks: .*--mark"):
+    with pytest.raises(CaptureError, match="two offsets .* almost equally well.* Add sync marks: .*--mark"):
         from_contacts([(t_s[part], b_uT[part])], log, "c")
 
 

@@ -110,7 +110,7 @@ def test_fault_without_a_time_does_not_change_the_span_of_its_kind():
     assert log.account() == {
         "fault_stuck_dropped_n": 6, "fault_stuck_first_ms": 3000, "fault_stuck_last_ms": 3000,
     }  # fmt: skip
-    with pytest.raises(CaptureError, match="2 x, the first at an unknown time"):
+    with pytest.raises(CaptureError, match="count 2, first at an unknown time"):
         FaultLog(override(DEFAULT_POLICY, ["stuck=refuse"], "t"), "x", "ms").record("stuck", mask, unknown_s * np.nan)
 
 
@@ -126,13 +126,13 @@ def test_policy_is_applied_to_rows_of_a_table():
     kept = check_rows(b_uT, temperature_degC, None, where="here", policy=policy)
     assert np.flatnonzero(~kept.keep).tolist() == list(range(20, 30))
     assert kept.account()["dropped_out_of_range_rows_n"] == 10
-    with pytest.raises(CaptureError, match="here: found fault zeros 1 x, the first at row 101"):
+    with pytest.raises(CaptureError, match="here: found fault zeros .count 1, first at row 101."):
         check_rows(b_uT, temperature_degC, None, where="here", policy=override(DEFAULT_POLICY, ["zeros=refuse"], "t"))
 
 
 def test_invalid_changes_of_the_policy_are_refused():
     wrong = {
-        "melted=drop": "Faults: .*stuck",
+        "melted=drop": "The possible NAMEs are: .*stuck",
         "stuk=flag": "Did you mean stuck=flag",
         "torn=flag": "torn must be drop or refuse; got 'flag'",
         "stuck": "stuck must be drop or flag or refuse; got ''. Try: stuck=drop",

@@ -78,7 +78,7 @@ def test_malformed_header_is_refused(text):
 
 
 def test_capture_in_a_renamed_folder_is_refused():
-    with pytest.raises(CaptureError, match="capture must be the folder's name 'other'; got 'a_capture'"):
+    with pytest.raises(CaptureError, match="capture must be the name of the folder, 'other'; got 'a_capture'"):
         check_same_capture(make_header(), "other")
 
 
@@ -117,7 +117,7 @@ def test_capture_whose_file_was_changed_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="has changed since it was added"):
         open_capture(folder, DEFAULT_POLICY)
     (folder / lab.READINGS).unlink()
-    with pytest.raises(CaptureError, match="file not found, but the header lists it"):
+    with pytest.raises(CaptureError, match="file not found, although the header lists this file"):
         open_capture(folder, DEFAULT_POLICY)
 
 

@@ -103,7 +103,7 @@ def test_prompts_name_the_places_in_another_order_in_each_pass(context, tmp_path
     assert log.pass_i[log.contact].tolist() == [0] * 6 + [1] * 6
     shown = [line for line in printed if "press place" in line]
     assert all(f"x {x:g}, y {y:g} mm" in line for line, (x, y) in zip(shown, places, strict=True))
-    assert "then place" in shown[0]
+    assert "the next place is place" in shown[0]
 
 
 def test_answer_to_a_prompt_may_be_an_index_a_force_or_skip(context, tmp_path):
@@ -212,8 +212,8 @@ def test_touches_during_which_the_gauge_sends_nothing_are_counted(context, fake_
 def test_labels_continue_after_the_gauge_is_unplugged(context, fake_gauge):
     gauge = fake_gauge([b"0.5\n"])
     prompter, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
-    assert "gauge: lost the force gauge" in (message := prompter.run(with_gauge(context, gauge)))
-    assert "Later forces are missing" in message
+    assert "gauge: lost the connection to the force gauge" in (message := prompter.run(with_gauge(context, gauge)))
+    assert "All later forces are missing" in message
     assert context.writer.touches_n == 2
 
 
@@ -224,7 +224,7 @@ def test_gauge_without_other_labels_detects_touches_by_their_force(context, tmp_
     context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
     label_thread = LabelThread(from_gauge("gauge", 9600), context)
     label_thread._thread.join()
-    unplugged = "labels ended: gauge: lost the force gauge: gone. What it sent"
+    unplugged = "labels ended: gauge: lost the connection to the force gauge: gone. The forces"
     assert unplugged in label_thread.end()
     assert isinstance(label_thread.failed, CaptureError)
     log = log_of(tmp_path)
@@ -271,7 +271,7 @@ def test_rows_that_are_appended_to_a_table_are_read(context, tmp_path, exists):
 
 @pytest.mark.parametrize(
     ("interruption", "problem"),
-    [("replaced", "replaced"), ("cut", r"shortened to \d+ bytes, but \d+ were read"), ("removed", "removed")],
+    [("replaced", "replaced"), ("cut", r"shortened to \d+ bytes, but \d+ bytes had"), ("removed", "removed")],
 )
 def test_labels_end_when_reading_the_table_is_interrupted(context, tmp_path, interruption, problem):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"

@@ -79,7 +79,7 @@ def test_log_of_any_sequence_of_labels_can_be_read(tmp_path_factory, dwells):
 )  # fmt: skip
 def test_invalid_label_is_refused(tmp_path, label, end_s):
     writer = ProbeLogWriter(tmp_path)
-    with pytest.raises(CaptureError, match="a label: .* (must be|is not a span of time)"):
+    with pytest.raises(CaptureError, match="a label: .* (must be|is not a valid time span)"):
         writer.write(Dwell(label, 0.0, end_s))
     writer.close()
 
@@ -136,7 +136,7 @@ def test_table_without_phases_is_divided_by_a_threshold_of_the_force():
 
 @pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
 def test_invalid_columns_are_refused(head):
-    with pytest.raises(CaptureError, match="row 1 must name either unix_s or t_s"):
+    with pytest.raises(CaptureError, match="row 1 must name exactly one of the columns unix_s and t_s"):
         SampleTable("log").feed(head.encode() + b"\n")
 
 
@@ -160,7 +160,7 @@ def test_too_short_touches_are_counted():
     changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
-    assert dwells.summary().startswith("2 touches left out: a touch needs 0.05 s")
+    assert dwells.summary().startswith("2 touches left out: at least 0.05 s must lie between")
     # The touch lasts 0.52 s. This is one dwell, and a rest of 0.01 s that is too short for another dwell.
     long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1

@@ -140,7 +140,7 @@ def test_table_file_is_read_like_a_capture_of_its_layout(tmp_path):
     assert (set(frame["capture"]), set(frame["board"])) == ({"my_table"}, {"unnamed"})
     counts = frame.attrs["counts"]
     assert counts["rows_n"] + counts["noload_rows_n"] == counts["rows_read_n"] == FRAMES_N
-    with pytest.raises(ParamsError, match="only a capture of `reskin record` has frames"):
+    with pytest.raises(ParamsError, match="only captures that `reskin record` wrote have frames"):
         reskin.load_recording(tmp_path / "my table.csv", frames=True)
 
 
@@ -152,21 +152,21 @@ def test_error_for_another_file_names_the_file(tmp_path):
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "cut.parquet").read_bytes()[:-20])
     for name, message in (
         ("gone", "file not found"), ("empty", "there is no header.json"), ("notes.csv", "column 1 is 'a'"),
-        ("other.parquet", "not the columns of reskin decode"), ("cut.parquet", "not readable as Parquet"),
+        ("other.parquet", "not those that `reskin decode` writes"), ("cut.parquet", "cannot be read as a Parquet file"),
     ):  # fmt: skip
         with pytest.raises(ReskinError, match=rf"{name}.*{message}"):
             reskin.load_recording(tmp_path / name)
     stream = write_stream(tmp_path / "late", {PROBE_FILE: labels().replace(",0,contact", ",0,noload").encode()})
-    with pytest.raises(CaptureError, match="late.*try: frames=True"):
+    with pytest.raises(CaptureError, match="late.*set frames=True"):
         reskin.load_recording(stream)
     assert len(reskin.load_recording(stream, frames=True)) == FRAMES_N
-    with pytest.raises(CaptureError, match="stream.bin.*run `reskin decode`"):
+    with pytest.raises(CaptureError, match="stream.bin.*with `reskin decode`"):
         reskin.load_recording(stream / STREAM_FILE)
 
 
 def test_layout_that_is_needed_is_named_in_the_error(shared_data):
     for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
-        with pytest.raises(ReskinError, match=f"This is layout {layout}: run `reskin add`"):
+        with pytest.raises(ReskinError, match=f"This is layout {layout}. Convert it to a capture with `reskin add`"):
             reskin.load_recording(shared_data / name)
 
 

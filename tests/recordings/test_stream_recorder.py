@@ -332,7 +332,7 @@ class TestErrors:
             stream_recorder.record(board.name, tmp_path, settings=SETTINGS, stop=threading.Event())
 
     def test_port_that_sends_nothing_is_reported(self, board, clock, tmp_path):
-        with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Is the"):
+        with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Check that the"):
             record(board, tmp_path, lambda _: setattr(clock, "s", 0.7), silence_s=0.6)
 
     def test_port_unplugged_before_the_first_byte_is_reported(self, board, tmp_path):
@@ -351,7 +351,7 @@ class TestErrors:
         actor = threading.Thread(target=act, args=[stop])
         actor.start()
         try:
-            with pytest.raises(CaptureError, match="no frame found in .* Wrong baud rate"):
+            with pytest.raises(CaptureError, match="no frame found in .* Check the baud rate"):
                 stream_recorder.record(
                     board.name, tmp_path, settings=replace(SETTINGS, no_frame_s=0.7), stop=threading.Event()
                 )
@@ -367,7 +367,7 @@ class TestErrors:
             wait_until_written(tmp_path, len(data))
             clock.s = 0.6
 
-        with pytest.raises(CaptureError, match="It fits binary with 4 chips"):
+        with pytest.raises(CaptureError, match="The bytes fit binary with 4 chips"):
             record(board, tmp_path, act, no_frame_s=0.5)
 
     def test_existing_recording_is_not_overwritten(self, board, tmp_path):

@@ -73,9 +73,9 @@ def read_text(text):
     ("old", "new", "message"),
     [
         ("turn_deg: 180", "turn_deg: 45", "chips.1.turn_deg must be 0, 90, 180 or 270; got 45"),
-        ("x_mm: 7.0", "x_mm: 0.0", r"chips 0 and 3 are at the same place \(0.0, 0.0\) mm. Correct it there"),
-        ("x_mm: 7.0", "x_mm: 0.007", "two chips are 0.007 mm apart. Are the positions in mm. Correct it there"),
-        ("centre_mm: [8.0, 8.0]", "centre_mm: [8.0]", "centre_mm.1 is missing. Add it there"),
+        ("x_mm: 7.0", "x_mm: 0.0", r"chips 0 and 3 are at the same place \(0.0, 0.0\) mm. Correct these settings"),
+        ("x_mm: 7.0", "x_mm: 0.007", "two chips are 0.007 mm apart. Are the positions in mm. Correct these settings"),
+        ("centre_mm: [8.0, 8.0]", "centre_mm: [8.0]", "centre_mm.1 is missing. Add this key"),
         (
             "half_x_mm: 8.0",
             "half_x_mm: 9.8",

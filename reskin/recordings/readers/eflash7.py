@@ -87,8 +87,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if table.b_uT.shape[1] != 3 * header.chips_n:
         chips_n = table.b_uT.shape[1] // 3
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
-            "header."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file, or "
+            "correct chips_n in header.json."
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
@@ -155,7 +155,8 @@ def _read_table(path: Path, where: str) -> _Table:
     back = np.flatnonzero(np.diff(time_s[:, 0]) <= 0)
     if len(back):
         raise CaptureError(
-            f"{where}: timestamp does not increase in line {FIRST_LINE_N + back[0] + 1}. Were two recordings joined?"
+            f"{where}: timestamp does not increase in line {FIRST_LINE_N + back[0] + 1}. If the file contains two "
+            "recordings, split it into two files."
         )
     check_changes(b_uT, where, first_line_n=FIRST_LINE_N)
     known_N = np.full((len(numbers), 3), np.nan)
@@ -167,14 +168,19 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
     """Return the numbers of the one or two touched places, from their columns and rows in the file (1 to 3)."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
-        raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place separately.")
+        raise CaptureError(
+            f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Write the rows of each place to a file of "
+            "its own, and add each file."
+        )
     pairs = place[0].reshape(-1, 2)
     if not np.isin(pairs, np.arange(1, SIDE_N + 1)).all():
-        rule = f"columns and rows 1 to {SIDE_N} of a grid"
-        raise CaptureError(where, "places", rule, place[0].tolist(), "Use layout table for places in mm.")
+        rule = f"columns and rows of a grid, numbered from 1 to {SIDE_N}"
+        raise CaptureError(where, "places", rule, place[0].tolist(), "If the places are in mm, use layout table.")
     numbers = sorted(int(column + SIDE_N * (row - 1)) for column, row in pairs)
     if len(set(numbers)) < len(numbers):
-        raise CaptureError(f"{where}: both places are place {numbers[0]}. Correct the columns of places.")
+        raise CaptureError(
+            f"{where}: both places are the same, place {numbers[0]}. Correct the columns that contain the places."
+        )
     return numbers
 
 
@@ -182,8 +188,11 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
     """Mark the rows with zeros for all chips, in which there was no new reading; raise if there are too many rows."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
-        problem = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
-        raise CaptureError(f"{where}: {problem}. Was the sensor unplugged? Record again.")
+        problem = (
+            f"{int(zero.sum())} of {len(zero)} rows contain only zeros, but at most {ZERO_FRACTION_MAX:.0%} of the "
+            "rows may do so"
+        )
+        raise CaptureError(f"{where}: {problem}. Check that the sensor is plugged in, and record again.")
     return zero
 
 
@@ -207,7 +216,7 @@ def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarra
     check_touch(force_N, where)
     if force_N[:, 2].max() > -force_N[:, 2].min():
         got = f"{force_N[:, 2].max():.4g} N"
-        remedy = "Is compression negative fz in this file? Reverse its sign."
+        remedy = "In layout eflash7, fz is negative in compression: reverse the sign of fz."
         raise CaptureError(where, "the strongest fz", "negative", got, remedy)
 
 

@@ -62,8 +62,8 @@ def collect(recording: Path) -> dict[str, Path]:
     missing = [name for name in FILES if not (recording / name).is_file()]
     if missing:
         raise CaptureError(
-            f"{recording}: no {', '.join(missing)} in it. A recording of layout eflesh is a folder with "
-            f"{', '.join(FILES)}. Copy the whole folder."
+            f"{recording}: the folder does not contain {', '.join(missing)}. A recording of layout eflesh is a folder "
+            f"with {', '.join(FILES)}. Copy the whole folder again."
         )
     return {name: recording / name for name in FILES}
 
@@ -73,7 +73,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
-        raise CaptureError(f"{where}: {columns_n} columns are not a time and 3 per chip. Is this layout eflesh?")
+        raise CaptureError(
+            f"{where}: {columns_n} columns cannot be a time and three columns per chip. Check that the layout is "
+            "eflesh."
+        )
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
@@ -132,7 +135,10 @@ def _read_fields(
     differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
     if len(differ):
         where = f"{header.capture}/{CHANGES} line {differ[0] + 1}"
-        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Use both files of the same recording.")
+        raise CaptureError(
+            f"{where}: the time differs from the time in the same line of {SENSOR}. Use both files of the same "
+            "recording."
+        )
     check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
     return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
 
@@ -152,7 +158,10 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
 def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
     if len(set(rows_n.values())) != 1:
         got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
-        raise CaptureError(f"{header.capture}: unequal numbers of rows, {got}. Was one of the files cut?")
+        raise CaptureError(
+            f"{header.capture}: the files have different numbers of rows, {got}. If one of the files was cut, copy all "
+            "files again."
+        )
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
@@ -162,13 +171,16 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
         where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
         difference_s = states_s[disagreeing[0]] - sensor_s[disagreeing[0]]
         raise CaptureError(
-            f"{where}: its time differs by {difference_s:.3f} s from the time in {SENSOR}; less than "
-            f"{CLOCKS_APART_MAX_s} s is allowed. Is a row missing in one of the files?"
+            f"{where}: the time differs by {difference_s:.3f} s from the time in {SENSOR}; less than "
+            f"{CLOCKS_APART_MAX_s} s is allowed. A row may be missing in one of the files: copy all files again."
         )
     back = np.flatnonzero(np.diff(sensor_s) <= 0)
     if len(back):
         where = f"{header.capture}/{SENSOR}"
-        raise CaptureError(f"{where}: time does not increase in line {back[0] + 2}. Were two recordings joined?")
+        raise CaptureError(
+            f"{where}: time does not increase in line {back[0] + 2}. If the file contains two recordings, split it "
+            "into two files."
+        )
 
 
 def _number_passes(
@@ -197,7 +209,7 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
         got = header.options if header.options else "no option"
-        remedy = "State which force the gauge measured."
+        remedy = "State the axis along which the gauge measured the force, with --force-axis."
         raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
     weight_g, where = states[:, WEIGHT_COLUMN], f"{header.capture}/{STATES}"
     weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)

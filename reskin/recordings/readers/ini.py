@@ -46,11 +46,16 @@ Account = dict[str, int]
 def collect(recording: Path) -> dict[str, Path]:
     """Find the two files of a recording: the readings `b20_NAME.txt`, and `truths_NAME.txt` in the same folder."""
     if not recording.is_file() or recording.name.startswith("truths_"):
-        raise CaptureError(f"{recording}: not the text file of readings. Add b20_NAME.txt, not truths_NAME.txt.")
+        raise CaptureError(
+            f"{recording}: this is not the text file of readings. Add b20_NAME.txt instead of truths_NAME.txt."
+        )
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
     truths = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
     if not truths:
-        raise CaptureError(f"{recording}: no {' or '.join(names)} beside it. Fetch or rename the truths file.")
+        raise CaptureError(
+            f"{recording}: there is no {' or '.join(names)} in the same folder. Copy the truths file to this folder, "
+            "under one of these names."
+        )
     return {READINGS: recording, TRUTHS: truths[0]}
 
 
@@ -59,7 +64,9 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[READINGS])
     columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
-        raise CaptureError(f"{where}: {columns_n} columns are not X, Y, Z, T for each chip. Is this layout ini?")
+        raise CaptureError(
+            f"{where}: {columns_n} columns cannot be X, Y, Z, T for each chip. Check that the layout is ini."
+        )
     return columns_n // VALUES_PER_CHIP_N
 
 
@@ -135,13 +142,14 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
 def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
     if readings_n <= rows_late_n:
         raise CaptureError(
-            f"{header.capture}: the recording has {readings_n} rows, but option rows_late is {rows_late_n}. Was the "
-            "recording cut?"
+            f"{header.capture}: the recording has {readings_n} rows, but option rows_late is {rows_late_n}. If the "
+            "recording was cut, copy the recording again."
         )
     if readings_n != truths_n:
         got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
         raise CaptureError(
-            f"{header.capture}: unequal numbers of rows, {got}. Is this the truths file of this recording?"
+            f"{header.capture}: the two files have different numbers of rows, {got}. Use the truths file of the same "
+            "recording."
         )
 
 
@@ -151,7 +159,7 @@ def _rows_late(header: Header) -> int | None:
         return None
     rows_late = header.options["rows_late"]
     if rows_late not in ROWS_LATE:
-        remedy = "Set it to the number of rows by which the fields lag."
+        remedy = "Set this option to the number of rows by which the fields lag behind the truths."
         raise CaptureError(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy)
     return int(rows_late)
 
@@ -210,6 +218,6 @@ def _noload_field(
         where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
         raise CaptureError(
             f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). "
-            "Start each pass off the skin, or remove this pass."
+            "At the start of each pass, the indenter must be off the skin. Remove this pass, or record it again."
         )
     return noload_uT[pass_i]

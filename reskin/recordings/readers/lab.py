@@ -89,7 +89,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if len(without):
         line_n = FIRST_LINE_N + int(np.argmax(table.press == without[0]))
         raise CaptureError(
-            f"{where}: the indent from line {line_n} on has no fault-free noload row. Remove it, or record it again."
+            f"{where}: the indent from line {line_n} on has no fault-free noload row. Remove all rows of this indent, "
+            "or record them again."
         )
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(table.press[keep])
@@ -136,8 +137,8 @@ def _read_checked(folder: Path, header: Header, policy: FaultPolicy, where: str)
     if table.temperature_degC.shape[1] != header.chips_n:
         chips_n = table.temperature_degC.shape[1]
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
-            "header."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file, or "
+            "correct chips_n in header.json."
         )
     return table, check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
 
@@ -167,7 +168,9 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
     for row_i in begins:
         if indent[row_i] in seen:
             problem = f"indent {indent[row_i]:g} begins again in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(f"{where}: {problem}; its rows must be one block. Was the file joined twice?")
+            raise CaptureError(
+                f"{where}: {problem}; its rows must be one block. Remove rows that are in the file twice."
+            )
         seen.add(indent[row_i])
     return np.repeat(np.arange(len(begins)), np.diff(begins, append=len(indent)))
 
@@ -180,11 +183,11 @@ def _check_table(table: _Table, where: str) -> None:
     check_touch(table.force_N[table.contact], where)
     pressed_N = float(np.median(table.force_N[table.contact, 2]))
     if pressed_N > 0:
-        remedy = "Is compression negative Fz in this file? Reverse its sign."
-        raise CaptureError(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy)
+        remedy = "In layout lab, Fz is negative in compression: reverse the sign of Fz."
+        raise CaptureError(where, "the median of Fz in contact", "negative", f"{pressed_N:.4g} N", remedy)
     check_places(table.place_mm, where, first_line_n=FIRST_LINE_N)
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):
         problem = f"the place changes within an indent, in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(f"{where}: {problem}. Number each press as its own indent.")
+        raise CaptureError(f"{where}: {problem}. Give each press an indent number of its own.")

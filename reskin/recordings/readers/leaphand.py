@@ -130,7 +130,9 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
     cells = read_cells(folder / READINGS, where, separator=None)
     pads_n = _count_pads(cells, where)
     if header.chips_n != CHIPS_N:
-        raise CaptureError(f"{where}: the header says {header.chips_n} chips, but a pad has {CHIPS_N}. Correct it.")
+        raise CaptureError(
+            f"{where}: the header says {header.chips_n} chips, but a pad has {CHIPS_N}. Correct the header."
+        )
     first = CHANNELS_N * (_pad_number(header, pads_n) - 1)
     fields = [f"B{axis}{chip} of pad {pad + 1}" for pad in range(pads_n) for chip in range(CHIPS_N) for axis in "xyz"]
     joints = [f"joint {joint + 1}" for joint in range(JOINTS_N * pads_n)]
@@ -142,13 +144,19 @@ def _read_pad(folder: Path, header: Header, policy: FaultPolicy) -> _Pad:
         row_i, joint_i = np.argwhere(wrong)[0]
         rule, got = f"whole numbers from 0 to {COUNTS_PER_TURN - 1}", f"{joint_counts[row_i, joint_i]:.6g}"
         place = f"{joints[joint_i]} in line {row_i + 1}, in counts of its servo,"
-        raise CaptureError(where, place, rule, got, "Are the joint positions in the last columns? Convert angles.")
+        raise CaptureError(
+            where,
+            place,
+            rule,
+            got,
+            "The last columns must be joint positions. If they are angles, convert them to counts.",
+        )
     unknown_degC = np.full((len(b_uT), CHIPS_N), np.nan)
     rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy)
     pad = _Pad(b_uT, joint_counts.astype(np.int64), _find_rest(joint_counts, where), rows, pads_n)
     if not pad.is_noload.any() or not pad.is_reading.any():
         what = "all no-load rows" if not pad.is_noload.any() else "all rows after the no-load rows"
-        raise CaptureError(f"{where}: {what} are faulty. Check the pad, and record again.")
+        raise CaptureError(f"{where}: {what} have faults. Check the pad, and record again.")
     return pad
 
 
@@ -157,7 +165,7 @@ def _count_pads(cells: list[list[str]], where: str) -> int:
     columns_n, per_pad_n = len(cells[0]), CHANNELS_N + JOINTS_N
     if columns_n % per_pad_n or not 1 <= columns_n // per_pad_n <= PADS_MAX_N:
         rule = f"{CHANNELS_N} fields and {JOINTS_N} joint positions for each of 1 to {PADS_MAX_N} pads"
-        raise CaptureError(where, "the number of columns", rule, columns_n, "Is this layout leaphand?")
+        raise CaptureError(where, "the number of columns", rule, columns_n, "Check that the layout is leaphand.")
     return columns_n // per_pad_n
 
 
@@ -165,7 +173,13 @@ def _pad_number(header: Header, pads_n: int) -> int:
     got = header.options.get("pad", "none")
     if got not in {str(pad) for pad in range(1, pads_n + 1)}:
         rule = f"1 to {pads_n}, the number of pads in the file"
-        raise CaptureError(header.capture, "option pad", rule, got, "Add each pad separately, with --pad.")
+        raise CaptureError(
+            header.capture,
+            "option pad",
+            rule,
+            got,
+            "Add each pad as a separate capture, and state the number of the pad with --pad.",
+        )
     return int(got)
 
 

@@ -104,7 +104,7 @@ def _check_kept(account: dict[str, int], where: str) -> None:
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
-        counts = f"{failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        counts = f"{failed_n} had failed I2C reads, and {stuck_n} had stuck chips"
         raise CaptureError(
             f"{where}: only {kept_n} of {read_n} lines are fault-free: {counts}. At least "
             f"{100 * KEPT_SHARE_MIN:g} % must be fault-free. Check the wiring, and log again."
@@ -126,7 +126,7 @@ def _read_names(path: Path, where: str) -> list[str]:
         raise CaptureError(f"{where}: file not found. Check the path.") from None
     except OSError as error:
         reason = "the file is empty" if path.is_file() and not path.stat().st_size else error.strerror
-        raise CaptureError(f"{where}: cannot read the log: {reason}. Check the name.") from None
+        raise CaptureError(f"{where}: cannot read the log: {reason}. Check the path.") from None
     # If the log was saved by a text editor or a spreadsheet, it may begin with a byte order mark, so remove this mark.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     temperatures = _has_temperatures(names)
@@ -148,18 +148,26 @@ def _has_temperatures(names: list[str]) -> bool:
 def _header_fault(names: list[str]) -> str:
     """Return a text that says what is wrong with the column names in line 1, and what to do."""
     wanted = column_names(len(names), temperatures=_has_temperatures(names))
-    rule = f"{','.join(column_names(1))}, then T1 and so on (all T may be missing)"
+    rule = f"{','.join(column_names(1))}, then T1, Bx1 and so on for the other chips (all columns T may be missing)"
     if tables.is_number(names[0]):
         chips_n, left_n = divmod(len(names) - 1, len(CHIP_COLUMNS))
         whole = f": {','.join(column_names(chips_n))}" if not left_n and 0 < chips_n <= SHOWN_CHIPS_MAX else ""
-        return f"line 1 has numbers, not the column names {rule}. If this is a board's log, add this line on top{whole}"
+        return (
+            f"line 1 has numbers, not the column names {rule}. If a board wrote this log, add a line with the column "
+            f"names at the top{whole}"
+        )
     if ";" in names[0]:
-        return "semicolons in line 1. Export it with commas between columns and points in numbers."
+        return tables.SEMICOLONS
     if {"phase", "x_mm", "y_mm"} & set(names):
-        return f"line 1 has columns of labels or estimates; a log has {rule}. To add labelled data: reskin add."
+        return (
+            f"line 1 has columns of labels or estimates, but a log has only {rule}. To add labelled data, use reskin "
+            "add."
+        )
     wrong_i = next((i for i, (name, right) in enumerate(zip(names, wanted, strict=False)) if name != right), len(names))
     if wrong_i == len(names):
-        return f"line 1: column {wrong_i + 1} must be {wanted[wrong_i]}; the line ends at {names[-1]}. Complete it."
+        return (
+            f"line 1: column {wrong_i + 1} must be {wanted[wrong_i]}; the line ends at {names[-1]}. Complete this line."
+        )
     got = ascii(names[wrong_i][:20])[1:-1]
     return f"line 1: column {wrong_i + 1} is {got!r}; it must be {wanted[wrong_i]} (columns: {rule}). Correct line 1."
 
@@ -167,7 +175,7 @@ def _header_fault(names: list[str]) -> str:
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
     """Return the column `name`; raise if it has a value that is not finite."""
     values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
-    remedy = "Remove that line; the gap is counted."
+    remedy = "Remove this line. The frame is then counted as missing."
     tables.refuse_row(~np.isfinite(values), where, name, "a finite number", values, remedy)
     return values
 
@@ -179,12 +187,12 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
     if back.any():
         row_i = int(back.argmax()) + 1
         got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
-        remedy = "Was the board reset? Split the log there."
+        remedy = "If the board was reset here, split the log into two files before this line."
         raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
         rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines per second"
-        remedy = f"{TIME} is in seconds: was it written in milliseconds?"
+        remedy = f"{TIME} must be in seconds. If it is in milliseconds, convert it."
         raise CaptureError(where, "the rate", rule, f"{rate_hz:.3g}", remedy)
 
 
@@ -194,15 +202,18 @@ def _faults(
     """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
-        raise CaptureError(f"{where}: every line has failed I2C reads. Check the wiring, and log again.")
+        raise CaptureError(f"{where}: in every line, the I2C read of a chip failed. Check the wiring, and log again.")
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(deviating):
-            problem = f"the step of chip {', '.join(map(str, deviating))} differs from that of the other chips"
+            problem = (
+                f"the LSB (the step between values) of chip {', '.join(map(str, deviating))} differs from that of the "
+                "other chips"
+            )
             raise CaptureError(
-                f"{where}: from row {block[0] + first_row} on, {problem}. A chip lost its settings: reset the board "
-                "and log again."
+                f"{where}: from row {block[0] + first_row} on, {problem}. A chip has probably lost its settings: reset "
+                "the board and log again."
             )
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
 

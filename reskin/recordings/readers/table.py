@@ -78,8 +78,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     names, cells = _read_cells(folder / name, where)
     if (chips_n := count_chips_of(names)) != header.chips_n:
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
-            "header."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file, or "
+            "correct chips_n in header.json."
         )
     columns = columns_of(header.chips_n)
     check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
@@ -102,7 +102,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if len(without):
         line_n = FIRST_LINE_N + without[0]
         raise CaptureError(
-            f"{where}: the press in line {line_n} has no fault-free no-load row before it. Add rows of phase noload."
+            f"{where}: the press in line {line_n} has no fault-free no-load row before it. Add rows of phase noload "
+            "before this press."
         )
     depth_is_zero = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
     pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
@@ -133,7 +134,9 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
     try:
         table = pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as error:
-        raise CaptureError(f"{where}: the file is not Parquet: {str(error)[:60]}. Write it again.") from None
+        raise CaptureError(
+            f"{where}: the file cannot be read as a Parquet file: {str(error)[:60]}. Write the file again."
+        ) from None
     columns = [["" if value is None else str(value) for value in column.to_pylist()] for column in table.columns]
     return list(table.column_names), [list(row) for row in zip(*columns, strict=True)]
 
@@ -147,7 +150,8 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
         if name not in columns and name.lower().split("_")[0] in STEMS:
             known = ", ".join((*NEEDED, *OPTIONAL))
             raise CaptureError(
-                f"{where}: column {name!r} is not known, but resembles one of {known}. Rename the column, or remove it."
+                f"{where}: column {name!r} is not known, but its name resembles one of {known}. Rename the column, or "
+                "remove the column."
             )
 
 
@@ -194,7 +198,7 @@ def _check(
             check_touch(numbers[axis][contact], where)
     if "Fz_N" in numbers and np.median(numbers["Fz_N"][contact]) < 0:
         got = f"{np.median(numbers['Fz_N'][contact]):.4g} N"
-        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Reverse its sign.")
+        raise CaptureError(where, "the median of Fz_N in contact", "positive", got, "Reverse the sign of Fz_N.")
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
@@ -209,9 +213,13 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
         return
     rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
     if rest_uT < SUBTRACTED_RATIO * pressed_uT:
-        problem = f"the fields are {rest_uT:.3g} uT at most in no-load rows, {pressed_uT:.3g} uT in contact"
+        problem = (
+            f"the strongest field of a row is {rest_uT:.3g} uT without contact and {pressed_uT:.3g} uT in contact "
+            "(medians)"
+        )
         raise CaptureError(
-            f"{where}: {problem}. A baseline seems to have been subtracted: write the raw fields of both phases."
+            f"{where}: {problem}. A baseline seems to have been subtracted. Write raw fields to the file, in rows of "
+            "both phases."
         )
 
 
@@ -233,7 +241,7 @@ def _number_presses(
             line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
             problem = f"indentation {twice:g} begins again in line {line_n}"
             raise CaptureError(
-                f"{where}: {problem}; its rows must be one block. Was the same recording appended twice?"
+                f"{where}: {problem}; its rows must be one block. Remove rows that are in the file twice."
             )
         begins_at = np.zeros(len(contact), bool)
         begins_at[rows[begins]] = True

@@ -128,12 +128,18 @@ def with_line_changed(line_n: int, old: str, new: str) -> list[str]:
     ("rows", "expected"),
     [
         (with_line_changed(4, "3,2", "3,1"), "the place changes in line 4"),
-        ([row.replace("6,3,2", "6,12.5,8") for row in ONE], "columns and rows 1 to 3 of a grid; got [12.5, 8.0]"),
+        (
+            [row.replace("6,3,2", "6,12.5,8") for row in ONE],
+            "columns and rows of a grid, numbered from 1 to 3; got [12.5, 8.0]",
+        ),
         (with_line_changed(5, "100.3", "100.1"), "timestamp does not increase in line 5"),
-        (with_line_changed(8, "-0.9", "-356"), "in line 8. Convert grams"),
+        (with_line_changed(8, "-0.9", "-356"), "in line 8. If the unit of the file is g"),
         (with_line_changed(8, "-0.9", "nan"), "fz in line 8"),
         (ONE[5:], "fewer than 5 rows come before the first touch"),
-        ([ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE, "10 of 22 rows are zeros, more than 25%"),
+        (
+            [ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE,
+            "10 of 22 rows contain only zeros, but at most 25%",
+        ),
     ],
 )
 def test_invalid_rows_are_refused(tmp_path: Path, rows: list[str], expected: str) -> None:
@@ -147,14 +153,14 @@ def test_file_with_the_wrong_sign_of_forces_is_refused(tmp_path: Path) -> None:
 
 def test_pair_of_equal_places_is_refused(tmp_path: Path) -> None:
     rows = rows_of("3,1,3,1", "{fz},0.01 {place}")
-    assert "both places are place 3" in error_of(write(tmp_path, rows, NAMES_OF_TWO))
+    assert "both places are the same, place 3" in error_of(write(tmp_path, rows, NAMES_OF_TWO))
 
 
 def test_fields_in_millitesla_are_refused(tmp_path: Path) -> None:
     cells = ONE[0].split(",")
     fields_mT = [[1e-3 * STEP_uT * (level + 5 * i) for i in range(len(FIELDS))] for level in range(40)]
     rows = [",".join([f"{i}", *cells[1:8], *(f"{b:.5f}" for b in row)]) for i, row in enumerate(fields_mT)]
-    assert "Convert nT, mT or G to uT" in error_of(write(tmp_path, rows))
+    assert "Convert the field changes to uT" in error_of(write(tmp_path, rows))
 
 
 def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def test_three_files_of_a_recording_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", eflesh.FILES)
 def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
     (scan(tmp_path) / name).unlink()
-    with pytest.raises(CaptureError, match=f"no {name}"):
+    with pytest.raises(CaptureError, match=f"does not contain {name}"):
         eflesh.collect(tmp_path)
 
 
@@ -175,8 +175,8 @@ def test_tables_with_different_numbers_of_rows_are_refused(tmp_path: Path, name:
 @pytest.mark.parametrize(
     ("name", "cell", "expected"),
     [
-        (eflesh.CHANGES, f"{START_s + 8.6}", "line 3: time differs from that of sensor.csv"),
-        (eflesh.STATES, f"{START_s + 8.6}", "line 3: its time differs by 0.100 s from the time in sensor.csv"),
+        (eflesh.CHANGES, f"{START_s + 8.6}", "line 3: the time differs from the time in the same line of sensor.csv"),
+        (eflesh.STATES, f"{START_s + 8.6}", "line 3: the time differs by 0.100 s from the time in sensor.csv"),
     ],
 )
 def test_clocks_that_disagree_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
@@ -194,7 +194,7 @@ def test_clock_that_runs_backwards_is_refused(tmp_path: Path) -> None:
 def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
     message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 16" in message
-    assert ": 7 columns" in message
+    assert "the file has 7 columns" in message
 
 
 def test_implausible_weight_is_refused(tmp_path: Path) -> None:
@@ -213,13 +213,13 @@ def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: flo
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
     eflesh.read(folder, HEADER, DEFAULT_POLICY)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
-    assert "states.csv: places must be equal, or spread over 1 to 200 mm" in error_of(folder)
+    assert "states.csv: places must be all equal, or spread over a range of 1 to 200 mm" in error_of(folder)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_stroke_in_metres_or_micrometres_is_refused(tmp_path: Path, factor: float) -> None:
     rescale(strokes(tmp_path) / eflesh.STATES, slice(3, 4), factor)
-    assert "states.csv: depth must be 0.05 to 100 mm where it is greatest" in error_of(tmp_path, GAUGED)
+    assert "states.csv: the greatest depth must be 0.05 to 100 mm" in error_of(tmp_path, GAUGED)
 
 
 def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
@@ -230,7 +230,7 @@ def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
     states[:, 4] = np.where(states[:, 4] == -1, -1, states[:, 4] / 1000)
     (folder / eflesh.STATES).write_text(lines_of(states.tolist()))
     assert (
-        "force must be at least 0.05 N in one or more rows with contact; got 0.00981 at most. Convert kg"
+        "force must be at least 0.05 N in one or more rows with contact; got 0.00981 N at most. If the unit is kg"
         in error_of(folder, GAUGED)
     )
 
@@ -240,7 +240,7 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, factor: float) -> Non
     scan(tmp_path)
     for name in (eflesh.SENSOR, eflesh.CHANGES):
         rescale(tmp_path / name, slice(1, None), factor)
-    assert "G to uT" in error_of(tmp_path)
+    assert "convert the fields to uT" in error_of(tmp_path)
 
 
 def test_scan_at_constant_height_has_no_depth(tmp_path):

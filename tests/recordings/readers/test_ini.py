@@ -229,10 +229,10 @@ def test_fields_of_a_public_recording_are_one_row_late(tmp_path: Path, shared_da
 @pytest.mark.parametrize(
     ("columns", "factor", "expected"),
     [
-        (slice(0, 2), 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.008"),
-        (slice(0, 2), 1e3, "Convert m or um to mm"),
-        (slice(2, 3), 0.01, "force must be at least 0.05 N in one or more rows with contact; got 0.015 at most"),
-        (slice(2, 3), 1e3, "Convert grams or mN to N"),
+        (slice(0, 2), 1e-3, "places must be all equal, or spread over a range of 1 to 200 mm; got a range of 0.008"),
+        (slice(0, 2), 1e3, "convert the places to mm"),
+        (slice(2, 3), 0.01, "force must be at least 0.05 N in one or more rows with contact; got 0.015 N at most"),
+        (slice(2, 3), 1e3, "convert the forces to N"),
     ],
 )
 def test_labels_in_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
@@ -277,7 +277,7 @@ def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: 
 
 def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
     message = error_of(recording_with_resets(tmp_path, {1}, range(24)))
-    assert "chip 1 must be that of the other chips" in message
+    assert "chip 1 must be the LSB of the other chips" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
@@ -309,7 +309,7 @@ def test_file_of_labels_is_found_by_its_name(tmp_path: Path, name: str) -> None:
     files = ini.collect(recording)
     assert files == {ini.READINGS: recording, ini.TRUTHS: truths}
     assert ini.count_chips(files) == CHIPS_N
-    with pytest.raises(CaptureError, match="not truths_"):
+    with pytest.raises(CaptureError, match="instead of truths_"):
         ini.collect(truths)
 
 
@@ -331,7 +331,7 @@ def test_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
         edit(path, 3, broken)
         message = error_of(tmp_path)
         assert name in message
-        assert "in line 3" in message
+        assert "line 3 has" in message
 
 
 def test_files_with_different_numbers_of_rows_are_refused(tmp_path: Path) -> None:
@@ -343,9 +343,9 @@ def test_files_with_different_numbers_of_rows_are_refused(tmp_path: Path) -> Non
 def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 20" in message
-    assert ": 12 columns" in message
+    assert "the file has 12 columns" in message
 
 
 def test_forces_in_grams_are_refused(tmp_path: Path) -> None:
     edit(write(tmp_path, ONE_PASS) / ini.TRUTHS, 4, "2.0 4.0 153.0")
-    assert "in line 4. Convert grams" in error_of(tmp_path)
+    assert "in line 4. If the unit of the file is g" in error_of(tmp_path)

@@ -152,10 +152,10 @@ def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Pa
         (4, row(0, "contact", 160.0).replace("160.0000", ""), "Bx0 in line 4"),
         (4, row(0, "contact", 160.0).replace("160.0000", "16O.0"), "Bx0 in line 4"),
         (4, row(0, "touch", 160.0), "phase in line 4"),
-        (4, row(0, "contact", 160.0) + ",3", "16 columns in line 4"),
-        (4, row(0, "contact", 160.0)[:20], "in line 4"),
+        (4, row(0, "contact", 160.0) + ",3", "line 4 has 16 columns"),
+        (4, row(0, "contact", 160.0)[:20], "line 4 has 6 columns"),
         (4, row(0, "contact", 160.0, place="5,6"), "the place changes within an indent, in line 4"),
-        (4, row(0, "contact", 160.0, force="0,0,-356"), "in line 4. Convert grams"),
+        (4, row(0, "contact", 160.0, force="0,0,-356"), "in line 4. If the unit of the file is g"),
         (4, row(0, "contact", 4e5), "in line 4"),
         (6, row(2, "contact", 90.0), "the indent from line 6 on has no fault-free noload row"),
         (8, row(0, "noload", 90.0), "indent 0 begins again in line 8"),
@@ -176,13 +176,13 @@ def test_missing_column_is_named(tmp_path: Path, missing: str) -> None:
 
 def test_duplicate_column_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Fz")
-    assert "two columns are named Fz" in error_of(folder)
+    assert "two columns have the name Fz" in error_of(folder)
 
 
 def test_fields_in_millitesla_are_refused(tmp_path: Path) -> None:
     rows = [row(0, "noload", -20.0), row(0, "contact", -21.0)]
     tiny = [",".join(str(float(c) / 1e3) if "." in c and "0000" in c else c for c in r.split(",")) for r in rows]
-    assert "Convert mT or G to uT" in error_of(write(tmp_path, *tiny))
+    assert "convert the fields to uT" in error_of(write(tmp_path, *tiny))
 
 
 def scale_column(column: str, factor: float) -> list[str]:
@@ -198,15 +198,15 @@ def scale_column(column: str, factor: float) -> list[str]:
 @pytest.mark.parametrize(
     ("column", "factor", "expected"),
     [
-        ("B", 1e-2, "Convert mT or G to uT"),
-        ("B", 1e-6, "Convert mT or G to uT"),
+        ("B", 1e-2, "convert the fields to uT"),
+        ("B", 1e-6, "convert the fields to uT"),
         ("B", 1e4, "below the full scale"),
-        ("_mm", 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
-        ("_mm", 1e3, "got 4000. Convert m or um"),
-        ("F", 102.0, "force must be below 100 N; got -357 in line 4. Convert grams"),
-        ("F", 1e3, "Convert grams or mN to N"),
-        ("F", 1e-3, "force must be at least 0.05 N in one or more rows with contact; got 0.0035 at most. Convert kg"),
-        ("Fz", -1.0, "the usual Fz in contact must be negative; got 3.5 N. Is compression negative Fz in this file?"),
+        ("_mm", 1e-3, "places must be all equal, or spread over a range of 1 to 200 mm; got a range of 0.004. If"),
+        ("_mm", 1e3, "got a range of 4000. If the unit of the file is m or um"),
+        ("F", 102.0, "force must be below 100 N; got -357 in line 4. If the unit"),
+        ("F", 1e3, "convert the forces to N"),
+        ("F", 1e-3, "force must be at least 0.05 N in one or more rows with contact; got 0.0035 N at most. If"),
+        ("Fz", -1.0, "the median of Fz in contact must be negative; got 3.5 N. In layout lab, Fz is negative"),
     ],
 )
 def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: float, expected: str) -> None:
@@ -223,7 +223,7 @@ def test_real_recording_converted_to_gauss_is_refused(tmp_path: Path, shared_dat
         for row in (line.split(",") for line in lines[1:])
     ]
     message = error_of(write(tmp_path, *rows, names=lines[0]), make_header(layout="lab", chips_n=5))
-    assert "G to uT" in message
+    assert "convert the fields to uT" in message
 
 
 def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
@@ -232,4 +232,4 @@ def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> 
 
 
 def test_recording_without_contact_is_refused(tmp_path: Path) -> None:
-    assert "rows of phase contact" in error_of(write(tmp_path, PRESSES[0]))
+    assert "no row has phase contact" in error_of(write(tmp_path, PRESSES[0]))

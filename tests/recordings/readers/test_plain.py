@@ -149,9 +149,12 @@ MISTAKES = {
     "no place": (lambda t: t.drop(columns="x_mm"), "x_mm"),
     "a chip without z": (lambda t: t.drop(columns="Bz1"), "Bz1"),
     "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
-    "no contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
-    "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
-    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse its sign"),
+    "no contact": (lambda t: t[t.phase == "noload"], "no row has phase contact"),
+    "millitesla": (
+        lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}),
+        "convert the fields to uT",
+    ),
+    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse the sign of Fz_N"),
     "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
     "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
     "a press twice": (
@@ -192,7 +195,7 @@ def test_template_of_a_table_is_its_header_line(tmp_path):
     capture = tmp_path / "capture"
     capture.mkdir()
     (capture / plain.CSV).write_text(out.read_text())
-    with pytest.raises(CaptureError, match="rows of phase contact"):
+    with pytest.raises(CaptureError, match="no row has phase contact"):
         plain.read(capture, make_header(layout="table", chips_n=3), DEFAULT_POLICY)
 
 
@@ -226,9 +229,9 @@ def test_table_of_field_changes_instead_of_fields_is_refused(tmp_path):
     assert "A baseline seems to have been subtracted" in error_of(tmp_path)
     rows[columns] = fields_uT / 1000
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "Convert mT or G to uT" in error_of(tmp_path)
+    assert "convert the fields to uT" in error_of(tmp_path)
 
 
 def test_error_says_that_numbers_have_decimal_commas(tmp_path):
     table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
-    assert "semicolons in line 1" in error_of(tmp_path)
+    assert "line 1 contains semicolons" in error_of(tmp_path)

@@ -35,7 +35,7 @@ def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
 
 def test_fields_of_a_skin_are_accepted_only_in_microtesla() -> None:
     check_fields(SKIN_uT, "here", first_line_n=1)
-    with pytest.raises(CaptureError, match="Convert mT or G"):
+    with pytest.raises(CaptureError, match="convert the fields to uT"):
         check_fields(SKIN_uT / 1e3, "here", first_line_n=1)
     with pytest.raises(CaptureError, match="in line 2"):
         check_fields(SKIN_uT * 1e3, "here", first_line_n=1)
@@ -47,12 +47,12 @@ def test_fields_of_a_board_are_accepted_only_in_microtesla(name: str, seed: int)
     b_uT = fields_uT(*BOARDS_uT[name], seed)
     check_fields(b_uT, "here", first_line_n=1)
     for factor in (1e-2, 1e-3, 1e-6, 1e3):
-        with pytest.raises(CaptureError, match=r"^here: field must be .* got .*uT"):
+        with pytest.raises(CaptureError, match="^here: .*field must be .* got .* uT"):
             check_fields(factor * b_uT, "here", first_line_n=1)
 
 
 def test_strong_fields_in_gauss_are_recognised_by_the_step_of_the_chips() -> None:
-    with pytest.raises(CaptureError, match="0.15 to 9.68 uT; got steps of 0.024. Convert G to uT"):
+    with pytest.raises(CaptureError, match="0.15 to 9.68 uT, .*; got 0.024. The unit is probably G"):
         check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
 
 
@@ -72,7 +72,7 @@ def test_recorded_fields_are_accepted_only_in_microtesla(shared_data) -> None:
     assert len(boards) > 6
     for b_uT in boards:
         check_fields(b_uT, "here", first_line_n=1)
-        with pytest.raises(CaptureError, match="G to uT"):
+        with pytest.raises(CaptureError, match="The unit is probably G"):
             check_fields(b_uT / 100, "here", first_line_n=1)
 
 
@@ -86,7 +86,7 @@ def test_forces_are_accepted_only_in_newtons() -> None:
 def test_implausible_forces_are_refused() -> None:
     for fine_N in (np.array([0.0, 0.05, np.nan]), np.zeros(3), np.full(3, np.nan), np.array([[0.1, -1.0, 0.0]])):
         check_touch(fine_N, "here")
-    with pytest.raises(CaptureError, match="^here: force must be .* got 0.0416 at most. Convert kg"):
+    with pytest.raises(CaptureError, match="^here: force must be .* got 0.0416 N at most. If the unit is kg"):
         check_touch(np.array([0.0, -0.0416, np.nan]), "here")
 
 
@@ -97,15 +97,17 @@ def test_places_are_accepted_only_in_millimetres(extent_mm: float, start_mm: flo
     check_places(place_mm, "here")
     for factor in (1e-3, 1e3):
         if extent_mm * factor > 200 or 0.01 < extent_mm * factor < 1:
-            with pytest.raises(CaptureError, match="^here: places must be equal, or spread over 1 to 200 mm"):
+            with pytest.raises(
+                CaptureError, match="^here: places must be all equal, or spread over a range of 1 to 200 mm"
+            ):
                 check_places(factor * place_mm, "here")
 
 
 def test_error_names_the_line_of_a_place_far_from_all_others() -> None:
     place_mm = np.array([[np.nan, np.nan], *([float(i), 2.0] for i in range(19)), [999.0, 2.0]])
-    with pytest.raises(CaptureError, match=r"line 22 \(999, 2 mm\) is far from the others"):
+    with pytest.raises(CaptureError, match=r"line 22 \(999, 2 mm\) is far from the other places"):
         check_places(place_mm, "here", first_line_n=2)
-    with pytest.raises(CaptureError, match="Convert m or um to mm"):
+    with pytest.raises(CaptureError, match="convert the places to mm"):
         check_places(1e3 * place_mm[:20], "here")
 
 
@@ -122,7 +124,7 @@ def test_depths_are_accepted_only_in_millimetres(deepest_mm: float, accepted: bo
     if accepted:
         check_depths(depth_mm, "here")
     else:
-        with pytest.raises(CaptureError, match="^here: depth must be 0.05 to 100 mm where it is greatest"):
+        with pytest.raises(CaptureError, match="^here: the greatest depth must be 0.05 to 100 mm"):
             check_depths(depth_mm, "here")
 
 
