@@ -136,7 +136,9 @@ def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker:
     for name, value in expected.items():
         got = properties.get(name, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
-            raise ParamsError("RESKIN_EXECUTOR", f"{name} of worker {worker}", value, got, f"Restart it. {HELP}")
+            raise ParamsError(
+                "RESKIN_EXECUTOR", f"{name} of worker {worker}", value, got, f"Restart the worker. {HELP}"
+            )
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
@@ -149,7 +151,7 @@ def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> 
     # Dask cancels calls if it loses the scheduler. Calls that `shutdown` cancelled get the same error, because nobody
     # waits for their results.
     if submitted.cancelled():
-        remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
+        remedy = "Finished training runs are cached. Start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return
     error = submitted.exception()

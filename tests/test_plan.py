@@ -121,7 +121,9 @@ def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     (root / SCENES / "mine.yaml").write_text(text)  # This checkout contains no library, and therefore no model.
-    with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
+    with pytest.raises(
+        ParamsError, match=r"universal.safetensors, which is named in section calibrated, was not found"
+    ):
         plan.plan_of(root, ["mine"])
 
 

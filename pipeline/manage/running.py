@@ -16,11 +16,14 @@ def require_idle(root: Path) -> None:
     if users:
         pid = min(users)
         raise ParamsError(
-            f"`dvc repro` runs in this checkout (process {pid}). Nothing was changed: try again when it has ended. "
-            f"If process {pid} is not DVC, delete {DVC_FILES / RWLOCK} first."
+            f"`dvc repro` is running in this checkout (process {pid}), so nothing was changed. Run the command again "
+            f"when `dvc repro` has ended. If process {pid} is not DVC, delete {DVC_FILES / RWLOCK} first."
         )
     if _is_locked(root / DVC_FILES / LOCK):
-        raise ParamsError("`dvc repro` runs in this checkout. Nothing was changed: try again when it has ended.")
+        raise ParamsError(
+            "`dvc repro` is running in this checkout, so nothing was changed. Run the command again when `dvc repro` "
+            "has ended."
+        )
 
 
 def dvc_processes(root: Path) -> dict[int, str]:

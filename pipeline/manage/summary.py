@@ -15,10 +15,10 @@ COMMITTED = "HEAD"
 WIDTH = 100  # columns
 NEXT = (
     ("{page}", "figures and tables; open it in a browser"),
-    ("make ui", "MLflow: every training with its curve, scores and model"),
-    (".venv/bin/reskin live --emulate nominal", "contacts on a simulated board, live"),
-    ("docs/tutorial.md", "in 30 minutes from a simulated board to your own model"),
-    ("docs/add-a-skin.md", "your own boards: reskin new, reskin add, dvc repro"),
+    ("make ui", "MLflow: each training run with its curve, scores and model"),
+    (".venv/bin/reskin live --emulate nominal", "live estimates of contacts on a simulated board"),
+    ("docs/tutorial.md", "from a simulated board to your own model in 30 minutes"),
+    ("docs/add-a-skin.md", "use your own boards: reskin new, reskin add, dvc repro"),
 )
 
 
@@ -59,13 +59,13 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
                     f"Scene {scene} is reproduced: all results from which its report is made equal those in dvc.lock, "
                     f"so DVC kept the report {committed.where}, with {values}."
                 ]
-            return [f"Scene {scene}: reports/{scene} is the report {committed.where}; it was not computed again."]
+            return [f"Scene {scene}: reports/{scene} is still the report {committed.where}; it was not computed again."]
         return [f"Scene {scene} is reproduced: all {values} equal those {committed.where}."]
     return [
         f"Scene {scene} is not reproduced exactly: {_differences(parts)} of {values} differ from those "
         f"{committed.where}.",
         *_probable_reasons(committed.provenance, fresh.provenance),
-        f"All differences: reskin compare {scene}",
+        f"To list all differences: reskin compare {scene}",
     ]
 
 

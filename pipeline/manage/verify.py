@@ -43,7 +43,10 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 def rerun(root: Path, names: Sequence[str]) -> None:
     """Run scenes in a clone of the last commit, and keep the new reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
-        say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit is run")
+        say(
+            f"warning: {len(changed.splitlines())} files differ from the last commit. The files of the last commit are "
+            "used, without these changes."
+        )
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
@@ -88,7 +91,8 @@ def _run(clone: Path, environment: Mapping[str, str], *arguments: str, quiet: bo
             raise
     if process.returncode:
         raise SchemaError(
-            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode})."
+            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode}). The "
+            "messages above say why."
         )
 
 

@@ -224,7 +224,8 @@ def unseen_boards(
         panels[0].set_yticks([*y.values()], [*y])
         test = (
             f"The model was calibrated to {rows[0]['presses_n']} unlabelled presses of the board. Labels are at random "
-            f"places, tests at other places. Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
+            "places, tests at other places. "
+            f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
         )
         title = f"Boards never seen in training ({source}):{' ' if large else chr(10)}each mark is one board"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)

@@ -66,8 +66,8 @@ RECORDED_METRICS = {
 }  # fmt: skip
 RECORDED_MEANING = (
     "Scene `{scene}`, code {code}. Each cell has the mean of both boards, then (board 1; board 2). All numbers are "
-    "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to {presses_n} "
-    "presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
+    "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to "
+    "{presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene

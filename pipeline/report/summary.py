@@ -23,7 +23,7 @@ def summarise(numbers: Numbers) -> list[str]:
         lines = [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
     elif numbers.get("table2"):
         rows = _rows_of_table_2(numbers)
-        paper = " (in parentheses: the paper's means, on recorded boards)" if "(" in str(rows[1:]) else ""
+        paper = " (in parentheses: the paper's, on recorded boards)" if "(" in str(rows[1:]) else ""
         lines = [f"{data} boards not seen in training: means{paper}", *_table(rows), MEANING]
     else:
         return []

@@ -223,7 +223,7 @@ def publish(settings: Settings, indentations: Path, models: Path, results: Path,
         found = published_results(scene, name, indentations, models, results, reports)
         say(write_scene(found, experiment, home(), register=not is_experiment()))
     except TrackingUnavailable as error:
-        say(f"warning: {name} is not in MLflow: {error}")
+        say(f"warning: the results of scene {name} were not written to MLflow: {error}")
 
 
 def published_results(
@@ -271,8 +271,10 @@ def planned_scene(settings: Settings) -> Scene:
     if list(scene.experiments) != list(planned):
         in_one_only = ", ".join(sorted(set(scene.experiments) ^ set(planned)))
         difference = f"{in_one_only} only in one of them" if in_one_only else "their order"
-        remedy = f"Try: reskin scenes use {settings.scene}, followed by the other scenes of the plan."
-        raise ParamsError(f"{settings.where}: experiments differ from those in {PLAN}: {difference}. {remedy}")
+        remedy = f"Try: reskin scenes use {settings.scene}, followed by the names of the other scenes in the plan."
+        raise ParamsError(
+            f"{settings.where}: the experiments of the scene differ from those in {PLAN}: {difference}. {remedy}"
+        )
     return scene
 
 
