@@ -23,7 +23,10 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = (
+    20.0,
+    60.0,
+)  # these are long, because a worker imports modules for several seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 # Suffixes of the files that must be equal on all machines. Files of settings may differ, because settings are sent with
@@ -39,7 +42,8 @@ def _version(library: str) -> str:
         return "none"
 
 
-# Computed at import: if a file is edited while a worker runs, the worker still uses the code that it imported.
+# This is computed when the module is imported, because a worker continues to use the code that it has imported, even if
+# the files are edited later.
 IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
     name: _version(name) for name in LIBRARIES
 }
@@ -82,7 +86,7 @@ def run_on_worker(folder: str, expected: Mapping[str, str], call: Callable[[], A
     The worker is compared with `expected` again, because it may have joined after `_check_workers`.
     """
     _compare(expected, describe_process(), f"process {os.getpid()}")
-    os.chdir(folder)  # safe, because a worker has one thread
+    os.chdir(folder)  # this affects no other call, because a worker has one thread
     return call()
 
 

@@ -156,7 +156,7 @@ def _keep_outputs(root: Path) -> None:
     """
     if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
         return
-    from dvc.exceptions import DvcException  # imported late: the import takes a second
+    from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo
 
     with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start here, it cannot delete outputs

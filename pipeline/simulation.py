@@ -29,7 +29,7 @@ def simulation_settings(settings: Settings) -> SimulationSettings:
 def check_protocols(simulation: SimulationSettings, where: str) -> None:
     """Raise `ParamsError` if an experiment cannot use one of the protocols; the error names `where`."""
     main = simulation.main.boards
-    if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
+    if simulation.main_boards.skin_mm != SKIN_MM:  # the studies of the physics assume the size of the authors' skin
         rule = f"skin_mm of the boards of protocol {MAIN} must be {list(SKIN_MM)}"
         raise ParamsError(f"{where}: {rule}. Correct skin_mm of these boards.")
     for name, protocol in simulation.protocols.items():

@@ -29,7 +29,7 @@ METHODS = {
     "triplet": "network + triplet",
     "adapt": "network, adapted",
 }  # names of methods by experiment; "network" for all other experiments
-CONFIDENCE = 0.95  # confidence level of intervals; convention
+CONFIDENCE = 0.95  # confidence level of intervals; the usual convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors

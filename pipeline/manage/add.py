@@ -214,7 +214,7 @@ def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any
     """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
-        find_departure,  # imported late: importing the physics takes seconds
+        find_departure,  # imported here, because importing the physics takes seconds
     )
     from reskin.physics.skin import SkinDesign
 
@@ -287,7 +287,7 @@ def _remove_files(target: Path) -> None:
 
 def _track(folder: Path, root: Path) -> None:
     """Track a folder with DVC like `dvc add`, but in this process, because starting another process takes seconds."""
-    from dvc.exceptions import DvcException  # imported late: the import takes a second
+    from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo
 
     try:

@@ -137,7 +137,9 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
         before, after = _label_rows([] if old is MISSING else old, [] if new is MISSING else new)
         for label in {**before, **after}:
             yield from _pairs(before.get(label, MISSING), after.get(label, MISSING), f"{name}[{label}]")
-    elif any(isinstance(value, Mapping | list) for value in present):  # a mapping or list on one side only
+    elif any(
+        isinstance(value, Mapping | list) for value in present
+    ):  # only one of the two values is a mapping or a list
         yield from _pairs(old, MISSING, name)
         yield from _pairs(MISSING, new, name)
     else:

@@ -28,7 +28,11 @@ from reskin.errors import ParamsError
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
 REPORTS = "reports/"  # our version of reports is kept until the next `dvc repro` writes them again
-SIDES = ("1", "2", "3")  # git's numbers for the three versions of a file in conflict: base, ours and theirs
+SIDES = (
+    "1",
+    "2",
+    "3",
+)  # git's numbers of the three versions of a file in conflict: the common ancestor, ours, and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
@@ -127,7 +131,7 @@ def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
 
 def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
     """Merge the versions of dvc.lock; return the names of stages that both sides changed."""
-    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported late: the import takes a second
+    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported here, because the import takes a second
 
     base, ours, theirs = _versions(root, blobs)
     stages, both = merge_stages(*(content.get("stages", {}) for content in (base, ours, theirs)))

@@ -13,7 +13,9 @@ from reskin.recordings.header import NAME
 from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
 from reskin.universal.model import FILE
 
-POOL_MAX_N = 40  # largest number of indentations that may be labelled, as in scene lab
+POOL_MAX_N = (
+    40  # largest number of indentations of a held-out skin for calibration; scene lab also uses at most 40 labels
+)
 LABELS_N = (0, 5, 10, 20, 40)
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\

@@ -46,14 +46,14 @@ def _is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # a process of another user
+        return True  # the process exists, but belongs to another user
     return True
 
 
 def _is_locked(file: Path) -> bool:
     if not file.exists():
         return False
-    from zc.lockfile import LockError, LockFile  # imported late: a dependency of DVC
+    from zc.lockfile import LockError, LockFile  # a dependency of DVC; imported here, because it is rarely needed
 
     try:
         LockFile(str(file)).close()

@@ -12,7 +12,7 @@ from pipeline.report.summary import summarise
 from reskin.errors import SchemaError
 
 COMMITTED = "HEAD"
-WIDTH = 100  # columns
+WIDTH = 100  # largest number of characters in a line
 NEXT = (
     ("{page}", "figures and tables; open it in a browser"),
     ("make ui", "MLflow: each training run with its curve, scores and model"),
@@ -48,7 +48,7 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
     """Say in sentences whether a report equals the committed one."""
     try:
         committed = read_revision(root, scene, COMMITTED)
-    except SchemaError:  # a scene of the user
+    except SchemaError:  # the report was never committed, for example because the scene is new
         return [f"Scene {scene}: its report is not committed, so there is nothing to compare it with."]
     parts = compare_reports(committed, fresh)
     values = f"{sum(part.compared_n for part in parts.values()):,} numbers and table cells"

@@ -22,7 +22,11 @@ from reskin import io
 from reskin.errors import SchemaError
 
 VERIFIED = ".reskin/verified"  # reports of the last reruns, for inspection and for `--against` on another machine
-QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as in the Makefile
+QUIET = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DVC_NO_ANALYTICS": "1",
+    "OMP_NUM_THREADS": "1",
+}  # the Makefile sets the same variables
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
@@ -51,7 +55,7 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
         _bring_recordings(root, clone, names)
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # for stages, which call `python`
         environment = {**QUIET, **os.environ, PUBLISH: "0", "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:

@@ -24,7 +24,9 @@ from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE
 
 PLACE, FORCE = "place", "force"
 YES, PARTLY, NO, UNTESTED = "yes", "partly", "no", "not tested"
-PLACE_PARTLY_PCT = 50.0  # assumed; the paper requires `PLACE_ACCURACY_MIN_PCT`
+PLACE_PARTLY_PCT = (
+    50.0  # assumed limit for "partly"; the limit for "yes" is the paper's requirement `PLACE_ACCURACY_MIN_PCT`
+)
 FORCE_YES_R2, FORCE_PARTLY_R2 = 0.9, 0.5  # assumed; the paper states no requirement for the force on a new skin
 LEVELS = (
     f"For places, the answer is yes if at least {PLACE_ACCURACY_MIN_PCT:g} % of the readings are within 1 mm in x and "
@@ -39,7 +41,7 @@ IN_BRACKETS = (
     "interval, and (a; b) are the values of the boards. ± is the standard deviation over pairs of a training skin and "
     "a tested skin."
 )
-SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the root of each squared error
+SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the square root of each mean squared error
 UNIVERSAL = "universal, "  # prefix of the methods in `labels` that are calibrated to the tested skin
 NOTHING, UNLABELLED = "none", "presses without labels"
 NONE_HELD_OUT = "no board held out"

@@ -33,7 +33,7 @@ SIGNIFICANT = 0.05  # convention: a claim of the family is significant if its ad
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less than this, in percentage points
 NONE = "–"
 NOT_RUN = "not run in this scene"
-NOT_REACHED = "not reached in this scene"
+NOT_REACHED = "the experiment of this scene is too small for this result"
 SHORT_OF = "smaller than the paper's: "  # prefix of a note on the size of our experiment
 ONE_SKIN = "not comparable with the paper, because each of our networks was trained on only one skin"
 SETTING = "a setting of this scene, not a result"
@@ -43,7 +43,7 @@ EQUIVALENT = (
 )
 # Paths of results that are comparable with the paper only if networks were trained on several skins.
 NEEDS_POOLING = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")
-# Verdicts on numbers: whether our interval over boards includes the paper's mean.
+# Verdicts on numbers. They say whether our interval over boards includes the paper's mean.
 AGREES, DIFFERS = "within interval", "significant difference"
 NO_INTERVAL = "not judged (no interval over boards)"
 DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules for differences, which are shown with a sign
@@ -76,7 +76,7 @@ class Reach(Strict):
 
     paper: str
     ours: str
-    of: str  # what is counted
+    of: str  # name of what is counted, for example "training readings"
 
 
 class Row(Strict):

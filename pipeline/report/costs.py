@@ -120,7 +120,7 @@ class Point:
 
     name: str
     label: str
-    position: tuple[float, float]  # cost, error
+    position: tuple[float, float]  # (cost, error)
     look: Mapping[str, Any]
 
 

@@ -51,7 +51,7 @@ UNBROKEN = re.compile(rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+
 SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-LONG = 40  # characters; a column with a longer cell is wide
+LONG = 40  # a column with a cell of more characters than this is wide
 NO_VALUE = ("–", "")  # cells that are hidden if the rows of a table are stacked
 # Widths in rem, which estimate the width of a table. If a table is wider than its place on the screen, its rows are
 # stacked, with the cells of each row below each other.

@@ -25,7 +25,13 @@ from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
-TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
+TABLES = (
+    "table2",
+    "claims",
+    "manual",
+    "flexible",
+    "single_sensor",
+)  # tables of simulated scenes that docs/results.md shows
 COMPARED = ("compare", "compare_parameters", "compare_frames")
 MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
@@ -69,7 +75,7 @@ RECORDED_MEANING = (
     "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to "
     "{presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
-FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
+FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 

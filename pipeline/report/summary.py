@@ -11,7 +11,10 @@ SHORT_TITLES = {
 MEANING = "R² of F is 1 for exact forces, and 0 for the mean force. Intervals are on the report page."
 RECORDED = "Recorded"
 LABELLED = ("accuracy_pct", "r2_f")  # metrics that are shown for methods that use labels
-CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of names: shown methods, and methods that are not shown
+CALIBRATED, REFERENCE = (
+    "universal",
+    "universal map",
+)  # names of methods that are shown start with the first prefix, but not with the second
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 
 

@@ -88,7 +88,9 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     io.write_json(reports / "numbers.json", shared)
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
-    with make_executor(imports="pipeline.report.experiments") as executor:  # drawing takes most of the time
+    with make_executor(
+        imports="pipeline.report.experiments"
+    ) as executor:  # figures are drawn in parallel, because drawing takes most of the time
         figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
         costs_future = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
