@@ -103,7 +103,7 @@ def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/
     known = scene_names(root)
     if name not in known:
         guess = did_you_mean(name, known)
-        raise ParamsError(f"there is no scene {name}.{guess} The scenes are: {', '.join(known)}. {remedy}")
+        raise ParamsError(f"no scene {name}.{guess} The scenes are: {', '.join(known)}. {remedy}")
     return root / SCENES / f"{name}.yaml"
 
 

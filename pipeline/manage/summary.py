@@ -15,7 +15,7 @@ COMMITTED = "HEAD"
 WIDTH = 100  # largest number of characters in a line
 NEXT = (
     ("{page}", "figures and tables; open it in a browser"),
-    ("make ui", "MLflow: each training run with its curve, scores and model"),
+    ("make ui", "MLflow: all training runs with curves, scores and models"),
     (".venv/bin/reskin live --emulate nominal", "live estimates of contacts on a simulated board"),
     ("docs/tutorial.md", "from a simulated board to your own model in 30 minutes"),
     ("docs/add-a-skin.md", "use your own boards: reskin new, reskin add, dvc repro"),
