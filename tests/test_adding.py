@@ -434,7 +434,7 @@ def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root_with_code, l
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
     invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
-    assert "--scene: a name must be 1 to 64 of" in invalid
+    assert "--scene: a name must be 1 to 64 characters of" in invalid
     assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
     assert contents(root_with_code) == before
     run(root_with_code, "reskin", *arguments, "small")
