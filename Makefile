@@ -1,16 +1,16 @@
-# make repro   everything from scratch: the environment, then `dvc repro` for the scenes of pipeline/plan.yaml
-# make test    lint, types, layers, tests
+# make repro   installs the environment, then runs `dvc repro` for the scenes in pipeline/plan.yaml
+# make test    checks the style, the types and the imports between packages, then runs the tests
 # make test-pythons   make test on each supported Python that is installed, each in an environment of its own
 # make test-processors   checks that training gives the same bits on emulated Intel and AMD processors (needs qemu-user)
-# make ui      the MLflow UI on the embedded store
-# make bench   benchmarks at full size (the tests run each at a tiny size), and slow tests
-# make faults   injects every fault for real (Linux; mounts need root) -> docs/faults.md
+# make ui      starts the MLflow UI, which shows the runs that are stored in this checkout
+# make bench   runs the benchmarks at full size (`make test` runs each of them at a tiny size), and slow tests
+# make faults   causes real faults and checks the messages and results (Linux; mounts need root) -> docs/faults.md
 # make time-repro   times `make repro` in a fresh clone (three runs of its stages) -> reports/time.json
 # make constraints   finds the newest compatible versions -> constraints.txt; then run make test, and commit
 # make licences   lists the licences of all installed packages; fails if one is not compatible
 # make audit   lists known vulnerabilities of the versions in constraints.txt, according to pypi.org
 # make time-install   installs the wheel in an empty environment: measures time and size, and opens `reskin live`
-# make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   MLflow on PostgreSQL, until Ctrl-C
+# make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   starts an MLflow server on PostgreSQL; Ctrl-C stops it
 # make teams   tests the workflows of a team, on servers that it starts and stops -> docs/measured/teams.md
 # make cluster-test   runs a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
 # make clean   removes the files made by the targets above, except data and results
@@ -48,7 +48,7 @@ repro: $(STAMP)
 	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage report if all results equal those in dvc.lock
 	@$(BIN)/reskin summary
 
-# Three workers, for two cores or more: tests of live boards mostly wait.
+# Three workers are used even on two cores, because tests of live boards wait for most of their time.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 lint compiled collected
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
@@ -60,7 +60,8 @@ test-pythons:
 		else echo "python$$version is not installed: not tested"; fi; \
 	done
 
-# Trains tiny networks on processors that QEMU emulates: weights must equal those from this processor. Needs qemu-user.
+# Trains tiny networks on processors that QEMU emulates. Their weights must equal those of networks that are trained on
+# this processor. Needs qemu-user.
 test-processors: $(STAMP)
 	$(BIN)/python -m tests.arithmetic Haswell-v2 Skylake-Client-v1 EPYC-v1
 
@@ -84,15 +85,17 @@ ui: $(STAMP)
 bench: $(STAMP)
 	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py tests/test_tutorial.py -s -q -p no:xdist
 
-# Kills, full disks, truncated files, dead servers: each fault is injected into a copy of a small finished checkout.
+# Causes faults such as killed processes, full disks, truncated files and dead servers, each in a copy of a small
+# checkout whose stages have run.
 faults: $(STAMP)
 	$(BIN)/python -m tests.faults
 
-# Time and disk space that a newcomer needs: a fresh clone, its stages run three times without any cache.
+# Measures the time and the disk space that a newcomer needs: makes a fresh clone, and runs its stages three times
+# without any cache.
 time-repro:
 	$(PYTHON) tests/benchmarks/time_repro.py --times 3
 
-# Time and disk space that somebody with a board and only Python needs.
+# Measures the time and the disk space that somebody needs who has a board and Python, but no clone.
 time-install:
 	$(PYTHON) tests/benchmarks/time_install.py --constraint constraints.txt
 
@@ -102,7 +105,7 @@ constraints: $(STAMP)
 licences: $(STAMP)
 	$(BIN)/python -m release.licences
 
-# It uses a separate environment, because the auditing tool is not a dependency of the project.
+# The audit uses a separate environment, because its tool is not a dependency of the project.
 audit:
 	$(PYTHON) -m venv .audit
 	.audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit

@@ -54,24 +54,33 @@ def checked_plan() -> "Plan":
 def new(
     scene: Annotated[str, Argument(help="Name of the new scene.")],
     boards: Annotated[str, Option(help="Names of your boards, separated by commas: b1,b2,b3.")],
-    presses_n: Annotated[int, Option("--presses", help="Indentations of each skin in one pass.", min=4)],
+    presses_n: Annotated[
+        int,
+        Option("--presses", help="Number of indentations of each skin in one pass over all places.", min=4),
+    ],
     passes_n: Annotated[
-        int, Option("--passes", help="How often each skin is pressed at all places, one pass after the other.", min=1)
+        int, Option("--passes", help="Number of passes: how often each skin is pressed at all places.", min=1)
     ] = 1,
     layout: Annotated[
         str | None,
         Option(
             help="Layout of your boards, which states where the chips are: reskin (the paper's board), anyskin, "
             "eflesh, or a YAML file, which is copied into the scene's file. Default: the layout of the paper's board "
-            "is written into the scene's file, and you edit it there."
+            "is written into the scene's file, where you can change it to the layout of your boards."
         ),
     ] = None,
     simulated: Annotated[
         bool,
-        Option("--simulated", help="The recordings will be of emulated boards, made by `reskin record --simulated`."),
+        Option(
+            "--simulated",
+            help="State that the recordings will come from emulated boards (`reskin record --simulated`).",
+        ),
     ] = False,
 ) -> None:
-    """Write a scene for two or more boards of your own, each of which is held out in turn."""
+    """Write a scene for two or more boards of your own.
+
+    Each board is held out in turn: networks are trained on the other boards and tested on this one.
+    """
     from pipeline.manage import new as creating
 
     names = [name.strip() for name in boards.split(",") if name.strip()]
@@ -83,32 +92,48 @@ def new(
 @app.command(rich_help_panel=RECORDINGS)
 def add(
     recordings: Annotated[
-        list[Path], Argument(metavar="RECORDING...", help="Files or folders, depending on the layout.")
+        list[Path],
+        Argument(metavar="RECORDING...", help="Files or folders of recordings; --layout determines which."),
     ],
     layout: Annotated[Layout, Option(help=LAYOUT)],
     scene: Annotated[str, Option(help="Scene to add the recordings to.")],
     board: Annotated[
-        str | None, Option(help="Name of the circuit board. Default: from the name of each file, BOARD_SKIN.csv.")
+        str | None,
+        Option(help="Name of the circuit board. Default: the first part of the name of each file, BOARD_SKIN.csv."),
     ] = None,
     skin: Annotated[
         str | None,
-        Option(help="Name of the skin; a skin that moved to another board needs a new name. Default: BOARD_SKIN."),
+        Option(
+            help="Name of the skin. A skin that was moved to another board needs a new name. Default: BOARD_SKIN, from "
+            "the name of each file."
+        ),
     ] = None,
     like: Annotated[
         str | None,
-        Option(help="If the scene is new: name of the recorded scene (ini, lab, ...) whose settings are copied."),
+        Option(
+            help="Create the scene as a copy of this recorded scene (ini, lab, ...), with the same settings. Only if "
+            "the scene does not exist yet."
+        ),
     ] = None,
-    name: Annotated[str | None, Option(help="Name of the capture. Default: board and skin.")] = None,
-    probe: Annotated[Path | None, Option(help="Layouts capture, serial-*: log of the robot (CSV).")] = None,
+    name: Annotated[
+        str | None,
+        Option(help="Name of the recording in the scene. Default: the name is made from the board and the skin."),
+    ] = None,
+    probe: Annotated[
+        Path | None, Option(help="Layouts capture, serial-*: CSV log of the robot, with the places that it presses.")
+    ] = None,
     chips_n: Annotated[
-        int | None, Option("--chips", help="Layouts serial-*: chips in a frame. Default: 5.", min=1, max=64)
+        int | None, Option("--chips", help="Layouts serial-*: number of chips in a frame. Default: 5.", min=1, max=64)
     ] = None,
     rate_hz: Annotated[
         float | None, Option("--rate-hz", help="Layouts serial-*: frames per second. Default: 400.")
     ] = None,
     wire: Annotated[
         Wire | None,
-        Option(help="Layouts serial-*: wire format. Default: binary for serial-binary, text-xyzt for serial-text."),
+        Option(
+            help="Layouts serial-*: format in which the board sent the readings. Default: binary for serial-binary, "
+            "text-xyzt for serial-text."
+        ),
     ] = None,
     mark: Marks = None,
     rows_late: Annotated[
@@ -124,14 +149,25 @@ def add(
         Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
     ] = None,
     pad: Annotated[
-        int | None, Option(help="Layout leaphand: number of the pad, counted from 1. Add each pad separately.", min=1)
+        int | None,
+        Option(
+            help="Layout leaphand: number of the pad whose readings are added, counted from 1. Add each pad with a "
+            "command of its own.",
+            min=1,
+        ),
     ] = None,
     allow_copy: Annotated[
         bool,
-        Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
+        Option(
+            "--allow-copy",
+            help="Also accept readings that are already in the scene with the name of another board or skin.",
+        ),
     ] = False,
 ) -> None:
-    """Add recordings to a scene. If one recording is refused, none is added. The next `dvc repro` uses them."""
+    """Add recordings to a scene, so that the next `dvc repro` uses them.
+
+    If one of the recordings cannot be added, none of them is added.
+    """
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.scenes import read_plan
@@ -178,7 +214,10 @@ def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None
     """Raise `ParamsError` if an option that names or describes one recording is given with several recordings."""
     given = [option for option, value in options.items() if value is not None]
     if len(recordings) > 1 and given:
-        raise ParamsError(f"{given[0]} is for one recording, but there are {len(recordings)}. Add them one by one.")
+        raise ParamsError(
+            f"{given[0]} is for one recording, but there are {len(recordings)}. Add each recording with a command of "
+            "its own."
+        )
 
 
 def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
@@ -196,7 +235,10 @@ def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) 
 def fetch(
     source: Annotated[
         str | None,
-        Argument(help="Set of recordings: lab, ini, eflesh, eflash7 or leaphand. Default: describe all sets."),
+        Argument(
+            help="Name of a set of recordings: lab, ini, eflesh, eflash7 or leaphand. Default: nothing is fetched, and "
+            "all sets are described."
+        ),
     ] = None,
     origin: Annotated[
         str | None,
@@ -208,7 +250,7 @@ def fetch(
     ] = None,
     yes: Annotated[bool, Option("--yes", help="Do not ask before using data that has no licence.")] = False,
 ) -> None:
-    """Fetch public recordings, verify them, and add them to a scene."""
+    """Fetch public recordings, check that the files are complete and unchanged, and add them to a scene."""
     from pipeline.manage import fetch as fetching
 
     def agree(question: str) -> bool:
@@ -219,10 +261,10 @@ def fetch(
 
 @app.command(rich_help_panel=RECORDINGS)
 def remove(
-    scene: Annotated[str, Argument(help="Scene of the capture.")],
-    capture: Annotated[str, Argument(help="Name of the capture, as in data/captures.yaml.")],
+    scene: Annotated[str, Argument(help="Name of the scene that contains the recording.")],
+    capture: Annotated[str, Argument(help="Name of the recording in the scene, as in data/captures.yaml.")],
 ) -> None:
-    """Remove a recorded capture from a scene."""
+    """Remove a recording from a scene, and delete its files from the checkout."""
     from pipeline.manage import add as adding
 
     adding.remove(ROOT, scene, capture)
@@ -242,7 +284,10 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write to MLflow the training runs and reports that it lacks, for example because its server was unreachable."""
+    """Write to MLflow the training runs and reports that are missing there.
+
+    They are missing, for example, if the MLflow server could not be reached when they were computed.
+    """
     from pipeline.scenes import read_scene
     from pipeline.stages.report import published_results, write_scene
 
@@ -253,7 +298,9 @@ def publish() -> None:
         missing = [path for path in (*models.values(), *written) if not path.exists()]
         if missing:
             path = missing[0].relative_to(ROOT)
-            typer.echo(f"scene {name}: {path} is missing, so nothing is uploaded. To compute all results: dvc repro")
+            typer.echo(
+                f"scene {name}: {path} is missing, so nothing is written to MLflow. To compute all results: dvc repro"
+            )
             continue
         folders = (ROOT / "data/indentations" / name, ROOT / "data/models" / name, results, ROOT / "reports" / name)
         typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))
@@ -275,7 +322,7 @@ def compare(
 def summary(
     scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
 ) -> None:
-    """Print the main scores, whether they equal the committed ones, and where to look next."""
+    """Print the main scores, say whether they equal the committed scores, and name pages and commands to go on with."""
     from pipeline.manage.summary import print_summary
 
     print_summary(ROOT, [scene] if scene else list(checked_plan().scenes), typer.echo)
@@ -288,14 +335,15 @@ def score(
         bool,
         Option(
             "--enter",
-            help="Write the scores to benchmark/entries, as an entry of the benchmark. Needs --method, --by, "
-            "--trained-on and --code.",
+            help="Also write the scores to benchmark/entries, as an entry of the benchmark. Options --method, --by, "
+            "--trained-on and --code must then be given.",
         ),
     ] = False,
     method: Annotated[str | None, Option(help="Name of your method.")] = None,
     by: Annotated[str | None, Option(help="Names of the authors.")] = None,
     trained_on: Annotated[
-        str | None, Option(help="Data on which your method was trained, such as: labels, or other boards.")
+        str | None,
+        Option(help='Data on which your method was trained, such as "labels" or "other boards".'),
     ] = None,
     code: Annotated[str | None, Option(help="Where your code or paper is, such as a URL.")] = None,
     data: Annotated[
@@ -317,11 +365,15 @@ def score(
 @app.command(rich_help_panel=PIPELINE)
 def verify_reports(
     names: Annotated[
-        list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
+        list[str] | None,
+        Argument(metavar="[SCENE]...", help="Names of scenes. Default: all scenes that `dvc repro` runs."),
     ] = None,
     against: Annotated[
         Path | None,
-        Option(help="Folder with the reports of an earlier rerun. If it is given, the scenes are not run again."),
+        Option(
+            help="Folder with reports of scenes that were run again before. If this option is given, the scenes are "
+            "not run, and these reports are compared."
+        ),
     ] = None,
 ) -> None:
     """Run scenes again in a fresh clone of the last commit, and compare their reports with the committed reports.
@@ -335,7 +387,7 @@ def verify_reports(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def check_cache() -> None:
-    """Verify the files in DVC's cache and move damaged ones aside; `dvc repro` then regenerates them."""
+    """Look for damaged files in DVC's cache, move them out of the cache, and print how to restore them."""
     from pipeline.manage import cache
 
     sys.exit(cache.check(ROOT, typer.echo))
@@ -344,7 +396,7 @@ def check_cache() -> None:
 @app.command(rich_help_panel=MAINTENANCE)
 def readme(
     check: Annotated[
-        bool, Option("--check", help="Write nothing. The exit status is 1 if a page is out of date.")
+        bool, Option("--check", help="Write nothing; exit with status 1 if a page is out of date.")
     ] = False,
 ) -> None:
     """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
@@ -352,7 +404,7 @@ def readme(
 
     changed, scenes_shown = fill_pages(ROOT, write=not check)
     if check and changed:
-        typer.echo(f"out of date: {', '.join(changed)}; run: reskin readme", err=True)
+        typer.echo(f"out of date: {', '.join(changed)}; to write them again: reskin readme", err=True)
         sys.exit(1)
     typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(scenes_shown)}")
 
@@ -368,8 +420,12 @@ def list_scenes() -> None:
 
 
 @scenes.command()
-def use(names: Annotated[list[str], Argument(help="Names of the scenes. All other scenes no longer run.")]) -> None:
-    """Set the scenes that `dvc repro` runs."""
+def use(
+    names: Annotated[
+        list[str], Argument(help="Names of the scenes that `dvc repro` runs from now on. It runs no other scenes.")
+    ],
+) -> None:
+    """Choose the scenes that `dvc repro` runs."""
     from pipeline import plan
     from pipeline.manage import tidy as tidying
 
@@ -378,7 +434,10 @@ def use(names: Annotated[list[str], Argument(help="Names of the scenes. All othe
     for sentence in plan.unused_settings(ROOT, names):
         typer.echo(f"note: {sentence}")
     if stale := tidying.stale_outputs(ROOT, checked_plan()):
-        typer.echo(f"files of stages that no longer run: {', '.join(stale)}; `reskin scenes tidy` removes them")
+        typer.echo(
+            f"There are still results of stages that no longer run: {', '.join(stale)}. To delete them: reskin scenes "
+            "tidy"
+        )
 
 
 @scenes.command()
@@ -395,7 +454,7 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check the settings of the planned scenes and params.yaml, and whether pipeline/plan.yaml is up to date."""
+    """Check the settings of the scenes that `dvc repro` runs, and whether pipeline/plan.yaml is up to date."""
     from pipeline import plan
 
     names = list(checked_plan().scenes)
@@ -409,16 +468,22 @@ def make_model(
     layout: Annotated[
         Path,
         Option(
-            help="Layout of your board: a YAML file in the form of reskin/universal/layouts/reskin.yaml, or the YAML "
-            "file of a scene with a layout, or one of the names reskin, anyskin, eflesh."
+            help="Layout of your board: a YAML file like reskin/universal/layouts/reskin.yaml, or the YAML file of a "
+            "scene that contains a layout, or one of the names reskin, anyskin, eflesh."
         ),
     ],
     out: Annotated[
         Path,
-        Option(help="File to which the model is written (.safetensors). Its description is written beside it (.json)."),
+        Option(
+            help="File to which the model is written (.safetensors). A description of the model is written to a .json "
+            "file with the same name."
+        ),
     ],
 ) -> None:
-    """Simulate skins on your board and train a universal model for it. Takes a few minutes; needs PyTorch."""
+    """Simulate skins on your board, and train a universal model for it.
+
+    This takes a few minutes and needs PyTorch.
+    """
     from pipeline.training import shipping
 
     shipping.make(layout, out, typer.echo)

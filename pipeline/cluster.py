@@ -23,7 +23,10 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = (
+    20.0,
+    60.0,
+)  # these are long, because a worker imports modules for several seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 # Suffixes of the files that must be equal on all machines. Files of settings may differ, because settings are sent with
@@ -39,7 +42,8 @@ def _version(library: str) -> str:
         return "none"
 
 
-# Computed at import: if a file is edited while a worker runs, the worker still uses the code that it imported.
+# This is computed when the module is imported, because a worker continues to use the code that it has imported, even if
+# the files are edited later.
 IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
     name: _version(name) for name in LIBRARIES
 }
@@ -82,7 +86,7 @@ def run_on_worker(folder: str, expected: Mapping[str, str], call: Callable[[], A
     The worker is compared with `expected` again, because it may have joined after `_check_workers`.
     """
     _compare(expected, describe_process(), f"process {os.getpid()}")
-    os.chdir(folder)  # safe, because a worker has one thread
+    os.chdir(folder)  # this affects no other call, because a worker has one thread
     return call()
 
 
@@ -136,7 +140,9 @@ def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker:
     for name, value in expected.items():
         got = properties.get(name, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
-            raise ParamsError("RESKIN_EXECUTOR", f"{name} of worker {worker}", value, got, f"Restart it. {HELP}")
+            raise ParamsError(
+                "RESKIN_EXECUTOR", f"{name} of worker {worker}", value, got, f"Restart the worker. {HELP}"
+            )
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
@@ -149,7 +155,7 @@ def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> 
     # Dask cancels calls if it loses the scheduler. Calls that `shutdown` cancelled get the same error, because nobody
     # waits for their results.
     if submitted.cancelled():
-        remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
+        remedy = "Finished training runs are cached. Start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return
     error = submitted.exception()

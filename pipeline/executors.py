@@ -49,7 +49,7 @@ def _workers_n(default: str) -> int:
     kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
         rule = "processes:N with N >= 1, here, or dask:ADDRESS"
-        raise ParamsError(VARIABLE, "the executor", rule, repr(name), "Unset it to use two processes.")
+        raise ParamsError(VARIABLE, "the executor", rule, repr(name), f"Unset {VARIABLE} to use two processes.")
     return int(count)
 
 

@@ -17,8 +17,8 @@ from reskin.errors import ParamsError, did_you_mean
 from reskin.recordings.header import NAME
 
 HEADER = """\
-# Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
-# data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
+# The scenes that `dvc repro` runs, and the items (scenes, captures or folders) for which each stage of dvc.yaml runs.
+# Do not edit: `reskin scenes use` and `reskin add` write this file from pipeline/scenes and data/captures.yaml.
 """
 MANY_N = 30  # recorded scenes with more captures than this are ingested by a single stage (docs/growth.md)
 NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the robot; their experiments read the raw captures
@@ -37,13 +37,16 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
         if scene.simulate is None and not captures[name]:
-            remedy = f"Try: reskin add RECORDING --scene {name} ..."
+            remedy = f"Add recordings to the scene: reskin add RECORDING --scene {name} ..."
             raise ParamsError(f"scene {name} has no recorded captures. {remedy}")
     many = [name for name in scenes if len(captures[name]) > MANY_N]
     pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
-        raise ParamsError("stage ingest: two captures have the same SCENE-CAPTURE name. Rename a scene.")
+        raise ParamsError(
+            "stage ingest: two captures have the same name, which is made from scene and capture (SCENE-CAPTURE). "
+            "Rename one of the scenes."
+        )
     simulate: dict[str, dict[str, str]] = {}
     ingest_simulated: dict[str, str] = {}
     for name, scene in scenes.items():
@@ -53,8 +56,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
                 continue
             folder = _folder(name, protocol)
             if folder in simulate or (folder in scenes and folder != name):
-                what = f"protocol {protocol} has the same folder, {folder}, as another scene or protocol"
-                raise ParamsError(f"scene {name}: {what}. Rename one of them.")
+                what = f"protocol {protocol} would use folder {folder}, which another scene or protocol uses too"
+                raise ParamsError(f"scene {name}: {what}. Rename one of the two.")
             simulate[folder] = {"scene": name, "protocol": protocol}
             if settings.kind not in NOT_INGESTED:
                 ingest_simulated[folder] = name
@@ -91,7 +94,7 @@ def _folder(scene: str, protocol: str) -> str:
 
 def scene_names(root: Path) -> list[str]:
     if not (root / SCENES).is_dir():
-        raise ParamsError(f"{root / SCENES}: folder not found. Run this in the checkout.")
+        raise ParamsError(f"{root / SCENES}: folder not found. Run the command in the folder of the checkout.")
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 
@@ -115,11 +118,12 @@ def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
         yield
         return
     if not re.fullmatch(NAME, name):
-        raise ParamsError("--scene", "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
+        rule = "1 to 64 characters of A-Z a-z 0-9 _ -"
+        raise ParamsError("--scene", "a name", rule, repr(name), "Choose another name.")
     original = scene_file(root, like)
     target = original.with_name(f"{name}.yaml")
     if target.exists():
-        remedy = "Omit --like to add the recording to it."
+        remedy = "To add the recording to this scene, omit --like."
         raise ParamsError(f"--like {like}: scene {name} exists already. {remedy}")
     lines = original.read_text(encoding="utf-8").splitlines(keepends=True)
     first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
@@ -152,7 +156,7 @@ def _keep_outputs(root: Path) -> None:
     """
     if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
         return
-    from dvc.exceptions import DvcException  # imported late: the import takes a second
+    from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo
 
     with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start here, it cannot delete outputs
@@ -164,7 +168,7 @@ def check(root: Path) -> Plan:
     plan = read_plan(root / PLAN)
     if plan.model_dump(mode="json") != plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"
-        problem = "is out of date: scenes or captures have changed since it was written"
+        problem = "is out of date, because scenes or captures have changed since it was written"
         raise ParamsError(f"{root / PLAN} {problem}. {remedy}")
     return plan
 
@@ -176,9 +180,11 @@ def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
         for experiment in scene.entries:
             if experiment.file is not None and not (root / scene.named_file(experiment.name)).is_file():
                 file = scene.named_file(experiment.name)
-                remedy = f"Make it: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
-                problem = f"file {file}, which section {experiment.stage} names, not found"
-                raise ParamsError(f"{scene_file(root, name)}: {problem}. {remedy}, or remove the experiment.")
+                remedy = f"Make the file with: reskin model make --layout {SCENES}/{name}.yaml --out {file}"
+                problem = f"file {file}, which is named in section {experiment.stage}, was not found"
+                raise ParamsError(
+                    f"{scene_file(root, name)}: {problem}. {remedy}, or remove {experiment.name} from the experiments."
+                )
     return make_plan(scenes, read_registry(root))
 
 

@@ -39,10 +39,10 @@ def stages_in_order() -> list[str]:
 
 
 def _ask_dvc() -> list[str]:
-    from dvc.repo import Repo  # imported late: the import takes a second
+    from dvc.repo import Repo  # imported here, because the import takes a second
     from dvc.repo.reproduce import get_active_graph, plan_repro
 
     with Repo() as repo:
         stages = plan_repro(get_active_graph(repo.index.graph))
-        # DVC also counts added recordings as stages; these have no command.
+        # DVC also counts added recordings as stages. They have no command, so they are left out.
         return [stage.addressing for stage in stages if stage.cmd]

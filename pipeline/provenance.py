@@ -20,7 +20,7 @@ NO_CODE = ("plan.yaml", "scenes")  # settings rather than code, although they ar
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
-CPUINFO = Path("/proc/cpuinfo")  # Linux only
+CPUINFO = Path("/proc/cpuinfo")  # exists only on Linux
 # Names of instruction sets, by the flag in /proc/cpuinfo.
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}
 
@@ -86,7 +86,9 @@ def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) 
     cpuinfo: content of Linux's /proc/cpuinfo. otherwise: the processor's name if `cpuinfo` has no model name.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
-    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # those of the first processor
+    values = {
+        name.strip().lower(): value.strip() for name, _, value in reversed(lines)
+    }  # the lines are reversed, so that the values of the first processor are kept
     flags = set(values.get("flags", values.get("features", "")).split())
     model = values.get("model name") or otherwise or "unknown processor"
     plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
@@ -143,7 +145,9 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
-            "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # includes imports
+            "cpu_s": round(
+                sum(usage.ru_utime + usage.ru_stime for usage in usages), 2
+            ),  # includes the CPU time of imports
             "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
         },
     )

@@ -33,7 +33,7 @@ LOADER = "pipeline.pyfunc"
 FOLDER = "model"  # folder of a model among the artifacts of a run
 COLUMNS = ("x_mm", "y_mm", "force_N")
 EXAMPLE, SERVING_EXAMPLE = "input_example.json", "serving_input_example.json"
-LABEL_N = len(COLUMNS)  # values of a label
+LABEL_N = len(COLUMNS)  # number of values in a label: x, y and force
 # The example of a model's input consists of EXAMPLE_N readings: those with the largest field changes among the first
 # EXAMPLE_OF_N readings of a capture.
 EXAMPLE_N, EXAMPLE_OF_N = 3, 2000
@@ -178,7 +178,9 @@ def write_model_files(
             "serving_input_path": SERVING_EXAMPLE,
             "type": "dataframe",
         }
-    io.write_text(folder / "MLmodel", json.dumps(about, indent=2))  # MLflow reads YAML; JSON is also YAML
+    io.write_text(
+        folder / "MLmodel", json.dumps(about, indent=2)
+    )  # MLflow reads this file as YAML, and JSON is valid YAML
     return about
 
 

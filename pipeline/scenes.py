@@ -249,10 +249,11 @@ def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))
             raise ParamsError(
-                f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there.{guess}"
+                f"{where}: {name} is not a known parameter (its value: {got}). Correct its name or remove it.{guess}"
             )
         if name in SECTIONS and not isinstance(value, dict):
-            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Correct it there.")
+            remedy = f"Write {name} as a section with keys and values."
+            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], remedy)
     return parse(Scene, content, where)
 
 
@@ -263,7 +264,9 @@ def read_shared(path: Path) -> Shared:
         for name, row in getattr(shared, section).items():
             where = f"{path}: {section}.{name}"
             if "steps_n" in row:
-                raise ParamsError(f"{where}: scenes set steps_n, in the sections that name this row. Remove it here.")
+                raise ParamsError(
+                    f"{where}: remove steps_n from this row. Each scene sets steps_n in the section that names the row."
+                )
             parse(model, row | {"steps_n": 1}, where)
     return shared
 

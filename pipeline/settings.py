@@ -88,9 +88,8 @@ class Adaptations(SectionWithRows):
         known = sorted(settings.section(Training, "train_triplet").recipes)
         for name, recipe in section["recipes"].items():
             if recipe["base"] not in known:
-                raise ParamsError(
-                    where, f"base of {name}", f"one of {known}", repr(recipe["base"]), "Correct it there."
-                )
+                remedy = "Name one of these recipes."
+                raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe["base"]), remedy)
         return section
 
 
@@ -120,7 +119,7 @@ class Settings:
     def __getitem__(self, section: str) -> Any:
         """Return a section of the scene's file without parsing it; raise `ParamsError` if the section is missing."""
         if section not in self.of_scene:
-            raise ParamsError(f"{self.where}: section {section} is missing. Add it there.")
+            raise ParamsError(f"{self.where}: section {section} is missing. Add the section to this file.")
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
@@ -152,7 +151,7 @@ class Settings:
         if not isinstance(name, str) or name not in rows:
             rule = f"one of {', '.join(sorted(rows))} (section {shared} of {PARAMS})"
             raise ParamsError(
-                f"{where}.{key} must be {rule}; got {name!r}. Correct it there.{did_you_mean(name, rows)}"
+                f"{where}.{key} must be {rule}; got {name!r}. Name one of these rows.{did_you_mean(name, rows)}"
             )
         return dict(rows[name])
 
@@ -194,7 +193,7 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
     """Remove a key from a section and return its value; raise `ParamsError` if it is missing."""
     if key not in section:
         known = ", ".join(sorted(section)) or "nothing"
-        raise ParamsError(f"{where}: {key} is missing (given: {known}). Add it there.")
+        raise ParamsError(f"{where}: {key} is missing (given: {known}). Add key {key} to this section.")
     return section.pop(key)
 
 
@@ -209,12 +208,14 @@ def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
     variants = take(section, "variants", where)
     if "recipes" in section:
-        raise ParamsError(f"{where}: unknown key recipes. Remove it: recipes result from recipe, steps_n and variants.")
+        raise ParamsError(
+            f"{where}: unknown key recipes. Remove this key: keys recipe, steps_n and variants determine the recipes."
+        )
     if not isinstance(variants, dict) or not all(isinstance(changes, dict) for changes in variants.values()):
-        rule = "a mapping of names to the settings that a variant changes, {} for none"
-        raise ParamsError(f"{where}.variants", "the variants", rule, variants, "Correct it there.")
+        rule = "a mapping from the name of each variant to the settings that it changes, or {} for no variants"
+        raise ParamsError(f"{where}.variants", "the variants", rule, variants, "Write variants as such a mapping.")
     if HEADLINE in variants:
-        rule = f"other than {HEADLINE}, the name of the recipe without changes in tables"
+        rule = f"other than {HEADLINE}, which is the name of the recipe without changes"
         raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
     recipes = {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}
     return section | {"recipes": recipes}

@@ -29,19 +29,20 @@ def simulation_settings(settings: Settings) -> SimulationSettings:
 def check_protocols(simulation: SimulationSettings, where: str) -> None:
     """Raise `ParamsError` if an experiment cannot use one of the protocols; the error names `where`."""
     main = simulation.main.boards
-    if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
+    if simulation.main_boards.skin_mm != SKIN_MM:  # the studies of the physics assume the size of the authors' skin
         rule = f"skin_mm of the boards of protocol {MAIN} must be {list(SKIN_MM)}"
-        raise ParamsError(f"{where}: {rule}. Correct it there.")
+        raise ParamsError(f"{where}: {rule}. Correct skin_mm of these boards.")
     for name, protocol in simulation.protocols.items():
         kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
         faults = {
             f"kind must be {kind}, which its experiment reads, not {protocol.kind}": protocol.kind != kind,
-            f"boards must be {main}, as for {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
-            f"boards must differ from {boards}, the boards of {MAIN}": name in ON_OTHER_BOARDS and boards == main,
-            f"skins_n must be 1, as only one skin is read, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
+            f"boards must be {main}, as in protocol {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
+            f"boards must not be {boards}, the boards of protocol {MAIN}": name in ON_OTHER_BOARDS and boards == main,
+            f"skins_n must be 1, because its experiment reads only one skin, not {skins_n}": name in OF_ONE_SKIN
+            and skins_n != 1,
         }
         for fault in (rule for rule, is_broken in faults.items() if is_broken):
-            raise ParamsError(f"{where}: protocol {name}: {fault}. Correct it there.")
+            raise ParamsError(f"{where}: protocol {name}: {fault}. Correct this setting of the protocol.")
 
 
 def load_protocol(settings: Settings, protocol: str) -> Load:

@@ -29,7 +29,7 @@ METHODS = {
     "triplet": "network + triplet",
     "adapt": "network, adapted",
 }  # names of methods by experiment; "network" for all other experiments
-CONFIDENCE = 0.95  # confidence level of intervals; convention
+CONFIDENCE = 0.95  # confidence level of intervals; the usual convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
@@ -37,12 +37,13 @@ BOARDS_MIN = 4  # with fewer boards, no interval is computed; the value of each 
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
-    "Supported: the whole 95 % interval is on the claim's side of the threshold, which is 0 unless another one is "
-    "stated. Contradicted: the whole interval is on the other side. Undecided: the interval includes the threshold. "
+    "Supported: the whole 95 % interval is on the claim's side of the threshold, which is 0 unless another threshold "
+    "is stated. Contradicted: the whole interval is on the other side. Undecided: the interval includes the threshold. "
     f"Not judged: with fewer than {BOARDS_MIN} boards there is no interval, and the values of the boards are given. "
-    "Intervals are over boards (Student's t); the skins and networks of a board are averaged first. They are computed "
-    "on a scale that keeps them in the possible range: the logit of accuracies and the logarithm of squared errors; "
-    "differences are not transformed. The folds share training boards; the intervals do not account for this."
+    "Intervals are over boards (Student's t): the value of a board is the mean over its skins and networks. So that "
+    "intervals contain only possible values, they are computed from the logit of accuracies and from the logarithm of "
+    "squared errors. Differences are not transformed. The networks for two tested boards are trained partly on the "
+    "same boards; the intervals do not account for this."
 )
 
 Cards = Sequence[Mapping[str, Any]]
@@ -417,9 +418,10 @@ def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
 
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:
-    remedy = "Train both on the same folds."
+    remedy = "Train both methods on the same folds."
     return SchemaError(
-        f"a paired difference needs the same held-out skins for both methods; only one method has {skins}. {remedy}"
+        "a paired difference needs scores of both methods on the same held-out skins, but only one method has scores "
+        f"on {skins}. {remedy}"
     )
 
 

@@ -170,8 +170,8 @@ def probe(uri: str | None) -> None:
         except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
             reason = getattr(error, "reason", error) or type(error).__name__
             raise TrackingUnavailable(
-                f"MLflow at {uri} does not answer ({reason}). Results are computed anyway; "
-                "`reskin publish` sends them when it is back."
+                f"MLflow at {uri} does not answer ({reason}). The results are computed anyway. When MLflow answers "
+                "again, send them with `reskin publish`."
             ) from None
 
 
@@ -185,7 +185,8 @@ def _probe_sqlite(file: str) -> None:
     except sqlite3.Error as error:  # MLflow itself would try ten times, for minutes
         raise TrackingUnavailable(
             f"MLflow's store {file} cannot be written ({error}; waited up to {LOCK_TIMEOUT_S:.0f} s). "
-            "Results are kept. If another program has locked it, run `reskin publish` when that has ended."
+            "The results are kept. If another program has locked the store, wait until this program has ended, then "
+            "run `reskin publish`."
         ) from None
 
 
@@ -307,7 +308,8 @@ class Publisher:
         """
         if time.monotonic() > self.end_s:
             raise TrackingUnavailable(
-                f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` sends the rest."
+                f"MLflow took longer than {self.limit_s:.0f} s. The results are kept. To send those that MLflow still "
+                "lacks, run `reskin publish`."
             )
         self.current.add(key)
         existing = self.marked.get(key) or self.find(stage, run_key=key)
@@ -508,12 +510,13 @@ class Publisher:
             self.log(run_id, [*rows, (TRAIN_S, seconds, 0)], span, params=params, tags=about)
             self.end(run_id, span)
         tested_on = (
-            f"Scores on recorded boards of scene lab, calibrated to {scores[0]['presses_n']} unlabelled presses and "
-            f"{max(by_labels)} labels; those without labels end in _0_labels."
+            f"The metrics are scores on recorded boards of scene lab, after calibration to {scores[0]['presses_n']} "
+            f"unlabelled presses and {max(by_labels)} labels. Metrics whose names end in _0_labels are scores without "
+            "labels."
             if by_labels
-            else "Not tested here."
+            else "This checkout has no scores of the model on recorded boards."
         )
-        use = f"Model for any skin on the paper's board. Not for {card['not_for']}."
+        use = f"Model for any skin on the paper's board. It is not for {card['not_for']}."
         self.register(UNIVERSAL, run_id, f"{use} {tested_on}")
 
     def register(self, name: str, run_id: str, description: str) -> None:
@@ -637,7 +640,7 @@ def _client(uri: str) -> Iterator[Any]:
     except (MlflowException, SQLAlchemyError, OSError) as error:
         sentence = " ".join(str(error).partition("[SQL:")[0].split())[:200]
         raise TrackingUnavailable(
-            f"MLflow at {uri} failed ({sentence}). Results are kept; `reskin publish` sends them later."
+            f"MLflow at {uri} failed ({sentence}). The results are kept. To send them later, run `reskin publish`."
         ) from None
 
 

@@ -139,7 +139,7 @@ def test_recording_with_repeated_readings_is_added_with_a_warning(root, tmp_path
     """If a recorder reads faster than the chips convert, it writes each reading twice."""
     press = [row(0, "noload", 90.0), *(row(0, "contact", 100.0 + i // 2) for i in range(80))]
     add_lab(root, write(tmp_path, *press) / "readings.csv")
-    assert "board1_skin1_readings: 50% of readings repeat the one before." in capsys.readouterr().err
+    assert "board1_skin1_readings: 50% of readings equal the reading before." in capsys.readouterr().err
 
 
 def test_recording_with_exchanged_coordinates_is_added_with_a_warning(root, tmp_path, lab_file, capsys):
@@ -160,8 +160,8 @@ def test_recording_with_exchanged_coordinates_is_added_with_a_warning(root, tmp_
 
 def test_recording_that_was_added_before_is_refused_unless_copies_are_allowed(root, lab_file):
     add_lab(root, lab_file)
-    assert_refused(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
-    assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
+    assert_refused(root, lambda: add_lab(root, lab_file), "the scene already has a capture with the name")
+    assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "Nothing has to be added")
     assert_refused(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
     assert_refused(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the same readings as")
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
@@ -183,7 +183,7 @@ def test_failed_removal_changes_no_files(root, lab_file):
 
 def test_folder_left_by_a_killed_add_is_reported(root, lab_file):
     (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
-    assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed")
+    assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed before")
 
 
 def test_errors_name_the_file_that_the_user_has_given(root, tmp_path):
@@ -425,7 +425,7 @@ def test_reskin_add_prints_that_it_has_added_the_scene_to_the_plan(root_with_cod
     assert "dvc config" not in done.stdout + done.stderr
     assert "is up to date; scenes: small" in output_of(["scenes", "check"])
     taken = output_of([*arguments, "--layout", "table"])
-    assert "the name b_s_readings is taken in this scene" in taken
+    assert "the scene already has a capture with the name b_s_readings" in taken
     assert "It can be read with" not in taken
     again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
@@ -438,7 +438,7 @@ def test_option_like_copies_a_scene_and_leaves_no_copy_if_adding_fails(root_with
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
     invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
-    assert "--scene: a name must be 1 to 64 of" in invalid
+    assert "--scene: a name must be 1 to 64 characters of" in invalid
     assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
     assert contents(root_with_code) == before
     run(root_with_code, "reskin", *arguments, "small")
@@ -476,7 +476,7 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
     layout = read_settings("mine", root).section(Compare, "compare").layout
     assert layout == paper_layout().model_copy(update={"name": "mine"})
     assert read_layout_of(root / SCENES / "mine.yaml") == layout
-    assert "exists. Choose another name" in output_of(["new", "mine", "--boards", "b1,b2", "--presses", "60"])
+    assert "exists already. Choose another name" in output_of(["new", "mine", "--boards", "b1,b2", "--presses", "60"])
     assert "one board cannot be held out" in output_of(["new", "one", "--boards", "b1", "--presses", "60"])
     own = tmp_path / "own.yaml"
     own.write_text((FOLDER / "reskin.yaml").read_text().replace("gap_mm: 1.6", "gap_mm: 2").replace("reskin", "own", 1))
@@ -502,7 +502,9 @@ def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path
         (rows if stated else rows.drop(columns="pass")).to_csv(tmp_path / f"{name}.csv", index=False)
         prepared = preparing.foreign(tmp_path / f"{name}.csv", "table", labels(name[:2], name), {})
         add.add(root, "mine", prepared, allow_copy=False)
-        warned = "1 passes found; split.pool_passes_n of the scene needs more than 1 of each skin. Add further"
+        warned = (
+            "1 passes, but with split.pool_passes_n: 1 the scene needs more than 1 passes of each skin. Add further"
+        )
         output = capsys.readouterr().err
         assert (warned in output, "fill in column pass" in output) == (not stated, not stated)
 
@@ -522,10 +524,10 @@ def test_board_and_skin_of_several_recordings_are_taken_from_the_names_of_their_
     before = contents(root)
     assert "board b3 is not a board of scene mine" in add_two("b3_s1")
     assert contents(root) == before
-    with pytest.raises(ReskinError, match=r"file's name is not BOARD_SKIN\.csv"):
+    with pytest.raises(ReskinError, match=r"file's name is not of the form BOARD_SKIN\.csv"):
         add.names_of(root, "mine", Path("b2.csv"), labels("", ""))
     output = add_two("b2_s1_more")
-    assert "capture b1_s1: 2 indentations found; split.labels_pool_n of the scene needs more than 6" in output
+    assert "capture b1_s1 has 2 indentations, but with split.labels_pool_n: 6 the scene needs more than 6" in output
     captures = read_registry(root).captures["mine"]
     assert {name: (entry.board, entry.skin) for name, entry in captures.items()} == {
         "b1_s1": ("b1", "b1_s1"), "b2_s1_more": ("b2", "b2_s1")

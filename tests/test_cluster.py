@@ -150,7 +150,7 @@ def test_worker_with_code_from_before_an_edit_is_refused(tmp_path, monkeypatch):
         module.write("# edited\n")
     now = import_fresh(source)
     cluster._compare(now.describe_process(), import_fresh(source).describe_process(), "w")
-    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Restart it"):
+    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Restart the worker"):
         cluster._compare(now.describe_process(), before.describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker process"):
         cluster.run_on_worker(str(tmp_path), before.describe_process(), os.getcwd)

@@ -96,7 +96,7 @@ def test_values_of_only_one_run_are_counted_by_section(checkout):
     assert code == 1
     assert ["numbers.json", "drift", "0", "0", "0", "1"] in rows(output)
     assert ["tables", "order", "0", "0", "2", "0"] in rows(output)
-    assert "3 in one run only" in output.splitlines()[-1]
+    assert "3 are in one run only" in output.splitlines()[-1]
 
 
 @pytest.mark.parametrize("where", ["", "quick", "reports/quick", "quick/numbers.json"])
@@ -112,7 +112,7 @@ def test_option_against_accepts_a_folder_or_a_file_instead_of_a_revision(checkou
         (["quick", "--against", "nowhere"], "git revision nowhere has no reports/quick/numbers.json"),
         (["quick", "--against", "reports"], None), (["lab"], "reports/lab/numbers.json: file not found"),
         (["zzz"], "no scene zzz. The scenes are: lab, quick"),
-        (["quick", "--against", ".git"], ".git: no quick/numbers.json there"),
+        (["quick", "--against", ".git"], ".git: this folder contains no quick/numbers.json"),
     ],
 )  # fmt: skip
 def test_missing_reports_are_an_error(checkout, arguments, message):

@@ -169,7 +169,7 @@ def test_recordings_can_be_fetched_from_a_mirror_or_a_folder(root, example, tmp_
 
 def test_missing_commit_is_an_error(root, example):
     write_source(root, source_of(example.files, example.url, "1" * 40))
-    assert_refused(root, f"the repository does not have commit {'1' * 40}, at which")
+    assert_refused(root, f"the repository does not have commit {'1' * 40}, from which")
 
 
 @pytest.mark.usefixtures("without_adding")
@@ -197,7 +197,7 @@ def test_wrong_checksum_is_an_error(root, example):
     write_source(root, source_of(example.files, example.url, None))
     other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
     problem = f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes"
-    assert_refused(root, f"{problem}.*name a git mirror or a folder with --from")
+    assert_refused(root, f"{problem}.*name a git mirror or a folder with option --from")
 
 
 def test_truncated_or_missing_file_is_an_error(root, example, tmp_path):
@@ -290,7 +290,7 @@ def test_full_disk_is_an_error(root, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(fetching, "_read_checked", full)
-    assert_refused(root, "cannot write: No space left on device")
+    assert_refused(root, "cannot write the files: No space left on device")
 
 
 def test_unknown_source_is_an_error(root):

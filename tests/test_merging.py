@@ -113,7 +113,7 @@ def test_merge_of_contradictory_recordings_raises_and_changes_no_files(root):
     [
         ({"yours": entry("s1", "b2")}, "the board of skin s1 must be b1, as in mine; got b2"),
         ({"yours": entry("s2", "b2", "b1-s1")}, "it has the same readings as mine"),
-        ({"mine": entry("s2", "b2")}, "the name mine is taken in scene"),
+        ({"mine": entry("s2", "b2")}, "already has a capture with the name mine"),
     ],
 )
 def test_merge_raises_if_the_merged_registry_would_be_invalid(theirs, message):
@@ -135,7 +135,7 @@ def test_conflicts_in_files_written_by_hand_are_not_merged(root):
     (root / PARAMS).write_text("ours: 1\n")
     git(root, "commit", "-qam", "Change it otherwise")
     git(root, "merge", "theirs", check=False)
-    with pytest.raises(ReskinError, match="Resolve params.yaml by hand"):
+    with pytest.raises(ReskinError, match="params.yaml: resolve the conflicts in these files by hand"):
         merge.merge(root)
 
 

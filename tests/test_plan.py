@@ -121,7 +121,9 @@ def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     (root / SCENES / "mine.yaml").write_text(text)  # This checkout contains no library, and therefore no model.
-    with pytest.raises(ParamsError, match=r"universal.safetensors, which section calibrated names, not found"):
+    with pytest.raises(
+        ParamsError, match=r"universal.safetensors, which is named in section calibrated, was not found"
+    ):
         plan.plan_of(root, ["mine"])
 
 
@@ -148,7 +150,7 @@ def test_scenes_use_writes_only_the_plan(tmp_path):
     generated = plan.check(root)
     assert list(generated.scenes) == ["two", "one"]
     assert list(generated.stages["train_multi"]) == ["two", "one"]
-    assert "do not edit" in (root / PLAN).read_text()
+    assert "Do not edit" in (root / PLAN).read_text()
     assert [file.read_bytes() for file in others] == before
 
 
@@ -200,8 +202,11 @@ def test_each_protocol_is_simulated_and_ingested_by_stages_of_its_own(tmp_path):
     [
         ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than the 6 skins of rigid boards"),
-        ({"protocols__press__skins_n": 3}, "protocol press: skins_n must be 1, as only one skin is read, not 3"),
-        ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards must differ from rigid"),
+        (
+            {"protocols__press__skins_n": 3},
+            "protocol press: skins_n must be 1, because its experiment reads only one skin, not 3",
+        ),
+        ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards must not be rigid"),
     ],
 )
 def test_invalid_simulation_is_an_error_before_any_stage(tmp_path, changes, message):

@@ -24,7 +24,7 @@ def test_board_and_skin_can_have_several_captures():
 
 
 def test_same_recording_twice_is_an_error():
-    with pytest.raises(CaptureError, match="it has the same readings as c0. It is in the scene already"):
+    with pytest.raises(CaptureError, match="it has the same readings as c0. Nothing has to be added"):
         register(ONE, header("c1"), "aa", allow_copy=True)
 
 
@@ -38,7 +38,7 @@ def test_relabelled_copy_is_an_error_unless_copies_are_allowed():
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        (header("c0"), "the name c0 is taken in scene"),
+        (header("c0"), "already has a capture with the name c0"),
         (header("c1", board="b1"), "the board of skin s0 must be b0, as in c0; got b1"),
         (header("c1", skin="s1", chips_n=10), "10 chips, but c0 in the same scene has 5"),
     ],

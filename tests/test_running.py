@@ -32,7 +32,7 @@ def test_checkout_in_which_no_dvc_repro_runs_is_idle(tmp_path, locks):
 
 def test_running_stage_is_an_error(tmp_path, locks):
     write_rwlock(locks, os.getpid())
-    with pytest.raises(ParamsError, match=rf"`dvc repro` runs in this checkout \(process {os.getpid()}\)"):
+    with pytest.raises(ParamsError, match=rf"`dvc repro` is running in this checkout \(process {os.getpid()}\)"):
         require_idle(tmp_path)
 
 
@@ -49,7 +49,7 @@ def test_error_names_the_lock_to_delete_if_its_process_is_not_dvc(tmp_path, lock
 
 def test_dvc_repro_between_two_of_its_stages_is_an_error(tmp_path, locks):
     lock = LockFile(str(locks / LOCK))
-    with pytest.raises(ParamsError, match="`dvc repro` runs in this checkout. Nothing was changed"):
+    with pytest.raises(ParamsError, match="`dvc repro` is running in this checkout, so nothing was changed"):
         require_idle(tmp_path)
     lock.close()
     require_idle(tmp_path)

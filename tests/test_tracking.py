@@ -293,7 +293,7 @@ def test_stage_runs_that_were_interrupted_are_published_again(tmp_path):
 
 def test_broken_store_is_reported(tmp_path):
     (tmp_path / "mlflow.db").write_bytes(b"junk" * 99)
-    with pytest.raises(TrackingUnavailable, match="Results are kept"):
+    with pytest.raises(TrackingUnavailable, match="The results are kept"):
         write(tmp_path, b0="k0")
 
 
@@ -308,7 +308,7 @@ def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, 
     uri = request.getfixturevalue(kind)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     start_s = time.monotonic()
-    with pytest.raises(TrackingUnavailable, match="`reskin publish` sends them when it is back"):
+    with pytest.raises(TrackingUnavailable, match="When MLflow answers again, send them with `reskin publish`"):
         write(tmp_path, b0="k0")
     assert time.monotonic() - start_s < 15  # The time limit is 2 s. The retries of MLflow would take 20 s.
 
@@ -323,7 +323,7 @@ def test_locked_store_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "LOCK_TIMEOUT_S", 0.1)
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(TrackingUnavailable, match="database is locked.*Results are kept"):
+        with pytest.raises(TrackingUnavailable, match="database is locked.*The results are kept"):
             write(tmp_path, b0="k0")
     write(tmp_path, b0="k0")
 
@@ -341,7 +341,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
     handler = logging.Handler()
     handler.emit = messages.append
     logging.getLogger("mlflow.store.db.utils").addHandler(handler)
-    with pytest.raises(TrackingUnavailable, match=r"failed \(.*no such table: tags\)\. Results are kept"):
+    with pytest.raises(TrackingUnavailable, match=r"failed \(.*no such table: tags\)\. The results are kept"):
         write(tmp_path, b0="k1")
     logging.getLogger("mlflow.store.db.utils").removeHandler(handler)
     assert messages == []

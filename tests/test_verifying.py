@@ -81,7 +81,7 @@ def test_rerun_starts_without_old_reports_and_keeps_its_new_reports(checkout, mo
     [
         (["lab"], "has no reports/lab/numbers.json"),
         (["zzz"], "no scene zzz. The scenes are: lab, quick"),
-        (["quick", "--against", "data"], "data: no quick/numbers.json there"),
+        (["quick", "--against", "data"], "data: this folder contains no quick/numbers.json"),
     ],
 )
 def test_missing_reports_are_an_error(checkout, arguments, message):

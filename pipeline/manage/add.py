@@ -42,7 +42,10 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     """
     require_idle(root)
     header, files = prepared
-    remedy = f"To create it: reskin new {scene} --boards ..., or add --like ini."
+    remedy = (
+        f"To create it, run reskin new {scene} --boards ..., or repeat the command with --like ini, which copies the "
+        "settings of scene ini."
+    )
     settings = read_scene(root, plan.scene_file(root, scene, remedy=remedy).stem)
     if settings.source != header.source:
         create = "--scene NEW --like ini" if header.source == "recorded" else "reskin new NEW --boards ... --simulated"
@@ -50,10 +53,10 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
         raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
     if settings.simulate is not None:
         remedy = "Create a scene for recordings of emulated boards: reskin new NAME --boards ... --simulated."
-        raise ParamsError(f"scene {scene} simulates its own captures, so none can be added. {remedy}")
+        raise ParamsError(f"scene {scene} simulates its own captures, so no recordings can be added to it. {remedy}")
     if settings.boards is not None and header.board not in settings.boards:
         guess, known = did_you_mean(header.board, settings.boards), ", ".join(settings.boards)
-        remedy = f"Correct the name, or add it to key boards of {plan.scene_file(root, scene)}."
+        remedy = f"Correct the name, or add the board to key boards in {plan.scene_file(root, scene)}."
         raise ParamsError(f"board {header.board} is not a board of scene {scene} ({known}).{guess} {remedy}")
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
@@ -66,7 +69,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
             known = ", ".join(name for name, experiment in EXPERIMENTS.items() if experiment.without_contact)
             raise ParamsError(
                 f"{header.capture}: nothing touches the skin in this recording, and no experiment of scene {scene} "
-                f"uses such recordings. Add it to a scene that runs {known}, such as scene hand."
+                f"uses such recordings. Add the recording to a scene that runs {known}, such as scene hand."
             )
         after = with_capture(before, scene, complete, fingerprints, allow_copy=allow_copy)
         _track(target, root)
@@ -97,8 +100,8 @@ def names_of(root: Path, scene: str, recording: Path, given: CaptureNames) -> Ca
     skin = stem.removeprefix(f"{board}_").partition("_")[0]
     if skin == stem or not skin:
         raise ParamsError(
-            f"{recording}: the name of the board or of the skin is not given, and the file's name is not "
-            "BOARD_SKIN.csv. Rename the file, or add --board and --skin."
+            f"{recording}: the name of the board or of the skin is not given, and the file's name is not of the form "
+            "BOARD_SKIN.csv. Rename the file, or use options --board and --skin."
         )
     return CaptureNames(given.board or board, given.skin or f"{board}_{skin}", given.name or stem)
 
@@ -133,13 +136,16 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "If it is the same recording, it is in the scene already. Otherwise, choose another name with --name."
-        raise ParamsError(f"the name {target.name} is taken in this scene. {remedy}")
+        remedy = (
+            "If that is the same recording, nothing has to be added. Otherwise, choose another name with option --name."
+        )
+        raise ParamsError(f"the scene already has a capture with the name {target.name}. {remedy}")
     if target.exists():
         remedy = (
-            "No scene contains it: an earlier `reskin add` was killed. Delete the folder, or choose another --name."
+            "Probably an earlier `reskin add` was killed before the recording was complete. Delete the folder, or "
+            "choose another name with option --name."
         )
-        raise ParamsError(f"{target}: the folder exists already. {remedy}")
+        raise ParamsError(f"{target}: the folder exists already, but it belongs to no capture of a scene. {remedy}")
 
 
 @dataclass(frozen=True)
@@ -171,15 +177,18 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
         indentations.update(np.unique(block.indentation).tolist())
     check_losses(counts, limit, folder.name)
     if rows_n == 0:
-        raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(counts)}. Check its files.")
+        raise CaptureError(
+            f"{folder.name}: all readings were dropped because of faults. Counts: {dict(counts)}. Check the recorded "
+            "files."
+        )
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in counts.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
     if repeats.readings > REPEATED_MAX:
         say(
-            f"warning: capture {folder.name}: {repeats.readings:.0%} of readings repeat the one before. Probably the "
-            "board, or the program that recorded it, reads faster than the chips measure. To measure the rate of the "
-            "chips, run: reskin ports --rate. The recording was added anyway."
+            f"warning: capture {folder.name}: {repeats.readings:.0%} of readings equal the reading before. Probably "
+            "the board, or the program that recorded it, reads faster than the chips measure. To measure the rate of "
+            "the chips, run: reskin ports --rate. The recording was added anyway."
         )
     fingerprints = (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
     return fingerprints, Counts(len(passes), len(indentations), touched)
@@ -192,11 +201,12 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
     ):  # fmt: skip
         pool_n = getattr(scene.split, key)
         if pool_n is not None and have_n <= pool_n:
-            column = "fill in column pass (needed if each pass has another order of places), "
+            column = "fill in column pass of the file (needed if the order of places differs between passes), "
             say(
-                f"warning: capture {header.capture}: {have_n} {what} found; split.{key} of the scene needs more than "
-                f"{pool_n} of each skin. Add further recordings of skin {header.skin}, "
-                f"{column if (what, header.layout) == ('passes', 'table') else ''}or reduce {key}."
+                f"warning: capture {header.capture} has {have_n} {what}, but with split.{key}: {pool_n} the scene "
+                f"needs more than {pool_n} {what} of each skin. Add further recordings of skin {header.skin}, "
+                f"{column if (what, header.layout) == ('passes', 'table') else ''}or reduce split.{key} in the "
+                "scene's file."
             )
 
 
@@ -204,7 +214,7 @@ def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any
     """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
-        find_departure,  # imported late: importing the physics takes seconds
+        find_departure,  # imported here, because importing the physics takes seconds
     )
     from reskin.physics.skin import SkinDesign
 
@@ -213,9 +223,9 @@ def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any
     try:
         sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
     except ReskinError as error:
-        sentence = f"The orientation of labels, chips and skin was not compared with the scene's: {error}"
+        sentence = f"The orientation of labels, chips and skin was not compared with the scene's settings: {error}"
     if sentence:
-        say(f"warning: capture {folder.name}: {sentence} It was added anyway.")
+        say(f"warning: capture {folder.name}: {sentence} The recording was added anyway.")
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
@@ -231,9 +241,9 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
     most_common = max(set(orientations), key=orientations.count, default=None)
     if most_common is not None:
         say(
-            f"warning: capture {folder.name}: its places agree with those of the scene's other captures only "
-            f"{most_common}. Check whether columns are swapped, or whether the board was rotated. The recording was "
-            "added anyway."
+            f"warning: capture {folder.name}: the places in this capture agree with the places in the scene's other "
+            f"captures only {most_common}. Check whether columns are swapped, or whether the board was rotated. The "
+            "recording was added anyway."
         )
 
 
@@ -277,7 +287,7 @@ def _remove_files(target: Path) -> None:
 
 def _track(folder: Path, root: Path) -> None:
     """Track a folder with DVC like `dvc add`, but in this process, because starting another process takes seconds."""
-    from dvc.exceptions import DvcException  # imported late: the import takes a second
+    from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo
 
     try:
@@ -286,4 +296,6 @@ def _track(folder: Path, root: Path) -> None:
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
         reason = " ".join(str(error).split())[-300:]
-        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See DVC's messages above.") from None
+        raise CaptureError(
+            f"dvc add {folder.relative_to(root)} failed: {reason}. The messages of DVC above give the details."
+        ) from None

@@ -103,7 +103,7 @@ def _md5(file: Path) -> str:
 
 
 def _cache_of(root: Path) -> Path:
-    from dvc.repo import Repo  # imported late: the import takes a second
+    from dvc.repo import Repo  # imported here, because the import takes a second
 
     with Repo(str(root)) as repo:
         return Path(repo.cache.local.path)

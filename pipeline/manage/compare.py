@@ -31,8 +31,8 @@ VERDICT = re.compile(
 MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance that may explain a difference
 EXPECTED = (
     "Values are equal on every x86-64 processor with AVX2 if the code, the settings and the versions of packages "
-    "(constraints.txt) are those of the committed run. On a GPU, or with other versions, values may differ. If none of "
-    "these explains a difference, please report it."
+    "(constraints.txt) are those of the committed run. On a GPU, or with other versions of packages, values may "
+    "differ. If none of these reasons explains a difference, please report it."
 )
 MISSING: Any = object()  # placeholder for a value that one of the two runs lacks
 
@@ -137,7 +137,9 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
         before, after = _label_rows([] if old is MISSING else old, [] if new is MISSING else new)
         for label in {**before, **after}:
             yield from _pairs(before.get(label, MISSING), after.get(label, MISSING), f"{name}[{label}]")
-    elif any(isinstance(value, Mapping | list) for value in present):  # a mapping or list on one side only
+    elif any(
+        isinstance(value, Mapping | list) for value in present
+    ):  # only one of the two values is a mapping or a list
         yield from _pairs(old, MISSING, name)
         yield from _pairs(MISSING, new, name)
     else:
@@ -226,7 +228,7 @@ def read_folder(path: Path, scene: str) -> Report:
     folder = next((candidate for candidate in candidates if (candidate / "numbers.json").is_file()), None)
     if folder is None:
         remedy = "Give the path of folder reports/<scene> in another checkout."
-        raise SchemaError(f"{path}: no {scene}/numbers.json there. {remedy}")
+        raise SchemaError(f"{path}: this folder contains no {scene}/numbers.json. {remedy}")
     files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
     return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
 
@@ -237,7 +239,9 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
     listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else ""
     names = [name for name in listed.splitlines() if name.endswith((".json", ".csv"))]
     if f"reports/{scene}/numbers.json" not in names:
-        remedy = f"Commit reports/{scene} first. `reskin compare --against` takes another revision, or a folder."
+        remedy = (
+            f"Commit reports/{scene} first, or name another revision or a folder: reskin compare {scene} --against ..."
+        )
         raise SchemaError(f"git revision {revision} has no reports/{scene}/numbers.json. {remedy}")
     commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder).strip()
     texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") for name in names}
@@ -331,8 +335,8 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
             echo(str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)) + "\n")
     unpaired_n = sum(len(part.missing) + len(part.new) for part in parts.values())
     echo(
-        f"{scene}: not equal: {len(differing):,} of {values} differ from those {committed.where}; {unpaired_n:,} in "
-        f"one run only; {len(verdicts)} verdicts changed. {EXPECTED}"
+        f"{scene}: not equal: {len(differing):,} of {values} differ from those {committed.where}; {unpaired_n:,} are "
+        f"in one run only; {len(verdicts)} verdicts changed. {EXPECTED}"
     )
     return 1
 

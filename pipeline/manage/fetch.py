@@ -35,7 +35,7 @@ FETCHED = "data/fetched"
 # The free disk space must suffice for this many copies of each file. Three copies are written: the fetched file, and
 # copies in data/raw and in DVC's cache. The fourth is a reserve.
 COPIES_N = 4
-USE_FROM = "to take the files from elsewhere, name a git mirror or a folder with --from."
+USE_FROM = "to take the files from another place, name a git mirror or a folder with option --from."
 PART = "pad"  # option of layout leaphand, whose files contain several captures; it selects one of them
 Say = Callable[[str], None]
 
@@ -102,7 +102,7 @@ class Source(Strict):
     def commits(self) -> str:
         """The commits from which the files are taken, as words for a message."""
         pinned = sorted({commit for file in self.files if (commit := self.commit_of(file))})
-        unpinned = "newest commit (none is pinned; checksums are checked)"
+        unpinned = "newest commit (pipeline/fetch.yaml names no commit; checksums of the files are checked)"
         return f"commit{'s' * (len(pinned) > 1)} {', '.join(pinned)}" if pinned else unpinned
 
     @property
@@ -153,7 +153,9 @@ def fetch(
         say(f"{folder}: {source.size}, all checksums match")
     scene = scene or source.scene
     if scene is None or not source.recordings:
-        return say(source.note or "the files are in no format that `reskin add` reads, so nothing is added to a scene")
+        return say(
+            source.note or "`reskin add` cannot read the format of these files, so they were not added to a scene"
+        )
     _add_all(root, scene, source, folder, say)
     _say_what_runs(root, scene, running, say)
 
@@ -173,7 +175,9 @@ def download(source: Source, where: str, folder: Path) -> None:
             free_B = shutil.disk_usage(folder.parent).free
             if free_B < needed_B:
                 what = f"needs {needed_B / 1e6:.0f} MB of free disk space; {free_B / 1e6:.0f} MB are free"
-                raise CaptureError(f"{folder.parent.absolute()}: {what}. Free some disk space, and run it again.")
+                raise CaptureError(
+                    f"{folder.parent.absolute()}: {what}. Free some disk space, and run the command again."
+                )
             with TemporaryDirectory(prefix=".git-", dir=folder.parent) as scratch:
                 origins: dict[str | None, Origin] = {}
                 for file in source.files:
@@ -186,7 +190,7 @@ def download(source: Source, where: str, folder: Path) -> None:
     except OSError as error:
         reason = f"{error.strerror or error} at {error.filename or folder}"
         raise CaptureError(
-            f"{folder}: cannot write: {reason}. Free some disk space, or check its permissions."
+            f"{folder}: cannot write the files: {reason}. Free some disk space, or check the permissions of the folder."
         ) from None
 
 
@@ -202,7 +206,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
         rule, got = f"{file.sha256} ({file.bytes_n} bytes)", f"{digest} ({len(content)} bytes)"
-        problem = "The file was changed or truncated, or is another file with this name. Nothing was kept."
+        problem = "The file was changed or truncated, or it is another file with the same name. Nothing was kept."
         remedy = f"{problem} Run the command again; {USE_FROM}"
         raise CaptureError(name, "sha256", rule, got, remedy)
     return content
@@ -226,7 +230,7 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
             added_n += 1
     except BaseException:
         all_n = len(source.recordings)
-        say(f"{added_n} of {all_n} recordings are in scene {scene}; run the same command again to add the rest")
+        say(f"{added_n} of {all_n} recordings are in scene {scene}; to add the others, run the same command again")
         raise
 
 
@@ -334,10 +338,10 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
             _git("cat-file", "-e", f"{commit}^{{commit}}", repository=whole)
         except subprocess.CalledProcessError as error:
             remedy = (
-                "Perhaps the history of the repository was rewritten, or it is a clone that was made with --depth. "
-                f"Use a complete clone; {USE_FROM}"
+                "Perhaps the history of the repository was rewritten, or the repository is an incomplete clone that "
+                f"was made with --depth. Use a complete clone; {USE_FROM}"
             )
-            what = f"the repository does not have commit {commit}, at which the files are pinned ({_reason(error)})"
+            what = f"the repository does not have commit {commit}, from which the files are taken ({_reason(error)})"
             raise CaptureError(f"{url}: {what}. {remedy}") from None
 
     def read(path: str) -> bytes:
@@ -365,7 +369,9 @@ def _git(*arguments: str, repository: Path | None = None) -> bytes:
             env={**os.environ, **silent},
         ).stdout  # fmt: skip
     except FileNotFoundError:
-        raise CaptureError("git is not installed. Install it, or name a folder of the files with --from.") from None
+        raise CaptureError(
+            "git is not installed. Install git, or name a folder that contains the files with option --from."
+        ) from None
 
 
 def _reason(error: subprocess.CalledProcessError) -> str:

@@ -28,7 +28,11 @@ from reskin.errors import ParamsError
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
 REPORTS = "reports/"  # our version of reports is kept until the next `dvc repro` writes them again
-SIDES = ("1", "2", "3")  # git's numbers for the three versions of a file in conflict: base, ours and theirs
+SIDES = (
+    "1",
+    "2",
+    "3",
+)  # git's numbers of the three versions of a file in conflict: the common ancestor, ours, and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
@@ -36,9 +40,14 @@ def merge(root: Path) -> str:
     """Resolve the conflicts of a merge; return a sentence about what was done and what remains to do."""
     unmerged = _unmerged(root)
     if by_hand := [name for name in unmerged if name not in RESOLVED and not name.startswith(REPORTS)]:
-        raise ParamsError(f"Resolve {', '.join(by_hand)} by hand, `git add` them, and run `reskin merge` again.")
+        raise ParamsError(
+            f"{', '.join(by_hand)}: resolve the conflicts in these files by hand. Then add the files with `git add`, "
+            "and run `reskin merge` again."
+        )
     if not unmerged:
-        raise ParamsError("No file is in conflict. Run first: git merge BRANCH, or git pull.")
+        raise ParamsError(
+            "No file is in conflict, so there is nothing to resolve. Run git merge BRANCH or git pull first."
+        )
     files = [root / name for name in RESOLVED if (root / name).exists()]
     with io.restoring(*files):
         if REGISTRY in unmerged:
@@ -51,9 +60,12 @@ def merge(root: Path) -> str:
             command = ["rm", "--quiet"] if name in deleted else ["checkout", "--ours"]
             _git(root, *command, "--", name)
     _git(root, "add", "--all", "--", *(name for name in unmerged if name not in deleted), PLAN)
-    changed = f" {len(changed_stages)} stages, which both branches ran, may run again." if changed_stages else ""
+    changed = f" {len(changed_stages)} stages that both branches ran may run again." if changed_stages else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
-    return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
+    return (
+        f"resolved the conflicts in {', '.join(unmerged)}. The registry has {captures_n} captures.{changed} Now run: "
+        "git commit, dvc pull, dvc repro"
+    )
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
@@ -119,7 +131,7 @@ def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
 
 def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
     """Merge the versions of dvc.lock; return the names of stages that both sides changed."""
-    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported late: the import takes a second
+    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported here, because the import takes a second
 
     base, ours, theirs = _versions(root, blobs)
     stages, both = merge_stages(*(content.get("stages", {}) for content in (base, ours, theirs)))
@@ -150,7 +162,7 @@ def _unmerged(root: Path) -> dict[str, dict[str, str]]:
 def _git(root: Path, *arguments: str) -> str:
     """Run git in the checkout, and return its output."""
     if not which("git"):
-        raise ParamsError("reskin merge needs git: install it.")
+        raise ParamsError("reskin merge needs git, which is not installed. Install git.")
     completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     if completed.returncode:
         raise ParamsError(f"git {arguments[0]} failed: {' '.join(completed.stderr.split())[-300:]}")

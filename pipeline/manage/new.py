@@ -13,7 +13,9 @@ from reskin.recordings.header import NAME
 from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
 from reskin.universal.model import FILE
 
-POOL_MAX_N = 40  # largest number of indentations that may be labelled, as in scene lab
+POOL_MAX_N = (
+    40  # largest number of indentations of a held-out skin for calibration; scene lab also uses at most 40 labels
+)
 LABELS_N = (0, 5, 10, 20, 40)
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\
@@ -26,10 +28,10 @@ experiments: [{experiments}]
 selection:
   force_min_N: 0.0 # readings with a smaller measured force are treated as no contact
 split:
-  transfer_skins_n: {transfer_n} # experiment transfer: number of boards of which one skin is trained on
+  transfer_skins_n: {transfer_n} # experiment transfer trains networks on one skin each; number of their boards
 {pool_passes}\
   labels_pool_n: {pool_n} # indentations of a held-out skin for calibration, with or without labels; not tested
-  labels_draws_n: 1 # random draws of these indentations; more take longer, and make the scores more precise
+  labels_draws_n: 1 # random draws of these indentations; more draws take longer and make the scores more precise
 train_single: {{recipe: paper, steps_n: 3000, seeds_n: 1, variants: {{}}}}
 train_multi: {{recipe: paper, steps_n: 3000, seeds_n: 3, variants: {{}}}}
 train_triplet: {{recipe: triplet, steps_n: 3000, seeds_n: 3, variants: {{}}}}
@@ -38,7 +40,7 @@ few_labels:
   labels_n: {labels_n}
   recipe: paper
   steps_n: 3000
-  recipes: # each recipe lists the values that differ from the shared row
+  recipes: # each entry lists the settings that differ from the recipe that is named above
     network: {{}}
     network-shape: {{inputs: shape}}
   adapted: []
@@ -54,7 +56,7 @@ calibrated:
 audit: # optional: similar_skins, weak_skins
   settings: chosen
 compare:
-  labels_mirrored: false # true if y of the labels points opposite to y of the board
+  labels_mirrored: false # true if the y axis of the labels is opposite to the y axis of the board
   memory: 0.065 # part of a field change that remains in the next no-load reading; assumed, as in scene lab
   # The layout of your boards: all experiments that simulate skins or use the universal model refer to it.
   layout:{layout}
@@ -67,7 +69,7 @@ adapt:
   steps_n: 300
   pokes_n: {pokes_n} # unlabelled indentations: those of the first pass
   variants:
-    control: {{unlabelled_weight: 0.0}} # as many steps, without the new skin's indentations
+    control: {{unlabelled_weight: 0.0}} # equally many steps, but without the new skin's indentations
 """
 ABOUT_MODEL = """\
 # Experiment calibrated tests a universal model for the layout below. To run it, make the model:
@@ -75,10 +77,10 @@ ABOUT_MODEL = """\
 # and add calibrated to the list of experiments.
 """
 ONE_BOARD = (
-    "two or more boards are needed, because one board cannot be held out and trained on. To train on the first passes "
-    "over one board and test on its last passes, run instead: reskin add RECORDING --layout table --board B --skin S "
-    "--scene NAME --like ini. Or use the universal model, which needs no training: see docs/live.md, Calibrate the "
-    "universal model"
+    "two or more boards are needed, because one board cannot be held out and also be trained on. To train on the "
+    "first passes over one board and test on its last passes, run instead: reskin add RECORDING --layout table "
+    "--board B --skin S --scene NAME --like ini. Or use the universal model, which needs no training: see "
+    "docs/live.md, Calibrate the universal model"
 )
 
 
@@ -109,13 +111,14 @@ def new(
     """
     for option, name in (("SCENE", scene), *(("--boards", board) for board in boards)):
         if not re.fullmatch(NAME, name):
-            raise ParamsError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
+            rule = "1 to 64 characters of A-Z a-z 0-9 _ -"
+            raise ParamsError(option, "a name", rule, repr(name), "Choose another name.")
     if len(set(boards)) < len(boards):
         raise ParamsError(f"--boards: {', '.join(boards)}: a name occurs twice. Name each board once.")
     if len(boards) < 2:
         raise ParamsError(f"--boards: {ONE_BOARD}.")
     if scene in scene_names(root):
-        raise ParamsError(f"{root / SCENES / scene}.yaml exists. Choose another name, or edit this file.")
+        raise ParamsError(f"{root / SCENES / scene}.yaml exists already. Choose another name, or edit this file.")
     file = root / SCENES / f"{scene}.yaml"
     io.write_text(file, scene_text(scene, boards, presses_n, passes_n, layout, source))
     try:
@@ -171,15 +174,15 @@ def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequenc
         steps.append("experiment adapt is left out, because it needs two or more passes over each skin (--passes 2)")
     if "calibrated" not in experiments:
         steps.append(
-            "experiment calibrated is left out, because it needs a universal model for your layout; the scene's file "
-            "says how to make one"
+            "experiment calibrated is left out, because it needs a universal model for your layout; a comment in the "
+            "scene's file says how to make this model"
         )
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
     if source == "simulated":
         add = f"reskin add captures/BOARD_SKIN ... --layout capture --scene {scene}"
     if layout is None:
         steps.append(
-            "next: describe your boards in this file, under key layout of section compare, which now describes the "
-            "paper's board"
+            "next: describe your boards in this file, in section compare, under key layout. At present, this key "
+            "describes the paper's board"
         )
     return [*steps, f"then: {add}" if layout is None else f"next: {add}"]

@@ -63,7 +63,9 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
     if original is not None:
         _refuse_copy(where, original, captures[original], entry, allow_copy)
     if capture in captures:
-        raise CaptureError(f"the name {capture} is taken in scene {scene}. Choose another with --name.")
+        raise CaptureError(
+            f"scene {scene} already has a capture with the name {capture}. Choose another name with option --name."
+        )
     for name, other in captures.items():
         if other.skin == entry.skin and other.board != entry.board:
             what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
@@ -74,7 +76,7 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:
             what = f"it has {entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"
-            raise CaptureError(f"{where}: {what}. Add it to another scene.")
+            raise CaptureError(f"{where}: {what}. Add the capture to another scene.")
     added = entry.model_copy(update={"copy_of": original})
     return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
 
@@ -106,7 +108,10 @@ def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_c
     relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return
-    remedy = "It is in the scene already."
+    remedy = "Nothing has to be added, because the recording is in the scene already."
     if relabelled:
-        remedy = "Under two names, folds would train and test on the same readings; to allow that, use --allow-copy."
+        remedy = (
+            "If both are in the scene under different names, networks may be trained and tested on the same readings. "
+            "To allow this, use option --allow-copy."
+        )
     raise CaptureError(f"{where}: it has the same readings as {original}. {remedy}")

@@ -16,11 +16,14 @@ def require_idle(root: Path) -> None:
     if users:
         pid = min(users)
         raise ParamsError(
-            f"`dvc repro` runs in this checkout (process {pid}). Nothing was changed: try again when it has ended. "
-            f"If process {pid} is not DVC, delete {DVC_FILES / RWLOCK} first."
+            f"`dvc repro` is running in this checkout (process {pid}), so nothing was changed. Run the command again "
+            f"when `dvc repro` has ended. If process {pid} is not DVC, delete {DVC_FILES / RWLOCK} first."
         )
     if _is_locked(root / DVC_FILES / LOCK):
-        raise ParamsError("`dvc repro` runs in this checkout. Nothing was changed: try again when it has ended.")
+        raise ParamsError(
+            "`dvc repro` is running in this checkout, so nothing was changed. Run the command again when `dvc repro` "
+            "has ended."
+        )
 
 
 def dvc_processes(root: Path) -> dict[int, str]:
@@ -43,14 +46,14 @@ def _is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # a process of another user
+        return True  # the process exists, but belongs to another user
     return True
 
 
 def _is_locked(file: Path) -> bool:
     if not file.exists():
         return False
-    from zc.lockfile import LockError, LockFile  # imported late: a dependency of DVC
+    from zc.lockfile import LockError, LockFile  # a dependency of DVC; imported here, because it is rarely needed
 
     try:
         LockFile(str(file)).close()

@@ -12,13 +12,13 @@ from pipeline.report.summary import summarise
 from reskin.errors import SchemaError
 
 COMMITTED = "HEAD"
-WIDTH = 100  # columns
+WIDTH = 100  # largest number of characters in a line
 NEXT = (
     ("{page}", "figures and tables; open it in a browser"),
-    ("make ui", "MLflow: every training with its curve, scores and model"),
-    (".venv/bin/reskin live --emulate nominal", "contacts on a simulated board, live"),
-    ("docs/tutorial.md", "in 30 minutes from a simulated board to your own model"),
-    ("docs/add-a-skin.md", "your own boards: reskin new, reskin add, dvc repro"),
+    ("make ui", "MLflow: all training runs with curves, scores and models"),
+    (".venv/bin/reskin live --emulate nominal", "live estimates of contacts on a simulated board"),
+    ("docs/tutorial.md", "from a simulated board to your own model in 30 minutes"),
+    ("docs/add-a-skin.md", "use your own boards: reskin new, reskin add, dvc repro"),
 )
 
 
@@ -48,7 +48,7 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
     """Say in sentences whether a report equals the committed one."""
     try:
         committed = read_revision(root, scene, COMMITTED)
-    except SchemaError:  # a scene of the user
+    except SchemaError:  # the report was never committed, for example because the scene is new
         return [f"Scene {scene}: its report is not committed, so there is nothing to compare it with."]
     parts = compare_reports(committed, fresh)
     values = f"{sum(part.compared_n for part in parts.values()):,} numbers and table cells"
@@ -59,13 +59,13 @@ def _comparison(root: Path, scene: str, fresh: Report) -> list[str]:
                     f"Scene {scene} is reproduced: all results from which its report is made equal those in dvc.lock, "
                     f"so DVC kept the report {committed.where}, with {values}."
                 ]
-            return [f"Scene {scene}: reports/{scene} is the report {committed.where}; it was not computed again."]
+            return [f"Scene {scene}: reports/{scene} is still the report {committed.where}; it was not computed again."]
         return [f"Scene {scene} is reproduced: all {values} equal those {committed.where}."]
     return [
         f"Scene {scene} is not reproduced exactly: {_differences(parts)} of {values} differ from those "
         f"{committed.where}.",
         *_probable_reasons(committed.provenance, fresh.provenance),
-        f"All differences: reskin compare {scene}",
+        f"To list all differences: reskin compare {scene}",
     ]
 
 

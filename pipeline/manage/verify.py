@@ -22,7 +22,11 @@ from reskin import io
 from reskin.errors import SchemaError
 
 VERIFIED = ".reskin/verified"  # reports of the last reruns, for inspection and for `--against` on another machine
-QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as in the Makefile
+QUIET = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DVC_NO_ANALYTICS": "1",
+    "OMP_NUM_THREADS": "1",
+}  # the Makefile sets the same variables
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
@@ -43,12 +47,15 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 def rerun(root: Path, names: Sequence[str]) -> None:
     """Run scenes in a clone of the last commit, and keep the new reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
-        say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit is run")
+        say(
+            f"warning: {len(changed.splitlines())} files differ from the last commit. The files of the last commit are "
+            "used, without these changes."
+        )
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
         _bring_recordings(root, clone, names)
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # for stages, which call `python`
         environment = {**QUIET, **os.environ, PUBLISH: "0", "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
@@ -88,7 +95,8 @@ def _run(clone: Path, environment: Mapping[str, str], *arguments: str, quiet: bo
             raise
     if process.returncode:
         raise SchemaError(
-            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode})."
+            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode}). The "
+            "messages above say why."
         )
 
 

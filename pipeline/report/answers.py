@@ -24,21 +24,26 @@ from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE
 
 PLACE, FORCE = "place", "force"
 YES, PARTLY, NO, UNTESTED = "yes", "partly", "no", "not tested"
-PLACE_PARTLY_PCT = 50.0  # assumed; the paper requires `PLACE_ACCURACY_MIN_PCT`
+PLACE_PARTLY_PCT = (
+    50.0  # assumed limit for "partly"; the limit for "yes" is the paper's requirement `PLACE_ACCURACY_MIN_PCT`
+)
 FORCE_YES_R2, FORCE_PARTLY_R2 = 0.9, 0.5  # assumed; the paper states no requirement for the force on a new skin
 LEVELS = (
-    f"Place, yes: at least {PLACE_ACCURACY_MIN_PCT:g} % of readings are within 1 mm in x and in y, which is the "
-    f'paper\'s "1mm with 90% accuracy"; partly: at least {PLACE_PARTLY_PCT:g} %. Force, yes: R² is at least '
-    f"{FORCE_YES_R2:g}; partly: at least {FORCE_PARTLY_R2:g}. We chose all of these limits but the first. For a yes, "
-    "the whole interval has to be above the limit, or all boards, if there are fewer than four."
+    f"For places, the answer is yes if at least {PLACE_ACCURACY_MIN_PCT:g} % of the readings are within 1 mm in x and "
+    'in y (the paper\'s requirement "1mm with 90% accuracy"), and partly if at least '
+    f"{PLACE_PARTLY_PCT:g} % are. For forces, the answer is yes if R² is at least {FORCE_YES_R2:g}, and partly if R² "
+    f"is at least {FORCE_PARTLY_R2:g}. The first of these limits is the paper's, and we chose the others. For a yes, "
+    "the whole interval has to be above the limit. With fewer than four boards there is no interval; then the value "
+    "of every board has to be above the limit."
 )
 IN_BRACKETS = (
-    "[low, high]: 95 % interval over the held-out boards (Student's t); (a; b): the values of the boards, if there are "
-    "fewer than four; ±: standard deviation over pairs of a training skin and a tested skin."
+    "[low, high] is the 95 % interval over the held-out boards (Student's t). With fewer than four boards there is no "
+    "interval, and (a; b) are the values of the boards. ± is the standard deviation over pairs of a training skin and "
+    "a tested skin."
 )
-SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the root of each squared error
+SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the square root of each mean squared error
 UNIVERSAL = "universal, "  # prefix of the methods in `labels` that are calibrated to the tested skin
-NOTHING, UNLABELLED = "nothing", "presses without labels"
+NOTHING, UNLABELLED = "none", "presses without labels"
 NONE_HELD_OUT = "no board held out"
 ANSWER, SECOND, COMPARED = "answer", "second", "compared"
 RIG, SHIPPED = WAYS  # methods of experiment random_presses
@@ -53,8 +58,8 @@ WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the fi
 class Effort:
     """Scores of a model on new skins, and the data that it needs of a new skin; `paper` has the paper's means.
 
-    `role`: `answer` if this model gives the answer of the scene, `second` if the answer in short names it too,
-    `compared` if another sentence compares it with the answer.
+    `role` is `answer` if the answer of the scene is about this model, `second` if the short form of the answer also
+    states the score of this model, and `compared` if another sentence compares this model with the answer's model.
     """
 
     model: str
@@ -73,7 +78,7 @@ class Effort:
         ]
         return {
             "model": self.model,
-            "needed of the new skin": self.needs,
+            "data needed from the new skin": self.needs,
             "place: within 1 mm": show_with_unit(self.scores.get("accuracy_pct"), "%"),
             "place: rms error": show_with_unit(rms(self.scores.get("mse_xy_mm2")), "mm"),
             "force: rms error": show_with_unit(rms(self.scores.get("mse_f_N2")), "N"),
@@ -84,9 +89,9 @@ class Effort:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer for the place or the force of a contact: a level, the answer in short, and sentences with numbers.
+    """The answer for the place or the force of a contact: a level, a short form, and sentences with numbers.
 
-    `second`: a sentence about the second model, which belongs to the answer in short.
+    `second` is a sentence about the second model, which is shown together with the short form of the answer.
     """
 
     quantity: str
@@ -119,8 +124,9 @@ def answers(numbers: Results) -> Answers:
 def rms(mse: Stat | None) -> Stat | None:
     """Return the square root of a mean squared error, with its interval or the values of its boards.
 
-    With values of boards, the mean is that of the boards' square roots.
-    Standard deviations are omitted, because that of the squared errors is not that of their square roots.
+    If the values of boards are known, the square root of each value is computed, and the mean is the mean of these
+    roots. The result has no standard deviation, because the standard deviation of the square roots cannot be computed
+    from the standard deviation of the squared errors.
 
     >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]})
     {'mean': 0.5, 'n': 6, 'ci95': [0.4, 0.6]}
@@ -140,7 +146,7 @@ def level(stat: Stat, yes: float, partly: float) -> str:
 
 
 def _efforts(numbers: Results) -> Iterator[Effort]:
-    """Yield the models to show; the one that needs most of the new skin comes last."""
+    """Yield the models to show; the model that needs the most data from the new skin comes last."""
     if boards_rows(numbers):
         yield from _efforts_on_random_presses(numbers)
         return
@@ -151,7 +157,7 @@ def _efforts(numbers: Results) -> Iterator[Effort]:
     adapting = f"{numbers.get('adapt', {}).get('pokes_n', ADAPTED_POKES_N)} presses without labels"
     rows = [row for row in ("single", "multi", "triplet", "adapted") if row in table2]
     ours = universal_rows(numbers) if rows else []
-    # A scene without the row of one skin does not repeat the whole of table 2: it is about the universal model.
+    # A scene without row `single` does not reproduce the whole of table 2, so it is about the universal model.
     network_role, our_role = (SECOND, ANSWER) if ours and "single" not in table2 else (ANSWER, SECOND)
     for row in rows:
         title = ADAPTED if row == "adapted" else known[row].title
@@ -204,8 +210,8 @@ def _tested(numbers: Results, best: Effort) -> str:
     boards = f"{boards_n} {source} boards with {skins_n} skins" if boards_n and skins_n else f"{source} boards"
     held_out = f"Tested on {boards}; no tested board or skin was in training."
     if source == "simulated":
-        held_out += " This is no evidence about real skins."
-    return f"{held_out} Model: {best.model}. It needs of the new skin: {best.needs}."
+        held_out += " All readings were simulated, so these results are no evidence about real skins."
+    return f"{held_out} Model: {best.model}. Data that this model needs from the new skin: {best.needs}."
 
 
 def _held_out_n(numbers: Results) -> tuple[int, int]:
@@ -224,12 +230,15 @@ def _place(best: Effort, others: Sequence[Effort]) -> Answer:
     error = show_with_unit(rms(best.scores.get("mse_xy_mm2")), "mm")
     second = ""
     sentences = [
-        f"rms error along x or y: {error}.",
+        f"Rms error of one coordinate (x or y): {error}.",
         f'The paper\'s requirement, "1mm with 90% accuracy": {_requirement(accuracy)}.',
     ]
     if best.paper:
         paper_mm = sqrt(best.paper["mse_xy_mm2"])
-        sentences.append(f"Paper: {three_digits(best.paper['accuracy_pct'])} %; {paper_mm:.2f} mm.")
+        sentences.append(
+            f"Paper: {three_digits(best.paper['accuracy_pct'])} % within 1 mm; rms error of one coordinate "
+            f"{paper_mm:.2f} mm."
+        )
     for other in others:
         sentences.append(f"{_named(other)}: {show_with_unit(other.scores['accuracy_pct'], '%')} within 1 mm.")
         second = sentences[-1] if other.role == SECOND else second
@@ -245,7 +254,7 @@ def _requirement(accuracy: Stat) -> str:
         return "reached on all boards" if few else "reached"
     if max(ends) < PLACE_ACCURACY_MIN_PCT:
         return "reached on no board" if few else "not reached"
-    return "reached on some boards" if few else "inconclusive, because the interval includes it"
+    return "reached on some boards" if few else f"inconclusive (the interval includes {PLACE_ACCURACY_MIN_PCT:g} %)"
 
 
 def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
@@ -253,18 +262,20 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
     if explained is None or error is None:
         return Answer(FORCE, UNTESTED, "the recordings have no forces")
     second = ""
-    sentences = [f"{show_with_unit(error, 'N')} rms; R² {show(explained)}.", *_forces(numbers)]
+    sentences = [f"Rms error: {show_with_unit(error, 'N')}; R²: {show(explained)}.", *_forces(numbers)]
     constant = numbers.get("constant_force", {}).get("labels" if numbers.get("labels") else "table2")
     if best.paper:
-        sentences.append(f"Paper: {sqrt(best.paper['mse_f_N2']):.2f} N, at forces that it does not state.")
+        sentences.append(
+            f"Paper: rms error {sqrt(best.paper['mse_f_N2']):.2f} N. The paper does not state how large its forces are."
+        )
     for other in others:
         r2 = other.scores["r2_f"]
         shown = show_with_unit(rms(other.scores["mse_f_N2"]), "N")
-        sentences.append(f"{_named(other)}: {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
+        sentences.append(f"{_named(other)}: rms error {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
         second = sentences[-1] if other.role == SECOND else second
     short = f"rms error {two_digits(error['mean'])} N"
     if constant and (guessing := rms(constant["mse_f_N2"])):
-        short += f", against {two_digits(guessing['mean'])} N for always guessing the mean force"
+        short += f" (always predicting the mean force: {two_digits(guessing['mean'])} N)"
     if force_level(explained) == NO:
         short = f"not usable; {short}"
     return Answer(FORCE, force_level(explained), short, tuple(sentences), second)
@@ -289,18 +300,18 @@ def _forces(numbers: Results) -> list[str]:
 
 
 def _within_skin(numbers: Results) -> Answers:
-    """Answer `not tested` for a scene that holds out no board, with the scores on skins that were in training."""
+    """Answer `not tested` for a scene that holds out no board, and state the scores on skins that were in training."""
     split = next((name for name in WITHIN_SKIN if name in numbers), None)
     tested = "This scene holds out no board, so it does not test new skins."
     if split is None:
         return Answers(tested, Answer(PLACE, UNTESTED, NONE_HELD_OUT), Answer(FORCE, UNTESTED, NONE_HELD_OUT))
-    own = "Same skin, later readings"
+    own = "Scores on skins that were in training, for held-out readings"
     skins = numbers.get("single_skins", {"": {name: stat["mean"] for name, stat in numbers[split].items()}})
     places, forces = [], []
     for skin, scores in skins.items():
         seen = numbers.get("hover", {}).get(skin, {}).get("seen", False)
         named = f"{skin}: " if skin else ""
-        magnetic = ", but the tip is sensed without touch too" if seen else ""
+        magnetic = ", but the chips also sense the tip without touch" if seen else ""
         places.append(f"{named}{three_digits(scores['accuracy_pct'])} % within 1 mm{magnetic}")
         if "mse_f_N2" in scores:
             forces.append(f"{named}rms error {two_digits(sqrt(scores['mse_f_N2']))} N, R² {scores['r2_f']:.3f}")

@@ -33,43 +33,50 @@ SIGNIFICANT = 0.05  # convention: a claim of the family is significant if its ad
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less than this, in percentage points
 NONE = "–"
 NOT_RUN = "not run in this scene"
-NOT_REACHED = "not reached in this scene"
+NOT_REACHED = "the experiment of this scene is too small for this result"
 SHORT_OF = "smaller than the paper's: "  # prefix of a note on the size of our experiment
-ONE_SKIN = "our networks were trained on one skin each: not comparable"
+ONE_SKIN = "not comparable with the paper, because each of our networks was trained on only one skin"
 SETTING = "a setting of this scene, not a result"
-TARGET = "an earlier simulated skin was calibrated to this number: agreement is not evidence"
-EQUIVALENT = "equivalent to no difference: the whole interval is nearer to 0 than half of the paper's difference"
+TARGET = "an earlier simulation was calibrated to this number of the paper, so agreement is not evidence"
+EQUIVALENT = (
+    "equivalent to no difference, because the whole interval is nearer to 0 than half of the paper's difference"
+)
 # Paths of results that are comparable with the paper only if networks were trained on several skins.
 NEEDS_POOLING = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")
-# Verdicts on numbers: whether our interval over boards includes the paper's mean.
+# Verdicts on numbers. They say whether our interval over boards includes the paper's mean.
 AGREES, DIFFERS = "within interval", "significant difference"
 NO_INTERVAL = "not judged (no interval over boards)"
 DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules for differences, which are shown with a sign
 FAMILY = (
-    "The claims of section 5 about accuracy form one family, which was listed before any run (`family` in "
-    "checklist.yaml). Their p-values (Student's t over boards) are adjusted by Holm's method. A claim of the family is "
-    f"supported or contradicted only if its adjusted p-value is {SIGNIFICANT:g} or less. All other verdicts are "
-    f"unadjusted and exploratory. A gain is sizeable if it is at least {100 * SIZEABLE:g} % of the paper's difference. "
-    "A difference is equivalent to no difference if its whole interval is nearer to 0 than that."
+    "The claims of section 5 about accuracy are tested as one family. The family was listed before any run "
+    "(`family` in checklist.yaml). Its p-values (Student's t over boards) are adjusted for the number of tests by "
+    "Holm's method. A claim of the family is supported or contradicted only if its adjusted p-value is "
+    f"{SIGNIFICANT:g} or less. The verdicts on all other claims are not adjusted, and are therefore exploratory. A "
+    f"gain is sizeable if it is at least {100 * SIZEABLE:g} % of the paper's difference. A difference is equivalent to "
+    f"no difference if its whole interval is nearer to 0 than {100 * SIZEABLE:g} % of the paper's difference."
 )
 MEANING = (
-    f"{reworded(VERDICTS)} A number of the paper that is not a claim is within interval "
-    "or a significant difference: our interval over boards includes the paper's mean, or not; the paper's own "
-    f"deviation is not considered. {FAMILY} Met: whether our mean meets the criterion. Slightly: the "
-    f"accuracy changes by less than {FEW_POINTS:g} percentage points. Plateau: it changes by less than "
-    f"{PLATEAU_POINTS:g}. The reasons in the notes are assumptions, which no run has tested. See: there is no "
-    "single number to compare; the result is in the table or figure that is named."
+    f"{reworded(VERDICTS)} If a number of the paper is not a claim, the verdict says whether our interval over boards "
+    f'includes the paper\'s mean ("{AGREES}") or not ("{DIFFERS}"). These two verdicts do not take the standard '
+    f"deviation of the paper's number into account. {FAMILY} Column met says whether our mean meets the criterion. "
+    f'"Slightly" means that the accuracy changes by less than {FEW_POINTS:g} percentage points, and "plateau" means '
+    f"that it changes by less than {PLATEAU_POINTS:g} percentage points. The reasons in column note are assumptions, "
+    "which no run has tested. If a result is not a single number, column ours names the table or figure that shows it "
+    '("see ...").'
 )
 CLAIMS_MEANING = f"{reworded(VERDICTS)} {FAMILY}"
 NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # the name of a number in the text of a reason
 
 
 class Reach(Strict):
-    """Sizes of the paper's experiment (a constant of `pipeline.report.paper`) and of ours (a path in numbers.json)."""
+    """The sizes of the paper's experiment and of ours, for example the numbers of training readings.
+
+    `paper` names a constant of `pipeline.report.paper`, and `ours` is a path in numbers.json.
+    """
 
     paper: str
     ours: str
-    of: str  # what is counted
+    of: str  # name of what is counted, for example "training readings"
 
 
 class Row(Strict):
@@ -240,14 +247,14 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if not pooled and row.ours.startswith(NEEDS_POOLING):
         return Judgement(notes=(ONE_SKIN,))
     if isinstance(ours, bool):
-        return Judgement(FEW_BOARDS, "holds on the board that was measured", _yes(ours))
+        return Judgement(FEW_BOARDS, "true on the board that was measured", _yes(ours))
     if row.rule == "setting" or (row.rule == "input" and simulated):
         return Judgement(notes=(SETTING,))
     if row.rule == "view":
         return Judgement()
     if row.rule == "finding":
         met = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
-        return Judgement(ours["verdict"], "holds for these trainings", met)
+        return Judgement(ours["verdict"], "true for the networks that were trained", met)
     if row.rule == "each":
         return _judge_each(ours)
     if row.rule in DIFFERENCES:
@@ -264,12 +271,12 @@ def _judge_difference(row: Row, printed: float | None, ours: Stat) -> Judgement:
     if row.rule in ("slight", "plateau"):
         margin = FEW_POINTS if row.rule == "slight" else PLATEAU_POINTS
         verdict = statistics.verdict_within(ours, margin)
-        return Judgement(verdict, f"within ±{margin:g} points", _yes(abs(ours["mean"]) < margin))
+        return Judgement(verdict, f"change of less than {margin:g} points", _yes(abs(ours["mean"]) < margin))
     improvement = gain(ours, row.metric)
     limit, criterion = 0.0, "gain above 0"
     if row.rule == "sizeable":
         limit = sizeable(printed)
-        criterion = f"gain above {limit:.3g}, half of the paper's"
+        criterion = f"gain above {limit:.3g} (half of the paper's gain)"
     low, high = improvement.get("ci95", (-float("inf"), float("inf")))
     notes = (EQUIVALENT,) if printed and max(-low, high) < sizeable(printed) else ()
     return Judgement(
@@ -296,7 +303,7 @@ def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
     by_number = "; ".join(f"{count}: {verdict}" for count, verdict in zip(counts, verdicts.values(), strict=True))
     return Judgement(
         statistics.combine_verdicts(list(verdicts.values())),
-        "gain above 0 at every number of training skins",
+        "gain above 0 for every number of training skins",
         _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
         notes=(reworded(by_number),),
     )
@@ -305,14 +312,15 @@ def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
 def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
     """Judge whether our interval includes the paper's mean.
 
-    Also judge whether our mean is within one sd of the paper's, or within 10 % if the paper gives no sd.
+    Also judge whether our mean is within one standard deviation of the paper's mean. If the paper gives no standard
+    deviation, our mean must be within 10 % of the paper's number.
     """
     value, mean = mean_of(ours), mean_of(printed)
     if value is None or mean is None:
         return Judgement()
-    tolerance, criterion = NEAR * abs(mean), f"within {100 * NEAR:g} % of the paper's"
+    tolerance, criterion = NEAR * abs(mean), f"within {100 * NEAR:g} % of the paper's number"
     if isinstance(printed, tuple):
-        tolerance, criterion = printed[1], "within the paper's sd"
+        tolerance, criterion = printed[1], "within the paper's standard deviation"
     inside = {"yes": AGREES, "no": DIFFERS}.get(_paper_in_interval(printed, ours))
     few = FEW_BOARDS if isinstance(ours, Mapping) and "values" in ours else NO_INTERVAL
     met = _yes(abs(value - mean) <= tolerance)
@@ -354,7 +362,7 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
     value = resolve(vars(paper) if name[0].isupper() else numbers, name)
     if value is None:
         problem = f"{name} is neither a constant of pipeline.report.paper nor a path in numbers.json"
-        raise SchemaError(f"{FILE.name}: {problem}. Correct the name.")
+        raise SchemaError(f"{FILE.name}: {problem}. Correct the name in {FILE.name}.")
     return value
 
 
@@ -389,7 +397,8 @@ def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
 def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
     """Return the row's possible reason, with its numbers filled in, if our mean does not meet the criterion.
 
-    A reason that names several numbers is their difference, so it is omitted if they are equal as shown.
+    If a reason names several numbers, the reason is that these numbers differ. It is therefore omitted if the numbers
+    are equal after rounding.
     """
     why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
     if not why or judgement.met != "no":

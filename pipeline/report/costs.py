@@ -16,12 +16,13 @@ TRADE_OFFS = {
 }
 STUDIES = ("quadratures", "integrators")
 COMPUTED = (
-    "Computed: the time in which the stage computed all its results, as if its training runs had run one after "
-    "another. Two of them run side by side, so less time passes. Last run: the time of the last run, which reuses the "
-    "training runs that were completed before."
+    "Column computed is the time that a stage takes to compute all its results if its training runs run one after "
+    "another. By default, two training runs run at the same time, so less time passes. Columns last run are about the "
+    "last run of the stage. The last run may have taken less time than computed, because it reuses training runs that "
+    "were completed before."
 )
 MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
-# Size of rounding errors. Smaller errors are drawn at this value, because a logarithmic axis cannot show 0.
+# About the size of rounding errors. Smaller errors are drawn at this value, because a logarithmic axis cannot show 0.
 ERROR_SHOWN_MIN = 1e-16
 
 Row = Mapping[str, Any]
@@ -29,9 +30,9 @@ Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against run times; return texts by file name.
+    """Draw and tabulate errors against run times; return the texts of the figures and tables by file name.
 
-    Methods without times on this machine are left out of figures.
+    Methods that were not timed on this machine are left out of the figures.
     """
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
     for name, (key, cost) in TRADE_OFFS.items():
@@ -61,7 +62,7 @@ def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
         for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
     ]
     references = [
-        {"method": row["method"], "until ready, s": _time(row, "train_s")}
+        {"method": row["method"], "time until ready, s": _time(row, "train_s")}
         | {"per reading, µs": _time(row, "inference_us"), "source": source}
         | scored(row)
         for row in runtime.get("rivals_costs", [])
@@ -98,7 +99,7 @@ def study_table(rows: Rows, source: str) -> pd.DataFrame:
             "study": row["study"],
             "method": row["method"],
             "setting": row["setting"],
-            "nodes or right-hand sides": str(row["work_n"]),
+            "number of nodes or right-hand sides": str(row["work_n"]),
             "error": "–" if row["error"] is None else f"{row['error']:.2g}",
             "median ms per indentation": f"{1e3 * row['median_s']:.3g}" if "median_s" in row else "–",
             "failure": row["failure"] or "",
@@ -119,7 +120,7 @@ class Point:
 
     name: str
     label: str
-    position: tuple[float, float]  # cost, error
+    position: tuple[float, float]  # (cost, error)
     look: Mapping[str, Any]
 
 
@@ -136,7 +137,7 @@ def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
             style = {"xytext": (-5, -5), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
             axes.annotate(point.label, point.position, **style)
         steps = zip(*(point.position for point in members), strict=True)
-        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbered)")
+        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbered methods)")
         figure.legend(loc="outside lower left", frameon=False, fontsize=8, ncols=2)
         return svg(figure)
 
@@ -196,9 +197,9 @@ def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
     return draw_study(
         rows,
         title=f"Error of the field change dB against run time ({source})",
-        error="rms error / rms dB, worst skin and depth",
-        note="Kernel alone and magpylib: the time of the field only, because nodes were moved beforehand. "
-        "Other methods: the time of flow and field.",
+        error="rms error / rms dB (worst skin and depth)",
+        note="Times of method kernel alone and of magpylib include only the computation of the field, because the "
+        "nodes were moved before. Times of all other methods include the motion of the nodes (flow) and the field.",
         limit=ERROR_MAX,
         rings=rings,
     )

@@ -24,8 +24,8 @@ FORCE = "headline_force.svg"
 HEADLINES = {HEADLINE: ("accuracy_pct", "mse_xy_mm2"), FORCE: ("mse_f_N2", "r2_f")}  # metrics of places and of forces
 UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # metrics for boards that were never seen in training
 LABELS = "labels.svg"
-OFFSET = 0.17  # distance of both marks of a row from the row's middle, as a fraction of its height
-WORST_MM = 2.0  # end of the colour scale of all error maps: twice the largest error that counts as correct
+OFFSET = 0.17  # distance of both marks of a row from the row's middle, as a fraction of the row's height
+WORST_MM = 2.0  # upper end of the colour scale of all error maps: twice the largest error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
 TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
@@ -44,14 +44,15 @@ SENSOR_METHODS = ("multi", "triplet", "adapted")
 PAPER = {"fmt": "D", "color": "black", "markerfacecolor": "white", "markersize": 6, "ecolor": "#00000030"}
 PAPER |= {"elinewidth": 8, "zorder": 1.5}
 PAPER_NAME = "paper's table 2: mean ± standard deviation"
-# Figures of boards that were never seen in training show the rows of experiment random_presses with these tested places
-# and these models.
+# For figures of boards that were never seen in training (experiment random_presses): the test that they show, and the
+# names of the models.
 TESTED = "places without labels (checkerboard)"
 WAYS = {
     "universal, boards of the rig": "trained on simulation and the rig's other board",
     "universal, simulated alone": "trained on simulation (the model that we ship)",
 }
-PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}  # of table 2
+# Names of those rows of the paper's table 2 that are drawn beside our scores.
+PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}
 PLACE_LABEL, FORCE_LABEL = "place: within 1 mm / %", "force: rms error / N"
 
 Rows = Sequence[Mapping[str, Any]]
@@ -101,7 +102,7 @@ def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str
                 {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))} if metric in model.paper else {}
                 for model, _ in rows
             ]
-            name = f"ours ({source}): {spread_of({model.short: row for model, row in rows})}"
+            name = f"ours ({source}), bars: {spread_of({model.short: row for model, row in rows})}"
             _draw_scores(axes, metric, y + OFFSET, [row for _, row in rows], label=name, **_look(1))
             _draw_scores(axes, metric, y - OFFSET, paper, label=PAPER_NAME, **PAPER)
             _limit(axes, metric)
@@ -158,7 +159,7 @@ def _spread(stat: Mapping[str, Any]) -> str:
     if "ci95" in stat:
         return "95 % interval over boards"
     if "values" in stat:
-        return "lowest to highest board"
+        return "from lowest to highest board"
     return "standard deviation over seeds" if "sd_seeds" in stat else "standard deviation" if "sd" in stat else "no bar"
 
 
@@ -222,8 +223,9 @@ def unseen_boards(
             axes.tick_params(labelsize=letters_pt)
         panels[0].set_yticks([*y.values()], [*y])
         test = (
-            f"{rows[0]['presses_n']} unlabelled presses of the board; labels at random places, tests at other places; "
-            f"means of {numbers['random_presses']['draws_n']} draws"
+            f"The model was calibrated to {rows[0]['presses_n']} unlabelled presses of the board. Labels are at random "
+            "places, tests at other places. "
+            f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
         )
         title = f"Boards never seen in training ({source}):{' ' if large else chr(10)}each mark is one board"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
@@ -240,7 +242,7 @@ def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: flo
     means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
     low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
     look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
-    name = f"{PAPER_NAME} (other skins, other test)"
+    name = f"{PAPER_NAME} (other skins, other test)"  # the paper's rows are not scores of the tests drawn above them
     axes.errorbar(middle, y, xerr=np.stack([middle - low, high - middle]), label=name, **look)
 
 
@@ -269,8 +271,8 @@ def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
         boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
         _finish(
             figure,
-            f"Scores on held-out boards, as labelled (scene {numbers['provenance']['scene']}, {source}): means over "
-            f"{boards_n} boards",
+            f"Scores on held-out boards, by number of labels (scene {numbers['provenance']['scene']}, {source}): "
+            f"means over {boards_n} boards, positions not corrected",
         )
         return svg(figure)
 
@@ -288,13 +290,13 @@ def _finish(figure: Any, title: str, letters_pt: float = 9.0, *, note: str = "")
 
 HELD_OUT = {  # what is held out in a map of position errors, by experiment
     "single_random": "one skin, random readings held out",
-    "single_indentation": "one skin, indentations held out",
-    "single_pass": "one skin, passes held out",
+    "single_indentation": "one skin, random indentations held out",
+    "single_pass": "one skin, random passes held out",
     "single_temporal": "one skin, last passes held out",
-    "transfer": "trained on one skin, tested on others",
-    "lobo": "held-out boards",
-    "triplet": "held-out boards, with the triplet loss",
-    "adapt": "held-out boards, after adaptation",
+    "transfer": "trained on one skin, tested on other skins",
+    "lobo": "held-out boards, trained without the triplet loss",
+    "triplet": "held-out boards, trained with the triplet loss",
+    "adapt": "held-out boards, trained with the triplet loss and adapted",
 }
 
 
@@ -340,7 +342,7 @@ def error_grid(
             figure.legend(loc="outside lower left", ncols=2, frameon=False, fontsize=9)
         (x_mm, y_mm), worst_mm = places[mean_mm.argmax()], mean_mm.max()
         summary = (
-            f"median over places {np.median(mean_mm):.2f} mm; worst {worst_mm:.2f} mm at x = {x_mm:g}, y = {y_mm:g}"
+            f"median over places {np.median(mean_mm):.2f} mm, worst {worst_mm:.2f} mm at x = {x_mm:g}, y = {y_mm:g} mm"
         )
         figure.suptitle(f"{title}\n{summary}", x=0.01, ha="left", fontsize=10)
         return svg(figure)
@@ -397,7 +399,7 @@ def sweep_pokes(rows: Rows, source: str) -> str:
     paper = [{m: {"mean": mean, "sd": sd} for m, (mean, sd) in TABLE_2[row].items()} for row in ("triplet", "adapted")]
     lines = [
         Line(
-            f"ours: {spread_of(dict(enumerate(ordered)))}",
+            f"ours, bars: {spread_of(dict(enumerate(ordered)))}",
             [row["pokes_n"] for row in ordered],
             ordered,
             _look(1) | {"fmt": "o-"},

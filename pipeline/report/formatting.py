@@ -29,15 +29,16 @@ INTERVAL = (
     "skins and networks. With fewer than four boards there is no interval, and (a; b) are the values of the boards."
 )
 SPREAD = (
-    f"{INTERVAL} ± is a standard deviation. If networks are tested on the skin on which they were trained, it "
-    "is over n repeats of the split. If they are tested on other skins, it is over n pairs of a training skin and a "
-    "test skin. If marked (seeds), it is over network seeds."
+    f"{INTERVAL} ± is a standard deviation. If networks are tested on the skin on which they were trained, n is the "
+    "number of random splits into training and test rows, and ± is the standard deviation of the scores of these "
+    "splits. If networks are tested on other skins, n is the number of pairs of a training skin and a test skin. A "
+    "standard deviation with the mark (seeds) is that of networks that differ only in their random seed."
 )
 SHORT = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",
     "control": "control",
 }  # fmt: skip
-CONTROL = "Control: fine-tuned equally long, without the new skin's pokes (ours)"
+CONTROL = "Control: fine-tuned equally long, but without pokes of the new skin (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
 # `way` and `labels_n` of the rows of experiment population in which the complete universal model has no labels.
 UNIVERSAL = ("universal", 0)
@@ -56,7 +57,10 @@ def reworded(text: str) -> str:
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean, its interval over boards (or else its sd), and its sd over seeds, rounded as in `decimals`."""
+    """Write a mean, its interval over boards (or else its standard deviation), and its standard deviation over seeds.
+
+    All these numbers have as many decimals as `decimals` returns.
+    """
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -180,14 +184,14 @@ def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[
 
 
 def scored(row: Mapping[str, Any]) -> dict[str, str]:
-    """Write every metric of a row and n as text; return the cells by column title."""
+    """Write every metric of a row, and the number n that it is averaged over, as text; return cells by column title."""
     return scores(row) | {"n": n_of(row)}
 
 
 def beside(
     row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
-    """Write each metric of a row, the paper's value of it (`printed`), and n, as text; return cells by column title."""
+    """Write each metric of a row beside the paper's value (`printed`), and then n; return cells by column title."""
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}

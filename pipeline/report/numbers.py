@@ -44,11 +44,17 @@ PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
-PAPERS_SPLITS = ("single_random", "single_temporal")  # the first one that the scene ran is compared with the paper
-STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # splits by indentation or pass
+PAPERS_SPLITS = (
+    "single_random",
+    "single_temporal",
+)  # the first of these splits that the scene ran is compared with the paper
+# Splits in which the readings of an indentation, or of a pass, are never divided between training and test.
+STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
-NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # experiment by method
+NETWORKS = {
+    METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN
+}  # name of the experiment, by name of the method
 OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
 # For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}

@@ -37,13 +37,13 @@ FURTHER = "further"  # key of the section of tables and figures that no other se
 # Tables that are unfolded when the page loads; all other tables are folded.
 OPEN = {"table1", "table2", "claims", "final_model"}
 WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
-BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist lists all
-EFFORTS = "Scores on new skins, by model and by what the model needs of the new skin"
+BESIDE_N = 4  # a section compares at most this many results with the paper; the checklist contains all results
+EFFORTS = "Scores on new skins, by model and by the data that the model needs from the new skin"
 SOURCES = {
-    "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
+    "simulated": "Every reading of this scene was simulated, so no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
-RESULTS = ("table-2", "figure-")  # starts of the ids of the paper's tables and figures with results
+RESULTS = ("table-2", "figure-")  # the ids of those tables and figures of the paper that show results start with these
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
 UNIT = r" (%|mm²|N²|mm|N|Hz|µT)(?!\w)"
 # Places where no line break is allowed: between a number and its deviation or unit, and in an interval with its unit.
@@ -51,7 +51,7 @@ UNBROKEN = re.compile(rf"(?<=\d) ± (?=\d)|(?<=\d){UNIT}|\([-+\d.e]+(; [-+\d.e]+
 SENTENCE_END = re.compile(r"(?<=[.]) ")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-LONG = 40  # characters; a column with a longer cell is wide
+LONG = 40  # a column with a cell of more characters than this is wide
 NO_VALUE = ("–", "")  # cells that are hidden if the rows of a table are stacked
 # Widths in rem, which estimate the width of a table. If a table is wider than its place on the screen, its rows are
 # stacked, with the cells of each row below each other.
@@ -128,8 +128,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes: name, description, counts of captures, answers, headline figure, and those
-    tables and figures of the paper with results that its page shows.
+    """A scene on the page of all scenes: name, description, counts of captures, answers and headline figure.
+
+    `places` lists the tables and figures of the paper whose results are also shown on the page of this scene.
     """
 
     scene: str
@@ -375,7 +376,10 @@ def measure(file: str, svg: str, id: str) -> Drawing:
     """Read the size of a figure from its SVG text, and compute the smallest legible width, in CSS pixels."""
     size = SVG_SIZE_PT.search(svg)
     if size is None:
-        raise SchemaError(f"{file}: the SVG has no size in points: {svg[:80]}. Was it written by drawing.svg?")
+        raise SchemaError(
+            f"{file}: the SVG has no size in points; it starts with {svg[:80]}. Write figures with function `svg` of "
+            "pipeline/report/drawing.py."
+        )
     width_pt, height_pt = map(float, size.groups())
     smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)
     least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt

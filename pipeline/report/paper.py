@@ -4,7 +4,9 @@ from collections.abc import Mapping
 
 Number = tuple[float, float]  # mean, standard deviation
 
-SINGLE_SENSOR: dict[str, Number] = {  # section 4: 50K samples, random 45K / 5K
+SINGLE_SENSOR: dict[
+    str, Number
+] = {  # section 4: 50K samples, of which 45K at random are for training and 5K for testing
     "accuracy_pct": (99.58, 0.34),
     "mse_xy_mm2": (0.037, 0.014),
     "mse_f_N2": (0.005, 0.002),
@@ -41,7 +43,7 @@ FIGURE_6B = (
 
 SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
-# Figures 4 and 5 are also printed without numbers.
+# Figures 4 and 5 are also printed without numbers, so only statements of the text about them are quoted.
 FIGURE_4 = (
     '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
     'samples"'
@@ -67,7 +69,11 @@ GAINS: dict[str, dict[str, float]] = {
     "adapted_over_multi": _subtract(_means["adapted"], _means["multi"]),
     "by_hand": _subtract(MANUAL["after"], MANUAL["before"]),  # "clearly demonstrating the effectiveness"
 }
-FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5, adapted; "about"
+FLEXIBLE: dict[str, float] = {
+    "accuracy_pct": 75.0,
+    "mse_xy_mm2": 0.72,
+    "mse_f_N2": 0.54,
+}  # section 5, after adaptation; the paper writes "about" before these numbers
 FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: reduction of the distance between skin and circuit board
 SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
 SENSITIVITY_ML = 20.0

@@ -24,7 +24,10 @@ SPLITS = {
     "single_pass": "random passes held out",
     "single_temporal": "last passes held out",
 }
-MEANING = "Numbers of the paper are from its sections 3 to 6. Numbers of this scene are counted in its results."
+MEANING = (
+    "The numbers in column paper are from sections 3 to 6 of the paper. The numbers in column this scene were counted "
+    "in the results of this scene."
+)
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,9 @@ def _boards(numbers: Results) -> Iterator[Protocol]:
         yield Protocol(
             "headline",
             "table 2, one training skin",
-            f"{TRANSFER_TRAIN_N} skins, one network for each, tested on {TRANSFER_TEST_N} other skins",
-            f"{transfer['folds_n']} skins, {_networks(transfer['seeds_n'])} for each, tested on {transfer['skins_n']} "
+            f"{TRANSFER_TRAIN_N} training skins, one network for each, tested on {TRANSFER_TEST_N} other skins",
+            f"{transfer['folds_n']} training skins, {_networks(transfer['seeds_n'])} for each, tested on "
+            f"{transfer['skins_n']} "
             f"other skins of {transfer['boards_n']} boards",
         )
     if lobo := counted.get("lobo"):
@@ -101,7 +105,7 @@ def _each_skin(numbers: Results) -> str:
     for name in ("indentations", "readings"):
         if count := counts.get(f"{name}_n"):
             return f"{round(count / skins_n):,} {name} of each"
-    return "numbers of readings not counted"
+    return "with an unknown number of readings"
 
 
 def _variation(numbers: Results) -> Iterator[Protocol]:
@@ -129,7 +133,7 @@ def _drift(numbers: Results) -> Iterator[Protocol]:
         "figure 5",
         f"{papers}tested on {DRIFT_TEST_N:,} after every {DRIFT_TRAIN_N:,}",
         f"{last_n}: trained on the first {train}, tested on {test} after every {every}; "
-        f"{_networks(drift['seeds_n'])} per policy",
+        f"{_networks(drift['seeds_n'])} per policy of no-load readings",
     )
 
 
@@ -144,7 +148,7 @@ def _sweeps(numbers: Results) -> Iterator[Protocol]:
         yield Protocol(
             "sensors",
             "figure 6b",
-            f"tested on {SWEEP_TEST_SKINS_N} skins; numbers of training skins only in the figure",
+            f"tested on {SWEEP_TEST_SKINS_N} skins; the numbers of training skins can only be read from the figure",
             f"{_listed(counts)} training skins; tested on {_count(sensors[0]['accuracy_pct']['n'], 'held-out board')}",
         )
 

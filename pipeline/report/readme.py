@@ -25,13 +25,20 @@ from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
-TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
+TABLES = (
+    "table2",
+    "claims",
+    "manual",
+    "flexible",
+    "single_sensor",
+)  # tables of simulated scenes that docs/results.md shows
 COMPARED = ("compare", "compare_parameters", "compare_frames")
 MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
-    "The table shows the time to compute everything from scratch, as if the training runs ran one after another. By "
-    "default, two training runs run at the same time, so less time passes."
+    "Column computed is the time that it takes to compute everything from scratch if the training runs run one after "
+    "another. By default, two training runs run at the same time, so less time passes. Column collapsed counts the "
+    "training runs whose network had a nearly constant output; they were repeated."
 )
 BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
@@ -44,9 +51,10 @@ MEASURED = "reskin/universal/measured.json"  # results of this model that the li
 SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F, N²", 2)}
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
-    "[low, high]: 95 % interval over six held-out boards; ±: standard deviation over pairs of skins. Our boards are "
-    "simulated, the paper's were recorded. An earlier simulation was tuned to row *Single-sensor*, so this row is not "
-    "evidence. The paper does not state its forces, so MSE_F may not be comparable."
+    "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of a training "
+    "skin and a tested skin. Our boards are simulated, and the paper's boards were recorded. An earlier version of the "
+    "simulation was tuned to row *Single-sensor* of the paper, so this row is not evidence. The paper does not state "
+    "how large its forces are, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
@@ -63,10 +71,11 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}: mean (board 1; board 2) over {draws_n} random draws. In all columns, the model is "
-    "also calibrated to {presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
+    "Scene `{scene}`, code {code}. Each cell has the mean of both boards, then (board 1; board 2). All numbers are "
+    "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to "
+    "{presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
-FIGURE = "docs/img/headline.svg"  # the shipped model, and a model trained with recordings
+FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
@@ -83,7 +92,7 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
         if name not in numbers:
             raise ParamsError(
                 f"reports/{name}/numbers.json is missing, but README.md and docs show its results. "
-                f"Restore it: git restore reports/{name}"
+                f"Restore the committed results: git restore reports/{name}"
             )
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
     results = [numbers[name] for name in (FULL_SIZE, HEADLINE)]
@@ -153,8 +162,9 @@ def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
         pages = [page for page, text in filled.items() if markers.search(text)]
         if len(pages) != 1:
             raise SchemaError(
-                f"README.md and docs: block {name} must be in one page; it is in {', '.join(pages) or 'no page'}. "
-                f"Restore its markers <!-- {name} --> and <!-- /{name} -->."
+                f"README.md and docs: the generated block {name} must be in exactly one page; it is in "
+                f"{', '.join(pages) or 'no page'}. Write its markers <!-- {name} --> and <!-- /{name} --> into a "
+                "single page."
             )
         before, opening, _, closing, after = markers.split(filled[pages[0]])
         filled[pages[0]] = f"{before}{opening}{content.strip()}\n{closing}{after}"
@@ -177,7 +187,7 @@ def blocks_of(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
-        if numbers not in moving  # its presses are those of another scene
+        if numbers not in moving  # a scene with experiment moving_hand uses the presses of another scene
     }
     return {
         "headline": _simulated(list(reversed(results))),
@@ -249,8 +259,8 @@ def _halves(numbers: Numbers) -> str:
     if not scores:
         return ""
     return (
-        "If all 40 labels are on one half of the skin, this share of the presses on the other half is within 1 mm: "
-        f"{', '.join(scores)}."
+        "If all 40 labels are on one half of the skin, the following share of the presses on the other half is within "
+        f"1 mm: {', '.join(scores)}."
     )
 
 
@@ -270,9 +280,10 @@ def _touches(numbers: Numbers) -> str:
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
-        f"Forces of the presses: {ranges}. At the threshold of the live page, {share} of these touches are missed. How "
-        "often a reading without touch is taken for a touch depends on when the no-load reading was taken: "
-        f"{'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the live page)."
+        f"The presses have forces of {ranges}. With the threshold of the live page, {share} of these presses are "
+        "missed. Some readings without touch are taken for a touch. How often this happens depends on when the no-load "
+        f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the "
+        "live page)."
     )
 
 
@@ -296,8 +307,8 @@ def _compact(value: Numbers | None, digits: int) -> str:
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     """Write the named tables of a scene below a heading with its provenance."""
     provenance = numbers["provenance"]
-    # Tables are made only for the experiments that are shown, because the current code may be unable to read the
-    # committed results of other experiments.
+    # Only the results of the experiments that are shown are passed to `make_tables`, because the current code may be
+    # unable to read the committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     trained = provenance["trained"]  # empty if the scene trains no networks
     code = f"trained by code {trained}" if trained else f"code {provenance['git']}"
@@ -317,9 +328,10 @@ def _time(times: Numbers) -> str:
     cpu_min = median(run["stages"]["cpu_s"] for run in runs) / 60
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
-        f"Environment {environment_min:.1f} min, stages {stages_min:.1f} min ({cpu_min:.1f} CPU min); {all_GB:.1f} GB, "
-        f"of which {environment_GB:.1f} GB are the environment. Median of {len(runs)} fresh clones on "
-        f"{times['machine']} (`make time-repro`, code {times['git']})."
+        f"This takes {environment_min:.1f} min for the Python environment and {stages_min:.1f} min for the stages "
+        f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB on disk, of which {environment_GB:.1f} GB are the "
+        f"environment. These are medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
+        f"{times['git']})."
     )
 
 

@@ -12,43 +12,51 @@ Numbers = Mapping[str, Any]  # numbers.json of one scene
 # Places where no line break is allowed: between a number and its unit.
 UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
 MAPS = (
-    "Look for places with large errors, for example at the edge of the skin or between the chips. All maps have the "
-    "same scale of colours."
+    "Look for places with large errors, for example at the edge of the skin or between the chips. A colour means the "
+    "same error in all maps."
 )
-# What to look for, by figure, for sentences without results.
+# The sentences that contain no results, by figure. They tell the reader what to look for in the figure.
 LOOK = {
-    LABELS: "In each row, the marks from 0 labels to the most labels show how much labels of the new board help.",
-    "variation_time.svg": "The distance of a line from 0 is the drift of the field since the first visit; its "
-    "colour is the number of contacts before.",
-    "variation_skins.svg": "The distance between the lines is what a network must cope with on a new skin: the "
-    "indentations are equal, and the fields differ.",
-    "drift_wander.svg": "A line that falls (left to right) shows a drift of the field at rest that is too fast for how "
-    "often no-load readings are taken.",
-    "sensitivity.svg": "Where a curve crosses the line of 95 %, pairs of readings with that difference of weight are "
-    "ordered correctly 95 times in 100.",
-    "logs.svg": "Where both lines of the force differ, the model misses a contact, reports a false one, or misjudges "
-    "its force.",
-    "ambient.svg": "Where a line falls, a field that appeared after the no-load reading spoils the estimates.",
-    "contacts.svg": "A model of single contacts estimates one place for two contacts: look how far apart they must be "
-    "before they are detected as two.",
-    "dynamics.svg": "Errors that grow towards short presses (left) are caused by motion during a reading.",
-    "gripper.svg": "Marks inside the band are runs that held the intended force within the stated tolerance.",
-    "population_scaling.svg": "Look whether more simulated training skins still reduce the errors.",
-    "compare_arrows.svg": "Equal directions of arrows in the recorded and the simulated row mean that the simulation "
-    "describes the board.",
-    "compare_growth.svg": "Recorded and simulated points that lie on each other show that the field grows equally with "
-    "the force.",
-    "compare_touch.svg": "Left of the recorded presses there are only simulations: they differ there, so recordings of "
-    "light touches would decide between them.",
-    "recorded_limits.svg": "Presses above a line of threshold are detected; extrapolated lines show the lightest "
-    "press that would be.",
-    "moving_hand.svg": "Look for values at which false contacts are rare and places are still found.",
-    "worlds.svg": "A factor matters if the lines of its column are steep; compare them with the dashed lines of the "
-    "paper.",
-    "training.svg": "A method above and to the right of a numbered one is worse and slower.",
-    "inference.svg": "A method above and to the right of a numbered one is worse and slower.",
-    "quadratures.svg": "Of the points below the limit, the one farthest to the left is the cheapest.",
-    "integrators.svg": "Lower and farther to the left is better; failures are listed below the panels.",
+    LABELS: "Each row is one method. Compare its mark for 0 labels with its mark for the most labels to see how much "
+    "labels of the new board improve the score.",
+    "variation_time.svg": "Each line shows how much the field has changed since the first press at this place. The "
+    "colour of a line is the number of contacts before it.",
+    "variation_skins.svg": "The indentations are equal on all skins, but the fields differ. A network has to cope with "
+    "this difference if it is used on a new skin.",
+    "drift_wander.svg": "If a line falls from left to right, the field at rest drifts so fast that no-load readings "
+    "should be taken more often.",
+    "sensitivity.svg": "At the difference in weight where a curve crosses the line of 95 %, 95 of 100 pairs of "
+    "readings are ordered correctly.",
+    "logs.svg": "Where the two lines of the force differ, the model misses a contact, reports a contact that does not "
+    "exist, or estimates a wrong force.",
+    "ambient.svg": "Where a line falls, the estimates become worse because of a magnetic field that appeared after the "
+    "no-load reading.",
+    "contacts.svg": "A model of single contacts estimates only one place for two contacts. Look how far apart two "
+    "contacts must be before they are detected as two.",
+    "dynamics.svg": "If the errors are larger for shorter presses (on the left), the cause is the motion of the tip "
+    "during a reading.",
+    "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
+    "stated tolerance.",
+    "population_scaling.svg": "Look at the right end of the lines: if they still fall there, more simulated training "
+    "skins would reduce the errors further.",
+    "compare_arrows.svg": "If the arrows in the recorded row and in the simulated row have the same directions, the "
+    "simulation describes the board well.",
+    "compare_growth.svg": "If the recorded and the simulated points lie on each other, the field grows with the force "
+    "in the simulation as it does on the board.",
+    "compare_touch.svg": "For forces smaller than those of the recorded presses (on the left), there are only "
+    "simulations, which differ from each other. Recordings of light touches would show which of them is right.",
+    "recorded_limits.svg": "A press above the line of a threshold is detected. The lightest press that would be "
+    "detected is where an extrapolated line crosses the threshold.",
+    "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
+    "places is still high.",
+    "worlds.svg": "If the lines in a column are steep, the factor of this column changes the scores much. The dashed "
+    "lines are the scores of the paper.",
+    "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
+    "inference.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
+    "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "
+    "time.",
+    "integrators.svg": "The best points are at the lower left: they have small errors and take little time. Failures "
+    "are listed below the panels.",
 }
 
 
@@ -73,8 +81,8 @@ def _table2(numbers: Numbers) -> dict[str, str]:
         for name, row in ours.items()
         if "mse_f_N2" in row
     ]
-    return {HEADLINE: f"Within 1 mm: {'; '.join(parts)}."} | (
-        {FORCE: f"Square roots of the mean MSE_F: {'; '.join(errors)}."} if errors else {}
+    return {HEADLINE: f"Share of readings within 1 mm: {'; '.join(parts)}."} | (
+        {FORCE: f"Rms error of the force (square root of the mean MSE_F): {'; '.join(errors)}."} if errors else {}
     )
 
 
@@ -90,7 +98,7 @@ def _unseen(numbers: Numbers) -> dict[str, str]:
                 ends = f"{first:.{digits}f} {unit} with {swept[0]['labels']} labels"
                 parts.append(f"{name}: {ends}, {last:.{digits}f} {unit} with {swept[-1]['labels']}")
         if parts:
-            what = "Within 1 mm" if metric == "accuracy_pct" else "Rms error of the force"
+            what = "Share of readings within 1 mm" if metric == "accuracy_pct" else "Rms error of the force"
             written[file] = f"{what}, mean over the boards: {'; '.join(parts)}."
     return written
 
@@ -98,9 +106,9 @@ def _unseen(numbers: Numbers) -> dict[str, str]:
 def _pokes(numbers: Numbers) -> dict[str, str]:
     rows = sorted(numbers["sweep_pokes"], key=lambda row: row["pokes_n"])
     ends = [f"{row['accuracy_pct']['mean']:.1f} % with {row['pokes_n']} pokes" for row in _spaced(rows)]
-    bars = "The bars are intervals of each score over boards, not of the difference"
+    bars = "The bars are intervals of single scores over boards, not of the difference between two scores"
     if difference := _gain_from_pokes(numbers):
-        bars += f": that is {difference}"
+        bars += f": this difference is {difference}"
     return {"sweep_pokes.svg": f"Mean accuracy: {', '.join(ends)}. {bars}."}
 
 
@@ -134,8 +142,10 @@ def _drift(numbers: Numbers) -> dict[str, str]:
     drift = numbers["drift"]
     names = {
         "initial": "one no-load reading at the start",
-        "regular": f"one every {drift['regular_n']} {drift['unit']}s" if "regular_n" in drift else "regular ones",
-        "each": "one before each contact",
+        "regular": f"a no-load reading every {drift['regular_n']} {drift['unit']}s"
+        if "regular_n" in drift
+        else "regular no-load readings",
+        "each": "a no-load reading before each contact",
     }
     last = {name: drift[name][-1] for name in names if drift.get(name)}
     parts = [f"{row['accuracy_pct']:.1f} % with {names[name]}" for name, row in last.items()]
@@ -155,7 +165,9 @@ def _shear(numbers: Numbers) -> dict[str, str]:
     if not all(name in by_line for name in names):
         return {"shear.svg": "Points on the diagonal are exact."}
     shares = [100 * by_line[name]["mean"] for name in names]
-    share = "{:.2f} % of the variance of sideways forces and {:.2f} % of that of normal forces".format(*shares)
+    share = "{:.2f} % of the variance of the sideways forces and {:.2f} % of the variance of the normal forces".format(
+        *shares
+    )
     return {"shear.svg": f"Points on the diagonal are exact. The networks explain {share}."}
 
 

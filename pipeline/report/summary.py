@@ -8,10 +8,13 @@ from pipeline.report.formatting import PAPER_METRICS, models
 SHORT_TITLES = {
     "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F",
 }  # fmt: skip
-MEANING = "R² of F: 1 if all forces are exact, 0 if a constant force is as good. The page has the intervals."
+MEANING = "R² of F is 1 for exact forces, and 0 for the mean force. Intervals are on the report page."
 RECORDED = "Recorded"
 LABELLED = ("accuracy_pct", "r2_f")  # metrics that are shown for methods that use labels
-CALIBRATED, REFERENCE = "universal", "universal map"  # prefixes of names: shown methods, and methods that are not shown
+CALIBRATED, REFERENCE = (
+    "universal",
+    "universal map",
+)  # names of methods that are shown start with the first prefix, but not with the second
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 
 
@@ -23,12 +26,12 @@ def summarise(numbers: Numbers) -> list[str]:
         lines = [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
     elif numbers.get("table2"):
         rows = _rows_of_table_2(numbers)
-        paper = " (the paper's in parentheses, on recorded boards)" if "(" in str(rows[1:]) else ""
+        paper = " (in parentheses: the paper's, on recorded boards)" if "(" in str(rows[1:]) else ""
         lines = [f"{data} boards not seen in training: means{paper}", *_table(rows), MEANING]
     else:
         return []
     if data == RECORDED and (model := numbers.get("final_model")):
-        lines.append(f"A model of all {model['boards_n']} boards, for use: reskin live --model {model['file']}")
+        lines.append(f"Model trained on all {model['boards_n']} boards, for use: reskin live --model {model['file']}")
     return lines
 
 

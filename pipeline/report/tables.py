@@ -43,10 +43,10 @@ from reskin.errors import ParamsError
 Numbers = Mapping[str, Any]
 Rows = Sequence[Mapping[str, Any]]
 SPLITS = {
-    "single_random": "random readings held out (as in the paper: an indentation has readings in training and test)",
+    "single_random": "random readings held out (as in the paper; one indentation has readings in training and in test)",
     "single_indentation": "random indentations held out (an indentation is never split between training and test)",
     "single_pass": "random passes held out (each pass presses all places to all depths)",
-    "single_temporal": "trained on the first passes, tested on the last",
+    "single_temporal": "last passes held out (trained on the first passes, tested on the last passes)",
 }
 UNCERTAINTY = {
     "coverage_pct": "coverage of 90 % intervals, %",
@@ -57,62 +57,72 @@ BEFORE_TOUCH = {
     "scan": "only the number of the indentation in its pass",
 }
 BEFORE_TOUCH_MEANING = (
-    'The rows "position from only ..." show how well the position can be guessed without touching the skin. They do '
-    "not use the field change, but only the stated quantity; the position is the mean position of the two training "
-    "readings whose value of this quantity is most similar. The row with the number of the indentation shows how "
-    "exactly the rig repeats its order of places. No network receives this number. The row with the no-load reading "
-    "shows how much the remaining field of earlier indentations reveals about this order. A network may use this "
-    "remaining field, because it is part of the field change."
+    'The rows "position from only ..." show how well the position can be guessed without touching the skin. These '
+    "guesses do not use the field change, but only the quantity that the row names: the guess is the mean position of "
+    "the two training readings in which this quantity is most similar. The row with the number of the indentation "
+    "shows how exactly the rig repeats its order of places in each pass. No network receives this number. After an "
+    "indentation, some of its field change remains for a while. The row with the no-load reading shows how much this "
+    "remaining field reveals about the order of places. A network may use the remaining field, because it is part of "
+    "the field change."
 )
 SEEN_TIP = (
-    "Some scores are not comparable with the paper's numbers and are not evidence of touch: the position of a tip that "
-    "only hovers is predicted too, so the indenter itself is magnetic"
+    "For some skins, the models also predict the position of a tip that only hovers above the skin, because the tip "
+    "itself is magnetic. The scores of these skins are therefore no evidence that a touch is sensed, and they are not "
+    "comparable with the paper's numbers"
 )
 HOVER_MEANING = (
-    "Hover control: models that were trained on contacts predict the position for rows without force, in which the tip "
-    "hovers above the place that it touches next. Without any signal, a few percent of the predictions are within 1 mm "
-    "by chance. If the 2 nearest contacts predict at least a quarter of them within 1 mm (an assumed threshold), the "
-    "chips sense the magnetism of the tip itself. |dB| without contact includes the noise of the no-load reading."
+    "This control shows whether the chips sense the tip itself. Models that were trained on contacts predict the "
+    "position from readings in which the tip hovers above the place that it touches next. One model is the network. "
+    "The other model is the mean position of the 2 contacts in training whose field changes are most similar. If the "
+    "chips sense no tip, only a few percent of the predictions are within 1 mm, by chance. If at least a quarter of "
+    "the predictions from the 2 nearest contacts are within 1 mm (a threshold that we assumed), the chips sense the "
+    "magnetism of the tip. |dB| is the length of the vector of field changes; without contact, it includes the noise "
+    "of the no-load reading."
 )
 TABLE_2_SPREAD = (
-    "± is the standard deviation, as in the paper. It is over n held-out boards, or, for one skin tested on others, "
-    f"over n pairs of a training skin and a test skin. {INTERVAL} For one skin tested on others, the interval is over "
-    "training skins and tested boards."
+    "± is the standard deviation, which the paper also reports. In row Single-sensor, each network was trained on one "
+    "skin and tested on others. There, n is the number of pairs of a training skin and a test skin, and the standard "
+    "deviation is that of the scores of these pairs. In all other rows, n is the number of held-out boards, and the "
+    f"standard deviation is that of the scores of these boards. {INTERVAL} In row Single-sensor, the interval "
+    "accounts for the differences between training skins and for the differences between tested boards."
 )
 SUMMARY_SPREAD = (
-    f"{INTERVAL} For one skin tested on others, ± is the standard deviation over n pairs of skins. In all other rows, "
-    "n is the number of boards. The last number in parentheses is the paper's mean."
+    f"{INTERVAL} In row Single-sensor, n is the number of pairs of a training skin and a test skin, and ± is the "
+    "standard deviation of the scores of these pairs. In all other rows, n is the number of held-out boards. The last "
+    "number in parentheses is the paper's mean."
 )
 TARGET = (
-    "An earlier simulated skin was tuned to the paper's row Single-sensor, and some of its spreads remain, so "
-    "agreement in this row is not evidence."
+    "An earlier version of the simulation was tuned until it agreed with the paper's row Single-sensor. Some of the "
+    "tuned variations between skins are still used, so agreement in this row is not evidence."
 )
 CONSTANT = "constant force: the mean over the tested indentations"
 COLLAPSED_MEANING = (
     "A network has collapsed if its output is nearly constant, so that it explains almost nothing of some target on "
-    "its own training rows. It is retrained with other random draws, at most twice. A network that collapses every "
-    "time is kept and included in all means; the audit also names such networks of train_* and adapt. Very short "
-    "training runs are not checked for collapse."
+    "its own training rows. A collapsed network is trained again with other random draws, at most twice. A network "
+    "that collapses every time is kept and included in all means. The networks of stages train_* and adapt that were "
+    "kept in this way are also named in table audit. Very short training runs are not checked for collapse."
 )
 REGISTERED_MEANING = (
-    "Registered: the positions are corrected by one offset per board, which is estimated from the board's labels as a "
-    "diagnosis. Labelled and unlabelled indentations are at tested places of the new board, but at other depths."
+    "Registered: before these scores are computed, the mean position error of each board is subtracted from the "
+    "predicted positions of this board. This mean error is computed from the labels of the board, so registered "
+    "scores are only a diagnosis. The labelled and unlabelled indentations that a method receives are at the same "
+    "places of the new board as the tested indentations, but at other depths."
 )
 TRAINING_ROWS = (
-    "The number of training rows is that of the first fold. For a classical method it is limited, and the rows are "
-    "drawn at random. The settings of classical methods were not tuned."
+    "Column training rows contains the number of training rows in the first fold. For classical methods, this number "
+    "is limited, and the training rows are drawn at random. The settings of classical methods were not tuned."
 )
 CONTROLLED = (
-    "0 pokes: the network before fine-tuning. The effect of fine-tuning without pokes of the new skin is shown by the "
-    "control in table 2."
+    "The row with 0 pokes has the scores of the network before fine-tuning. To see what fine-tuning changes without "
+    "pokes of the new skin, see row Control of table 2."
 )
-BUDGETS = "The number of training steps is set for each scene and was not part of the choice."
+BUDGETS = "The number of training steps is a setting of the scene. It was not chosen by these scores."
 DRAWS = (
     "[low, high] is the 95 % interval over n held-out boards (Student's t). With fewer than four boards there is no "
-    "interval, and (a; b) are the values of the boards. Each board has its own draws of training skins, and its "
-    "networks are averaged first."
+    "interval, and (a; b) are the values of the boards. For each board, training skins are drawn at random, several "
+    "times. The value of a board is the mean over all networks that were tested on it."
 )
-OVER_BOARDS = "± is the standard deviation over n boards."
+OVER_BOARDS = "± is the standard deviation of the scores of n boards."
 
 QUANTITIES = {
     "field_at_rest_chip_median_uT": "field at rest, median chip, µT",
@@ -121,8 +131,8 @@ QUANTITIES = {
     "change_at_1_N_uT": "field change at 1 N, µT",
     "change_at_2_N_uT": "field change at 2 N, µT",
     "change_at_3_N_uT": "field change at 3 N, µT",
-    "change_at_3_N_over_1_N": "field change at 3 N divided by that at 1 N",
-    "weakest_over_strongest_chip": "field change at the weakest chip divided by that at the strongest",
+    "change_at_3_N_over_1_N": "field change at 3 N divided by field change at 1 N",
+    "weakest_over_strongest_chip": "field change at the weakest chip divided by field change at the strongest chip",
     "rest_changes_in_1_uT": "field at rest, rms change over 1 contact, µT",
     "rest_changes_in_10_uT": "field at rest, rms change over 10 contacts, µT",
     "rest_changes_in_100_uT": "field at rest, rms change over 100 contacts, µT",
@@ -136,23 +146,26 @@ QUANTITIES = {
     "force_max_N": "force, largest, N",
 }
 PAIRED = (
-    "Differences are computed on the same test rows, skin by skin: networks on a skin are averaged first, then the "
+    "Both models of a difference are scored on the same test rows. On each skin, scores are averaged over networks, "
+    "and the second model's mean is subtracted from the first model's mean. These differences are averaged over the "
     "skins of a board. [low, high] is the 95 % interval over n boards (Student's t). With fewer than four boards there "
-    "is no interval, and (a; b) are the values of the boards. Differences from networks of one skin use only the "
-    "boards that these networks were tested on, and the interval is also over their training skins. The table claims "
-    "has verdicts on the differences."
+    "is no interval, and (a; b) are the values of the boards. If the second model is the single-sensor network, only "
+    "the boards on which this network was tested are used, and the interval also accounts for the differences between "
+    "its training skins. Our verdicts on the differences are in table claims."
 )
 FINAL_MEANING = (
-    "The scores are those of networks that were trained in the same way without one of the boards, each tested on that "
-    "board. They estimate the scores of the final model on a further board. The final model itself was not tested."
+    "The final model itself was not tested, because no board was left to test it on. The scores belong to networks "
+    "that were trained in the same way, but each without one of the boards, on which it was then tested. These scores "
+    "estimate the scores of the final model on a further board."
 )
 SKINS_MEANING = (
-    "Each cell: mean over skins [smallest … largest] (number of skins). The field change of a reading is the length of "
-    "the vector of all channels; the table uses the median over readings within 20 % of the stated force. –: too few "
-    "readings."
+    "Each cell has the mean over skins, then the smallest and the largest value of a skin in brackets, then the "
+    "number of skins in parentheses. The field change of a reading is the length of the vector that contains the "
+    "changes of all channels. The field change of a skin at a force is the median over its readings whose force "
+    "differs from this force by at most 20 %. A dash (–) means that there are too few such readings."
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
-HELD_OUT = "model, on held-out boards"  # heading of the first column of a summary
+HELD_OUT = "model, tested on held-out boards"  # heading of the first column of a summary
 UNIVERSAL = "universal, "  # prefix of the names of methods that are calibrated to the skin
 CHECKS = {
     "subject": "subject", "law": "law", "against": "compared with", "error": "error", "tolerance": "allowed",
@@ -285,7 +298,8 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
     ]
     return tabulate(
         lines,
-        spread="Positions are as labelled. The networks and draws of a board are averaged.",
+        spread="The predicted positions are compared with the labels without a correction of offsets. Each score is "
+        "the mean over all networks and random draws that were tested on the board.",
     )
 
 
@@ -331,7 +345,10 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     kept_n = sum(trainings[name]["kept_collapsed_n"] for name in scenes.TABLE_2.values() if name in trainings)
     meaning = [TARGET] * (source == "simulated")
     if kept_n:
-        meaning.append(f"{kept_n} networks collapsed in each of their training runs and are included in these means.")
+        meaning.append(
+            f"{kept_n} networks collapsed (their output is nearly constant) in each of their training runs. They are "
+            "included in these means."
+        )
     table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(meaning)} if meaning else {})
     return table
 
@@ -396,8 +413,8 @@ def _printed(paper: Mapping[str, Number]) -> dict[str, str]:
 
 def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
     places = {
-        "as_labelled": "as labelled",
-        "registered": "corrected by one offset per board (a diagnosis with its labels)",
+        "as_labelled": "as predicted",
+        "registered": "corrected by one offset per board, from its labels (a diagnosis)",
     }
     lines = [
         {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "positions": title}
@@ -438,19 +455,20 @@ def final_model_table(numbers: Numbers) -> pd.DataFrame:
     trained_on = f"{model['boards_n']} {source} boards, {model['skins_n']} skins, {model['rows_n']:,} readings"
     scores_of = {title: show(held_out[metric]) for metric, title in COLUMNS.items() if metric in held_out}
     rows = {
-        "file": f"{file}; its card is beside it (.json)",
+        "file": f"{file}; a JSON file with the same name describes the model",
         "trained on": f"{trained_on}; {model['steps_n']} steps",
-        "tested": f"no, because all boards were in training. Networks of the same recipe on {n_of(held_out)} held-out "
-        f"boards (row {row.title} of table 2): " + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
+        "tested": "no, because all boards were in training. Scores of networks that were trained in the same way, on "
+        f"{n_of(held_out)} held-out boards (row {row.title} of table 2): "
+        + "; ".join(f"{title} {shown}" for title, shown in scores_of.items()),
         "use with a log": f"reskin predict LOG.csv --model {file} --out contacts.csv",
         "use with a board": f"reskin live --model {file}",
         "use in Python": f'model = reskin.load_model("{file}").zero(noload_uT); model.predict(b_uT)',
         "use without Python": 'model.export_onnx("model.onnx")',
     }
     if source == "simulated":
-        rows["limits"] = "It was trained on simulated skins, and does not fit real ones."
+        rows["limits"] = "The model was trained on simulated skins only, so it is not suitable for real skins."
     elif not model["forces_known"]:
-        rows["limits"] = "The recordings have no forces, so its forces are NaN."
+        rows["limits"] = "The recordings contain no forces, so every force that the model predicts is NaN."
     return tabulate([{"final model": name, "": text} for name, text in rows.items()], meaning=FINAL_MEANING)
 
 
@@ -463,7 +481,10 @@ def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
         for what, count in _counts(counts).items()
         if protocol == "main" or count
     ]
-    meaning = {"meaning": "Main: the captures that folds are made of. For other protocols, counts of 0 are not listed."}
+    meaning = {
+        "meaning": "Protocol main has the captures from which the training and test sets (folds) are made. For all "
+        "other protocols, counts of 0 are not listed."
+    }
     return tabulate(lines, **(meaning if others else {}))
 
 
@@ -616,14 +637,16 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
     """Add our column (`measured`, by row) and our row to the paper's table 1, whose cells remain as printed."""
     rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
     if unknown := sorted(measured.keys() - rows.keys()):
-        raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Use the names of the table.")
+        remedy = "Use names of rows of table 1 (pipeline/report/tables.yaml) in function `measured`."
+        raise ParamsError("table 1", "each row with a result of ours", f"one of {sorted(rows)}", unknown, remedy)
     lines = [
         {"property": name, **dict(zip(data.columns, cells, strict=True)), OURS: measured.get(name, NOT_GIVEN)}
         for name, cells in rows.items()
     ]
     sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())
     meaning = (
-        f'Cells are as printed in table 1 of the paper, including "?". The last row and column are ours. {sources}'
+        'The cells are printed as in table 1 of the paper, including "?". We added the last row and the last column. '
+        f"Sources of the other columns: {sources}"
     )
     return tabulate(lines, meaning=meaning)
 
@@ -635,7 +658,9 @@ def measured(numbers: Numbers) -> dict[str, str]:
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
     cells = {}
     if rate := described["over_skins"].get("rate_hz"):
-        cells["Frequency"] = f"{three_digits(rate['mean'])} Hz" + ", a setting read back from the captures" * simulated
+        cells["Frequency"] = (
+            f"{three_digits(rate['mean'])} Hz" + ", a setting, computed from the times in the captures" * simulated
+        )
     if sleeve := numbers.get("sleeve"):
         area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
         cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated
@@ -643,7 +668,8 @@ def measured(numbers: Numbers) -> dict[str, str]:
         policy = next(name for name in ("each", "regular", "initial", "free") if name in drift)
         last = drift[policy][-1]
         cells["Durable (> 50k contacts)"] = (
-            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, {POLICIES[policy]}"
+            f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts (no-load readings: "
+            f"{POLICIES[policy].format(regular_n=drift.get('regular_n'))})"
         )
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
     if best:

@@ -72,7 +72,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
     for file in set(cache.glob("*.parquet")) - used:
         io.remove(file)
     captures_n = len(settings.captures)
-    say(f"{settings.scene}: {captures_n} captures, {captures_n - read_n} of them from the cache")
+    say(f"{settings.scene}: ingested {captures_n} captures, {captures_n - read_n} of them from the cache")
 
 
 def _is_whole(cached: Path) -> bool:
@@ -82,7 +82,10 @@ def _is_whole(cached: Path) -> bool:
     """
     if io.sha256(cached) == cached.stem.partition("-")[2]:
         return True
-    say(f"warning: cached readings are damaged and are read again ({cached}: content has changed since it was written)")
+    say(
+        f"warning: the cached readings in {cached} are damaged, because the file has changed since it was written. "
+        "The capture is ingested again."
+    )
     io.remove(cached)
     return False
 
@@ -115,7 +118,7 @@ def describe(settings: Settings, indentations: Path, description: Path) -> None:
     counts = {"captures_n": len(captures), "readings_n": readings_n}
     counts["indentations_n"] = sum(capture_counts.get("indentations_n", 0) for capture_counts in ingest_counts.values())
     io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": summary})
-    say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
+    say(f"{settings.scene}: {indentations}: described {readings_n} readings of {len(captures)} captures")
 
 
 def split(settings: Settings, section: Split, indentations: Path, folds: Path) -> None:
@@ -123,9 +126,11 @@ def split(settings: Settings, section: Split, indentations: Path, folds: Path) -
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))
-        return say(f"{settings.scene}: {len(captures)} captures; no experiment holds rows out")
+        return say(
+            f"{settings.scene}: {len(captures)} captures; no folds, because no experiment of the scene holds rows out"
+        )
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
     new_folds = draw_folds(rows, settings.held_out, section, settings.seed)
     io.write_json(folds, render_folds(captures, rows, new_folds))
     counts = f"{len(rows)} rows of {len(captures)} captures, {len(new_folds)} folds"
-    say(f"{settings.scene}: {counts}; left out: {rows.dropped}")
+    say(f"{settings.scene}: {counts}; rows that are in no fold: {rows.dropped}")

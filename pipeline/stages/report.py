@@ -88,7 +88,9 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     io.write_json(reports / "numbers.json", shared)
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
-    with make_executor(imports="pipeline.report.experiments") as executor:  # drawing takes most of the time
+    with make_executor(
+        imports="pipeline.report.experiments"
+    ) as executor:  # figures are drawn in parallel, because drawing takes most of the time
         figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
         costs_future = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
@@ -223,7 +225,7 @@ def publish(settings: Settings, indentations: Path, models: Path, results: Path,
         found = published_results(scene, name, indentations, models, results, reports)
         say(write_scene(found, experiment, home(), register=not is_experiment()))
     except TrackingUnavailable as error:
-        say(f"warning: {name} is not in MLflow: {error}")
+        say(f"warning: the results of scene {name} were not written to MLflow: {error}")
 
 
 def published_results(
@@ -271,8 +273,10 @@ def planned_scene(settings: Settings) -> Scene:
     if list(scene.experiments) != list(planned):
         in_one_only = ", ".join(sorted(set(scene.experiments) ^ set(planned)))
         difference = f"{in_one_only} only in one of them" if in_one_only else "their order"
-        remedy = f"Try: reskin scenes use {settings.scene}, followed by the other scenes of the plan."
-        raise ParamsError(f"{settings.where}: experiments differ from those in {PLAN}: {difference}. {remedy}")
+        remedy = f"Try: reskin scenes use {settings.scene}, followed by the names of the other scenes in the plan."
+        raise ParamsError(
+            f"{settings.where}: the experiments of the scene differ from those in {PLAN}: {difference}. {remedy}"
+        )
     return scene
 
 

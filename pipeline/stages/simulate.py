@@ -21,8 +21,9 @@ def simulate(settings: Settings, protocol: str, raw: Path) -> None:
     simulation, seed = simulation_settings(settings), settings.seed
     pairs, skins_n = list_captures(simulation, protocol), simulation.protocols[protocol].skins_n
     if len(pairs) < skins_n:
-        rule = f"at most the {len(pairs)} that its boards have"
-        raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Reduce it.")
+        rule = f"at most {len(pairs)}, the number of skins on the boards of the protocol"
+        remedy = f"Reduce simulate.protocols.{protocol}.skins_n."
+        raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, remedy)
     with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
         futures = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]

@@ -42,8 +42,9 @@ def sweep_pokes(
     recipe = settings.section(Adaptations, "adapt").recipes[HEADLINE]
     held_out = data.folds_of("lobo")[-section.boards_n :]
     if section.boards_n > len(held_out):
-        rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, "Reduce it.")
+        rule = f"at most {len(held_out)}, the number of boards of the scene"
+        remedy = "Reduce sweep_pokes.boards_n."
+        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, remedy)
     named_recipe = (HEADLINE, recipe)
     pairs = [
         (job, pokes_n)

@@ -105,7 +105,7 @@ def test_answer_uses_experiment_random_presses_if_it_was_run():
     assert "With 40 labelled presses: 87.0 % (86.0; 88.0) within 1 mm." in found.place.sentences
     # This is the mean of the rms errors of the two boards.
     assert found.force.short.startswith("not usable; rms error 1.5 N")
-    assert "needs of the new skin: 65 presses without labels." in found.tested
+    assert "needs from the new skin: 65 presses without labels." in found.tested
 
 
 @pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
@@ -132,7 +132,7 @@ def test_scene_without_held_out_boards_has_no_answer_on_new_skins():
     alone = {name: value for name, value in all_experiments("recorded").items() if name != "table2"}
     found = answers(alone)
     assert (found.place.level, found.force.level, found.efforts) == (UNTESTED, UNTESTED, ())
-    assert "Same skin" in found.place.sentences[0]
+    assert "held-out readings" in found.place.sentences[0]
     seen = {"hover": {"screw": {"seen": True}}, "single_skins": {"screw": {"accuracy_pct": 100.0, "mse_xy_mm2": 0.1}}}
     assert "without touch" in answers(alone | seen).place.sentences[0]
     bare = {name: value for name, value in alone.items() if not name.startswith("single")}

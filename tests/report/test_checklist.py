@@ -99,10 +99,13 @@ def test_row_of_a_missing_experiment_says_that_it_was_not_run():
 )
 def test_number_is_met_within_the_papers_standard_deviation_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
-    assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
+    assert (judgement.criterion, judgement.met) == (
+        "within the paper's standard deviation",
+        "yes" if abs(ours - mean) <= sd else "no",
+    )
     alone = judge_value(stat(ours), mean, ours=f"a.{path}")
     assert (alone.criterion, alone.met) == (
-        "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
+        "within 10 % of the paper's number", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
     )  # fmt: skip
     # There is no verdict, because a standard deviation is not an interval over boards.
     assert judgement.verdict == alone.verdict == NO_INTERVAL
@@ -190,7 +193,7 @@ def test_decrease_of_an_error_counts_as_gain():
 )
 def test_sizeable_gain_must_be_at_least_half_of_the_papers_gain(low, high, verdict, equivalent):
     judgement = judge_value(over_boards(low, high), 5.97, rule="sizeable")
-    assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98, half of the paper's")
+    assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98 (half of the paper's gain)")
     assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 

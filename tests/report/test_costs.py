@@ -312,4 +312,4 @@ def test_table_gives_times_and_errors_of_reference_methods():
     found = learning_times({"rivals": {"methods": methods}}, {"reference_methods": took})
     (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
     assert (line["method"], line["accuracy, %"]) == ("map", "40.00 ± 0.10")
-    assert (line["until ready, s"], line["per reading, µs"]) == ("3", "50")
+    assert (line["time until ready, s"], line["per reading, µs"]) == ("3", "50")

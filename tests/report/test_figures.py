@@ -197,7 +197,7 @@ def test_figure_of_labels_has_a_line_for_each_method(lab):
     labels = texts_of(headline_figures(lab, "recorded")[LABELS])
     assert all(f"{row['method']} ({row['inputs']})" in labels for row in lab["labels"])
     assert "recorded" in labels
-    assert "as labelled" in labels
+    assert "positions not corrected" in labels
 
 
 def titles(svg: str) -> list[str]:

@@ -25,7 +25,7 @@ def test_protocol_of_an_experiment_that_was_not_run_is_omitted():
 def test_count_of_one_is_followed_by_a_singular():
     drift = {"unit": "pass", "train_n": 1, "test_n": 1, "every_n": 2, "skins_n": 1, "seeds_n": 1}
     (one,) = protocols({"drift": drift | {"initial": [{"contacts_n": 961}]}})
-    assert "first 1 pass, tested on 1 pass after every 2 passes; 1 network per policy" in one.ours
+    assert "first 1 pass, tested on 1 pass after every 2 passes; 1 network per policy of no-load" in one.ours
 
 
 def test_each_protocol_belongs_to_a_section_of_the_page():

@@ -58,21 +58,21 @@ def test_sentence_about_shear_is_about_held_out_lines():
     # This is the result with random readings held out, which the sentence must not state.
     numbers["shear"]["explained_fz"]["mean"] = 0.5
     numbers["shear"]["by_line"]["explained_fz"]["mean"] = 0.25
-    assert "25.00\u00a0% of that of normal forces" in sentences(numbers)["shear.svg"]
+    assert "25.00\u00a0% of the variance of the normal forces" in sentences(numbers)["shear.svg"]
 
 
 def test_accuracy_after_drift_has_one_decimal():
     numbers = numbers_of("paper")
     numbers["drift"]["each"][-1]["accuracy_pct"] = 94.5
-    assert "94.5\u00a0% with one before each contact" in sentences(numbers)["drift.svg"]
+    assert "94.5\u00a0% with a no-load reading before each contact" in sentences(numbers)["drift.svg"]
 
 
 def test_sentence_about_pokes_states_that_bars_are_not_intervals_of_the_difference():
     numbers = numbers_of("quick")
     sentence = sentences(numbers)["sweep_pokes.svg"]
-    assert sentence.endswith("not of the difference: that is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")
+    assert sentence.endswith("two scores: this difference is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")
     del numbers["paired"]
-    assert sentences(numbers)["sweep_pokes.svg"].endswith("not of the difference.")
+    assert sentences(numbers)["sweep_pokes.svg"].endswith("not of the difference between two scores.")
 
 
 def test_sentence_is_about_unseen_boards_instead_of_table_2_if_they_were_tested():

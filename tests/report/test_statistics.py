@@ -288,7 +288,7 @@ def test_claim_of_several_parts_is_supported_only_if_all_parts_are():
 
 def test_methods_tested_on_different_skins_cannot_be_compared():
     few, many = score_table({"b0": [[1.0]]}), score_table({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
-    with pytest.raises(SchemaError, match="the same held-out skins for both methods; only one method has .*'b1_s0'"):
+    with pytest.raises(SchemaError, match="the same held-out skins, but only one method has scores on .*'b1_s0'"):
         paired(few, many)
 
 

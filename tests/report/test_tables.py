@@ -220,9 +220,9 @@ def test_only_marked_blocks_of_a_page_are_replaced():
     pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
     assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
     assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
-    with pytest.raises(SchemaError, match="block b must be in one page; it is in no page"):
+    with pytest.raises(SchemaError, match="block b must be in exactly one page; it is in no page"):
         fill(pages, {"b": "new"})
-    with pytest.raises(SchemaError, match="in one page; it is in one.md, other.md"):
+    with pytest.raises(SchemaError, match="in exactly one page; it is in one.md, other.md"):
         fill(pages | {"other.md": pages["one.md"]}, {"a": "new"})
 
 
@@ -311,7 +311,11 @@ def test_table_1_contains_the_cells_of_the_paper(measured):
 
 def test_settings_of_a_simulation_are_not_called_measured():
     for source, rate, area in (
-        ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
+        (
+            "simulated",
+            "400 Hz, a setting, computed from the times in the captures, simulated",
+            "mm, a setting, simulated",
+        ),
         ("recorded", "400 Hz, recorded", "mm, recorded"),
     ):
         numbers = all_experiments(source)
