@@ -99,12 +99,15 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
     flat = np.flatnonzero((lowest == highest).all(axis=1))
     if len(flat):
         where, found = f"triplets of group {names[flat[0]]}", f"all {count[flat[0]]} points are at one place"
-        raise TrainingError(f"{where}: {found}. Poke at several places, or leave the group out.")
+        remedy = "Add presses at other places to this group, or remove the group from the training rows."
+        raise TrainingError(f"{where}: {found}. {remedy}")
     is_anchor = np.zeros(len(place), bool)
     for first, n in zip(start, count, strict=True):
         is_anchor[order[first : first + n]] = _find_anchors(place[order[first : first + n]])
     if not is_anchor.any():
-        raise TrainingError(f"triplets: all {len(place)} points are equally far from each other. Poke at more places.")
+        raise TrainingError(
+            f"triplets: all {len(place)} points are equally far from each other. Add presses at other places."
+        )
     return TripletPoints(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
 
 
@@ -130,7 +133,10 @@ def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: n
         if not len(left):
             return positive, negative
     place = points.place[anchor[left[0]]].tolist()
-    raise TrainingError(f"triplets: {MAX_DRAWS_N} draws from the anchor at {place} were ties. Poke at more places.")
+    raise TrainingError(
+        f"triplets: for the anchor at {place}, {MAX_DRAWS_N} draws gave no two points at different distances. Add "
+        "presses at other places."
+    )
 
 
 def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:

@@ -75,7 +75,9 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
     torch.set_num_threads(1)
     started_s, start_s, on, first = time.time(), time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("RESKIN_DEVICE=cuda, but torch finds no CUDA device. Unset it to train on the CPU.")
+        raise TrainingError(
+            "RESKIN_DEVICE is cuda, but torch finds no CUDA device. To train on the CPU, unset RESKIN_DEVICE."
+        )
     prepared, scalers = zip(*(prepare(job, data) for job in jobs), strict=True)
     architecture = first.recipe.architecture
     outcomes = train(prepared, architecture, first.schedule, first.loss_weights, on)

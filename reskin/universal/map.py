@@ -446,8 +446,8 @@ class MapEvaluator:
         self.gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
         invalid = ~np.isfinite(self.gaussians.log_det)
         if invalid.any():
-            what = f"{int(invalid.sum())} covariances of its hypotheses are not positive definite"
-            raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
+            what = f"the covariances of {int(invalid.sum())} hypotheses (places and forces) are not positive definite"
+            raise SchemaError(f"map of a skin: {what}. Take the no-load reading again: call zero.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
         """Return, for each hypothesis, the expected relative error of the law and how uncertain it still is.

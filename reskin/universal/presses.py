@@ -83,7 +83,10 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
     known = placed & (force_N > 0) if forces_known else placed
     if not known.any():
         what = f"board {captures[0].board} has no press with a known place and force"
-        raise SchemaError(f"experiment compare: {what}. Record both, or remove the experiment from the scene.")
+        raise SchemaError(
+            f"experiment compare: {what}. Record the places and forces of presses, or remove "
+            "the experiment from the scene."
+        )
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],
