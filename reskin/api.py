@@ -563,7 +563,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     ------
     ReskinError
         If a model cannot be read or a port is listed twice. The `with` statement also raises this error, if a port
-        cannot be opened or sends no readings, or if the number of the board's chips is not that of the model.
+        cannot be opened or sends no readings, or if the board and the model have different numbers of chips.
 
     Examples
     --------

@@ -188,7 +188,7 @@ def truth_at(
     """Return the true x_mm, y_mm and F_N of each reading of a recording that a robot made.
 
     A dwell is a stop of the robot at one place; it lasts from `start_s` to `end_s`. The true values of a reading are
-    those of the dwell during which the reading was taken. Readings between dwells have NaN.
+    the values of the dwell during which the reading was taken. Readings between dwells have NaN.
     """
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])

@@ -1,6 +1,6 @@
 """An emulated board: a process that sends the bytes that a real board would send.
 
-The bytes are those of a recorded capture or of a simulation. They are sent to a pseudo-terminal or to a TCP socket,
+The bytes come from a recorded capture or from a simulation. They are sent to a pseudo-terminal or to a TCP socket,
 from which other programs read them as from a serial port. Faults can be added to the bytes, such as a chip that is
 stuck or a cable that is unplugged.
 """
@@ -352,7 +352,7 @@ def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
         return [piece if i % 2 else b"" for i, piece in enumerate(pieces)]
     if fault == "torn":
         return [piece[:-TORN_BYTES_N] if i % TORN_EVERY_N == 0 else piece for i, piece in enumerate(pieces)]
-    rng = rng_for(0, "inject", fault)  # wrong-baud
+    rng = rng_for(0, "inject", fault)  # the remaining fault is `wrong-baud`: the bytes are random
     return [rng.bytes(len(piece)) for piece in pieces]
 
 

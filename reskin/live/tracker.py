@@ -180,7 +180,7 @@ class UniversalEstimator:
 
     @property
     def external_uT(self) -> float:
-        """Expected size of external fields, such as that of a magnet; 0 if no external fields are expected."""
+        """Expected size of external fields, such as the field of a magnet; 0 if no external fields are expected."""
         return self._model.external_uT
 
     def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:

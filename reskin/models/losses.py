@@ -2,8 +2,8 @@
 
 The triplet loss is computed from triplets, which this module draws at random. A triplet consists of three points of the
 same group, where a group is a skin or a line of pokes: an anchor, a positive and a negative. The positive is strictly
-nearer to the anchor than the negative. The loss makes the network's features of the anchor more similar to those of the
-positive than to those of the negative.
+nearer to the anchor than the negative. The loss makes the network's features of the anchor more similar to the
+features of the positive than to the features of the negative.
 """
 
 from dataclasses import dataclass
@@ -162,8 +162,8 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    The result is the same as that of `np.unique(place, axis=0, ...)`. That function takes three times as long, because
-    it compares rows as records.
+    `np.unique(place, axis=0, ...)` gives the same result, but takes three times as long, because it compares rows as
+    records.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

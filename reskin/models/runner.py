@@ -52,7 +52,8 @@ def run_jobs(
     data
         The rows to which the row numbers of the jobs refer.
     executor
-        Runs the training of each stack (jobs that are trained together) in a worker process.
+        Executor with worker processes. Jobs that are trained together are called a stack; each stack is trained in one
+        worker process.
     cache
         Folder with the results of completed training runs.
     log

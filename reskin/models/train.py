@@ -142,8 +142,7 @@ def train(
 def clip_gradients(net: Stack, norm_max: float) -> None:
     """Clip the gradient of each network to a norm of at most `norm_max`.
 
-    The norm is that of the gradient with respect to all weights of the network. A gradient with a larger norm is scaled
-    down.
+    The norm is computed over all weights of the network. A gradient with a larger norm is scaled down.
     """
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
@@ -183,7 +182,7 @@ class AdamW:
 
     This class calls the function `torch.optim.adamw.adamw` instead of using the class `torch.optim.AdamW`. The first
     use of that class in a process would import PyTorch's compiler, which takes a second of CPU time. The results are
-    bit-identical to those of `torch.optim.AdamW`.
+    bit-identical to the results of `torch.optim.AdamW`.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:

@@ -256,7 +256,7 @@ def tabulate(
     """Tabulate the displacement and the rotation of the material for all depths up to `deepest_m`.
 
     The result is interpolated between tables for values of ln(R/h) that are multiples of `SIZE_STEP`. The depths in the
-    table are those of the ladder, so the last depth is slightly greater than `deepest_m`. The values at one depth do
+    table are the depths of `LADDER`, so the last depth is slightly greater than `deepest_m`. The values at one depth do
     not depend on `deepest_m`.
 
     Parameters

@@ -180,7 +180,9 @@ def _about(header: Any) -> dict[str, str]:
 
 
 def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[str, Float32[np.ndarray, "f _"]]:
-    """Return the labels of each reading of a capture: those of the dwell in which it was taken, or NaN between dwells.
+    """Return the labels of each reading of a capture.
+
+    These are the labels of the dwell in which the reading was taken. Readings between dwells have NaN.
 
     The result maps each feature to its values; it is empty if the capture has no probe log.
     """

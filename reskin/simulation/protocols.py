@@ -261,7 +261,7 @@ class Press(_OnlyTemperature):
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
         """Draw the place, the duration and the largest depth of each press.
 
-        All presses have the same number of stops, which is that of the longest press. After a shorter press, the tip
+        All presses have as many stops as the longest press. After a shorter press, the tip
         stays above the skin for the remaining stops.
         """
         least_s, most_s = self.duration_s

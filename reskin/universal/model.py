@@ -103,7 +103,7 @@ MISFIT_MAX = 4.0
 # may be another skin. In scene lab, recordings of one board differ by at most 5 %, and recordings of different boards
 # by 65 %.
 OTHER_SKIN_MIN = 0.25
-BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
+BLOCK_N = 200  # readings are evaluated in blocks of this size, which limits the memory
 # With external fields, the errors of map and networks are more strongly correlated. The likelihood power is therefore
 # divided by 1 + external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Both values were chosen so that 90 % intervals
 # contain 90 % of the true values on simulated skins.
@@ -132,8 +132,8 @@ class Evaluation:
     The likelihood power affects standard deviations and, in `by_map`, also places and forces.
 
     `line` calibrates the forces (`reskin.universal.force`). If only few forces are known, they are used in two ways:
-    `likelihoods` are those of the map that is conditioned on the presses with known forces, and `unlabelled` those of
-    the map that is not conditioned on them. `few` contains these presses.
+    `likelihoods` comes from the map that is conditioned on the presses with known forces, and `unlabelled` from a map
+    that is not conditioned on these presses. `few` contains the presses.
     """
 
     evaluator: MapEvaluator
@@ -324,9 +324,10 @@ class PressCalibration:
 
     @cached_property
     def moved(self) -> SkinMap:
-        """The map, with the same shift of places as the networks if the shift was estimated from random presses.
+        """The map, with its places moved by the same shift as the places of the networks.
 
-        Random presses are presses at random places all over the area of presses. Without them, this is `skin`.
+        The map is moved only if the shift was estimated from presses at random places all over the area of presses.
+        Otherwise, this is `skin`.
         """
         return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
 
@@ -396,8 +397,8 @@ class PressCalibration:
 
         Two maps are compared: one for an unchanged slide, and one for a changed slide. The log odds are the log
         likelihood of the press under the first map minus its log likelihood under the second map. A likelihood is the
-        sum over all places and forces, because those of the press are unknown. Both maps are conditioned on the labels
-        of the day of this object.
+        sum over all places and forces, because the place and the force of the press are unknown. Both maps are
+        conditioned on the labels of the day of this object.
         """
         same, changed = (
             logsumexp(-0.5 * skin.evaluator.evaluate(db_uT).deviance.astype(float), axis=1)

@@ -24,8 +24,9 @@ PRESSES_N = 2 * PLACES_N  # number of presses on each skin: the first half is fo
 PITCH_MM, JITTER_MM = 2.0, 0.05
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
-# The following constants describe how boards and skins vary, in addition to the parameters of the law. These values and
-# the spreads of the parameters are assumed. Thickness and tip radius are relative to those of the setup.
+# Boards and skins differ in the parameters of the law, and also in the properties that the following constants
+# describe. The values of these constants and the spreads of the parameters are assumed. Thickness and tip radius are
+# relative to those of the setup.
 THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: its probability
 TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: its probability
 # Increase of the logarithm of the amplitude per mm of gap. In fits to the boards of scene lab, a larger gap comes with
