@@ -38,7 +38,7 @@ BLOCK_STEPS_N = 50
 # Training is stopped if the mean squared error exceeds this value, because networks hardly ever recover from such an
 # error. The error is in scaled units, in which a network that always predicts the mean has an error of 1.
 DIVERGED = 1e8
-# Whether a network has collapsed (predicts nearly the same value for all inputs) is checked only after this number of
+# A network has collapsed if it predicts nearly the same value for all inputs. This is checked only after this number of
 # steps or more, because after fewer steps, the network may not have learned anything yet.
 CHECKED_STEPS_N = 200
 CHECKED_ROWS_N = 2000  # approximate number of training rows, evenly spaced, on which collapse is checked

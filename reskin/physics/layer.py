@@ -219,7 +219,9 @@ def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius
     limit_m = min(thickness_m, tip_radius_m)
     if not (np.isfinite(depth_m) & (depth_m < limit_m)).all():
         rule = f"finite and below {1e3 * limit_m:.3g} mm, the smaller of the skin's thickness and the tip's radius"
-        raise ParamsError("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Reduce the depth.")
+        raise ParamsError(
+            "poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Reduce the depth of the indentation."
+        )
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:

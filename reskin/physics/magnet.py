@@ -178,7 +178,11 @@ def place_nodes(
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
         raise ParamsError(
-            "quadrature", "thickness, cell and layers", "above 0", got, "Correct these settings of the skin."
+            "quadrature",
+            "thickness, cell and layers",
+            "above 0",
+            got,
+            "Correct the skin's thickness or the quadrature.",
         )
     (along_x_m, widths_x_m), (along_y_m, widths_y_m) = (_cells(side_m, rule) for side_m in sides_m)
     gauss, weights = np.polynomial.legendre.leggauss(rule.layers_n)

@@ -178,9 +178,10 @@ def slip_traction(contact: layer.Contact) -> Traction:
     """Return the traction q of a sliding tip.
 
     According to Coulomb's law q = mu p, the traction is proportional to the pressure p. The simulation uses this
-    traction at all stops of a drag, including those at which the tip still sticks, because the tip begins to slide
-    after one or two millimetres. The tangential stiffness for this traction is lower than for `stick_traction`: by 19
-    to 20 % on the nominal skin at depths of 0.2 to 1.2 mm, and by 1/6 on a very thick layer.
+    traction at all stops of a drag, although the tip still sticks at the first stops. The
+    reason is that the tip begins to slide after one or two millimetres. The tangential stiffness for this traction is
+    lower than for `stick_traction`: by 19 to 20 % on the nominal skin at depths of 0.2 to 1.2 mm, and by 1/6 on a very
+    thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 

@@ -30,8 +30,8 @@ NOISE_uT = (3.3, 3.3, 5.0)  # standard deviations of a reading's noise along x, 
 # The error of the law that is expected from recorded boards is multiplied by a random factor between 0 and this value.
 RESIDUAL_SCALE_MAX = 2.0
 # Ranges of the relative rms error of the law, from which the error of each skin is drawn. The first range is for
-# simulated skins if recorded boards of the same rig are known, the second for simulated skins if no board is known, and
-# the third for recorded boards.
+# simulated skins if recorded boards of the same rig are known. The second range is for simulated skins if no board is
+# known, and the third range is for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
 # The random error of the law is a sum of cosine waves: range of its length scale in place, its length scale in log
 # force, and number of waves.

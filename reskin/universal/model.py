@@ -12,8 +12,8 @@ Three classes contain both parts at different stages of calibration:
 
 These three classes use the frame and the axes of the board, and work for any board. `Universal` is the class for users.
 It is made for the board of one layout (`reskin.universal.layout`); the model that comes with the project is for the
-paper's board. `Universal` takes readings along the axes of the chips, and its places are in the frame of the labels, in
-which the centre of the board is at the layout's `centre_mm`.
+paper's board. `Universal` takes readings along the axes of the chips. Its places are in the frame of the labels. In
+this frame, the centre of the board is at the layout's `centre_mm`.
 
 A likelihood power is the exponent to which a likelihood is raised. A power below 1 increases standard deviations. It is
 used where likelihoods are multiplied as if errors were independent although they are correlated.
@@ -94,8 +94,9 @@ SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networ
 # `network_offsets_mm` corrects the places of the networks twice. The first correction, from unlabelled presses, loses
 # weight as labels are added: it is divided by 1 + this value * number of labels.
 FADES_PER_LABEL = 0.15
-# The error of the networks in place is a constant error on each skin, with the first standard deviation, plus an error
-# that differs from press to press, with the second one.
+# The error of the networks in place is assumed to be the sum of two parts: a part that is the same for all presses on a
+# skin, with the first standard deviation, and a part that differs from press to press, with the second standard
+# deviation.
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0
 # A warning is given if chi^2 per channel exceeds this assumed value. For skins like those in training, it is about 1.
 MISFIT_MAX = 4.0

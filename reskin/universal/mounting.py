@@ -1,12 +1,12 @@
 """Check how a skin is mounted on its board, and how the axes of the labels are oriented.
 
-The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after one or three
-quarter turns, every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
-down, fields have the same sign and are about 1.3 times as large.
+The poles of the paper's skin alternate like the fields of a checkerboard. Therefore, if the skin is turned by one or
+three quarter turns before it is glued on, every field has the opposite sign. Half a turn changes nothing. If the skin
+is glued on upside down, fields have the same sign and are about 1.3 times as large.
 
 The no-load field shows whether a skin is turned. Without this check, the universal model would estimate wrong places on
-a turned skin, because the field change of a press on a turned skin resembles that of a press on the opposite side of a
-skin that is not turned.
+a turned skin, because two field changes are similar: the field change of a press on a turned skin, and the field change
+of a press on the opposite side of a skin that is not turned.
 
 Presses at known places show whether the axes of the labels are oriented as the user has stated.
 """

@@ -175,10 +175,10 @@ def memory(
 ) -> float | None:
     """Return the fraction of the field change of a press that remains in the next no-load reading.
 
-    In each capture, a linear regression explains the no-load readings by the field change of the previous press, the
-    field change of the next press, and a polynomial in time for the drift. The result is the mean over captures of the
-    coefficient of the previous press. A capture is skipped if it is too short, or if it does not have a new no-load
-    reading before each press. The result is None if all captures are skipped.
+    In each capture, a linear regression explains the no-load readings by three terms: the field change of the previous
+    press, the field change of the next press, and a polynomial in time, which describes the drift. The result is the
+    coefficient of the previous press, averaged over captures. A capture is skipped if it is too short, or if it does
+    not have a new no-load reading before each press. The result is None if all captures are skipped.
     """
     coefficients = []
     for capture_i in np.unique(presses.capture_i):
