@@ -116,7 +116,7 @@ def read_network(model: Path) -> Network:
     if str(form).startswith(UNIVERSAL):
         raise ParamsError(f"{model}: this is a universal model. Load it with reskin.load_universal(file=...).")
     if form != FORMAT:
-        raise SchemaError(f"{card_file}: the format is {form}, but only {FORMAT} is supported. Train the model again.")
+        raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
     if tuple(card.output) != TARGETS:
         outputs = ", ".join(card.output) or "nothing"

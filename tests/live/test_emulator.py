@@ -352,5 +352,5 @@ class TestRobot:
     def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")
         for options in ({"board": "b1"}, {"robot": True}):
-            with pytest.raises(ParamsError, match="only for nominal"):
+            with pytest.raises(ParamsError, match="can only be used with source nominal"):
                 read_script(str(tmp_path / "c0"), **options)

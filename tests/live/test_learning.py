@@ -166,7 +166,10 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
     found = estimator(db_uT.astype(np.float32)).target
     np.testing.assert_allclose(found, expected, atol=0.02)  # The tolerance in mm and N is that of single precision.
-    for wrong_mm, wrong_N, message in (((99.0, 8.0), 1.0, "on the skin"), ((8.0, 8.0), 900.0, "the model's range")):
+    for wrong_mm, wrong_N, message in (
+        ((99.0, 8.0), 1.0, "on the skin"),
+        ((8.0, 8.0), 900.0, "the force range of the model"),
+    ):
         with pytest.raises(SchemaError, match=message):
             estimator.add_label(wrong_mm, wrong_N, db_uT[3])
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, found)

@@ -185,7 +185,7 @@ def test_wrong_input_is_an_error_and_leaves_nothing_behind(tmp_path):
     folder = write_stream(tmp_path, "binary")
     (folder / PROBE_FILE).write_text(DWELLS)
     for files, options, error, message in (
-        ([good, simulated], {}, SchemaError, "it is simulated, but .*a.parquet is recorded"),
+        ([good, simulated], {}, SchemaError, "this recording is simulated, but .*a.parquet is recorded"),
         ([good, unlabelled], {}, SchemaError, "contains Fz_N. Export these recordings to different folders"),
         ([good, slow], {}, ReskinError, "different rates, 10 to 100 Hz"),
         ([good, write_log(tmp_path)], {}, SchemaError, "only this recording or only .* contains"),
