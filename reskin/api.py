@@ -80,7 +80,7 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
 
     files = sorted(Path(folder).glob("*.parquet"))
     if not files:
-        raise ParamsError(f"{folder}: no Parquet files in this folder. Ingest captures first: dvc repro.")
+        raise ParamsError(f"{folder}: no Parquet files in this folder. To create them from captures, run `dvc repro`.")
     return load(files, Selection(force_min_N=force_min_N))
 
 
@@ -290,7 +290,9 @@ def simulate_recording(
         raise ParamsError(f"{where}: {target} exists. Choose another folder.")
     for what, name in (("folder", target.name), ("skin", skin), ("board", board)):
         if not re.fullmatch(headers.NAME, name):
-            raise ParamsError(where, what, "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another name.")
+            raise ParamsError(
+                where, what, "1 to 64 characters from A-Z, a-z, 0-9, _ and -", repr(name), "Choose another name."
+            )
     presses = nominal("protocols")[MAIN] | {"depths_mm": list(depths_mm), "passes_n": passes_n}
     section = {"boards": nominal("boards"), "protocols": {MAIN: presses}}
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, where)
@@ -362,7 +364,7 @@ class Model:
             If the number of channels differs from the model's.
         """
         if self._noload_uT is None:
-            raise ParamsError("predict: the no-load reading is missing. First call zero with fields without contact.")
+            raise ParamsError("predict: the no-load reading is missing. First call zero with readings without contact.")
         rows_uT = self._rows(b_uT)
         predicted = self._network((rows_uT - self._noload_uT).astype(np.float32))
         return predicted if np.ndim(b_uT) == 2 else predicted[0]
@@ -561,7 +563,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     ------
     ReskinError
         If a model cannot be read or a port is listed twice. The `with` statement also raises this error, if a port
-        cannot be opened or sends no readings, or if the number of the board's chips is not that of the model.
+        cannot be opened or sends no readings, or if the board and the model have different numbers of chips.
 
     Examples
     --------

@@ -39,27 +39,29 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Learning for magnetic tactile skins: read boards, record, see contacts live, estimate contacts from logs.",
-    epilog=f"In a checkout of the project also: {', '.join(CHECKOUT_COMMANDS)}.",
+    epilog=f"In a checkout of the project, there are also the commands {', '.join(CHECKOUT_COMMANDS)}.",
 )
 
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Chips = Annotated[int, Option("--chips", help="Number of chips in a frame.", min=1, max=64)]
 SOURCE = "The folder of a capture, `nominal` (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = (
-    "What is shown for readings with a fault. NAME=flag shows their estimates, for example stuck=flag. NAME=drop hides "
-    "them. The names of the faults are in section faults of params.yaml. The option can be repeated."
+    "Whether estimates are shown for readings with the fault NAME. NAME=flag shows them, for example stuck=flag. "
+    "NAME=drop hides them. The names of the faults are in section faults of params.yaml. The option can be repeated."
 )
 LABELS = (
-    "How the places of the presses are known. grid:NXxNY:STEP_MM or line:N:STEP_MM: you are asked to press the places "
-    "of a grid or a line. Otherwise, the CSV file to which the program of a robot appends the places."
+    "Source of the places of the presses. With grid:NXxNY:STEP_MM or line:N:STEP_MM, you are asked to press the places "
+    "of a grid or a line one by one. With the name of a CSV file, the places are read from this file, to which the "
+    "program of a robot appends them."
 )
 SCAN = (
-    "Order in which the places are pressed. If you are asked to press places (--labels grid or line): random (default) "
-    "or snake. Otherwise: a description, which is written to the header of the capture."
+    "Order in which the places are pressed. With --labels grid or line, it is the order in which you are asked to "
+    "press them: random (default) or snake. Otherwise, it is any description of the order, which is only written to "
+    "the header of the capture."
 )
 GAUGE = (
-    "Port of a force gauge that sends lines with Fz, or with Fx Fy Fz, in N. If its baud rate is not 9600, use "
-    "PORT@BAUD."
+    "Port of a force gauge. The gauge must send lines of text with Fz, or with Fx Fy Fz, in N. If its baud rate is not "
+    "9600, use PORT@BAUD."
 )
 BOARD_NAME = "Only with source nominal: name of the simulated board. Each name gives another board with another skin."
 ROBOT = (
@@ -81,12 +83,12 @@ MODEL = (
     "the paper's board."
 )
 EXTERNAL = (
-    "Only for the universal model on a board that moves: by how many uT the external field at the board changes "
-    "(docs/live.md)."
+    "Expected change of the external field in uT, for a board that moves (docs/live.md). Only the universal model has "
+    "this option."
 )
 NEW_DAY = (
-    "State that the calibration was saved on an earlier day. The skin may now slide in another way under presses, so "
-    "the model determines this again (docs/live.md)."
+    "State that the calibration was saved on an earlier day. Under presses, the skin may now slide in another way than "
+    "on that day, so the model determines again how it slides (docs/live.md)."
 )
 USUAL_COUNTS = {  # counts in the result of `predict` that do not indicate a fault
     "rate_hz", "duration_s", "readings_n", "quiet_start_s", "noise_uT", "contact_readings_n", "contacts_n",
@@ -167,7 +169,9 @@ def find_ports(
     hunt: Annotated[
         bool, Option("--hunt", help="Find the port of a board: you are asked to unplug it and to plug it in again.")
     ] = False,
-    rate: Annotated[bool, Option("--rate", help="Measure the frame rates, and explain what limits them.")] = False,
+    rate: Annotated[
+        bool, Option("--rate", help="Measure the frame rate of each board, and explain what limits it.")
+    ] = False,
     seconds: Annotated[float, Option(help="With --rate: duration of the measurement in s.", min=0.5)] = 5.0,
     osr: Annotated[int, Option(help="With --rate: value of the chips' setting OSR (oversampling).", min=0, max=3)] = 0,
     dig_filt: Annotated[
@@ -200,7 +204,9 @@ def template(
     if out.exists():
         raise ParamsError(f"{out}: the file exists. Choose another name.")
     io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
-    typer.echo(f"wrote {out}. Fill in {', '.join(NEEDED)} and fields in uT, then run reskin add --layout table")
+    typer.echo(
+        f"wrote {out}. Fill in columns {', '.join(NEEDED)} and fields in uT, then run `reskin add --layout table`"
+    )
 
 
 @app.command(rich_help_panel=BOARD)
@@ -221,7 +227,7 @@ def record(
     ] = None,
     baud: Annotated[int, Option(help="Baud rate of the port. USB ports ignore it.", min=1)] = 115200,
     seconds: Annotated[
-        float, Option(help="Duration of the recording in s. Default: until Ctrl-C.", min=0.0)
+        float, Option(help="Duration of the recording in s. By default, recording ends when you press Ctrl-C.", min=0.0)
     ] = math.inf,
     scan: Annotated[str | None, Option(help=SCAN)] = None,
     labels: Annotated[str | None, Option(help=LABELS)] = None,
@@ -267,7 +273,7 @@ def _announce_simulation(source: str) -> None:
     The simulation takes some seconds. Without this message, the user would see no output during this time.
     """
     if source == "nominal" or Path(source).is_file():
-        typer.echo("simulating the board; the first time, the simulation is also compiled: please wait", err=True)
+        typer.echo("simulating the board, which takes some seconds, and longer the first time: please wait", err=True)
 
 
 @app.command(rich_help_panel=BOARD)
@@ -281,10 +287,13 @@ def emulate(
         ),
     ] = "pty",
     speed: Annotated[
-        float, Option(help="Speed relative to that of the source; inf sends as fast as possible.", min=0.01)
+        float,
+        Option(
+            help="Speed relative to the speed of the source. With inf, frames are sent as fast as possible.", min=0.01
+        ),
     ] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
-    loop: Annotated[bool, Option("--loop", help="Start again after the last frame.")] = False,
+    loop: Annotated[bool, Option("--loop", help="After the last frame, start again with the first frame.")] = False,
     true_places: Annotated[
         bool, Option("--true-places", help="Print the true place and the true force of each simulated touch.")
     ] = False,
@@ -293,8 +302,8 @@ def emulate(
 ) -> None:
     """Emulate a board: create a port, and send the frames of a capture or of a simulation through it.
 
-    Programs can read the port like that of a real board. With --fault, faults of the board or of the port are simulated
-    too.
+    Programs can read this port like the port of a real board. With --fault, faults of the board or of the port are
+    simulated too.
     """
     from reskin.live.emulator import RobotLog, TouchPrinter, inject, make_port, parse_fault, play, read_script
 
@@ -314,7 +323,9 @@ def emulate(
             listener(piece_i)
 
     emulated, stop = make_port(port), threading.Event()
-    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C: stop")
+    typer.echo(
+        f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; press Ctrl-C to stop"
+    )
     started_s = time.monotonic()
     try:
         sent_n = play(script, emulated, stop, speed=speed, loop=loop, on_sent=on_sent)
@@ -410,7 +421,11 @@ def predict(
     model: Annotated[list[Path] | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
         float,
-        Option("--rate-hz", help="Frames per second. Used only for a file from `reskin decode` without times."),
+        Option(
+            "--rate-hz",
+            help="Frames per second. This option is used only if the log is a file of `reskin decode` that contains no "
+            "times.",
+        ),
     ] = 400.0,
     external_uT: Annotated[float, Option("--external-uT", help=EXTERNAL)] = 0.0,
     new_day: Annotated[bool, Option("--new-day", help=NEW_DAY)] = False,

@@ -177,7 +177,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         if self.n_features_in_ % 3 or self._targets_shape != (len(TARGETS),):
             got = f"{self.n_features_in_} channels and targets of shape {self._targets_shape}"
             rule = f"3 channels per chip and the targets {', '.join(TARGETS)}"
-            raise SchemaError(file, "a saved network", f"for {rule}", got, "Use joblib for other networks.")
+            raise SchemaError(file, "a saved network", f"for {rule}", got, "Save other networks with joblib.")
         io.write_tensors(path, self.network_.tensors, {"format": FORMAT})
         io.write_json(path.with_suffix(".json"), dict(self.network_.card))
 
@@ -194,7 +194,7 @@ class ContactRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
 
 def _as_seed(random_state: Any) -> int:
     if not isinstance(random_state, int | np.integer):
-        remedy = "A run without a seed could not be repeated."
+        remedy = "Pass a seed, so that the training can be repeated."
         raise ParamsError("ContactRegressor", "random_state", "a whole number", repr(random_state), remedy)
     return int(random_state)
 
@@ -210,13 +210,13 @@ def _train(job: TrainingJob, data: TrainingData) -> tuple[TrainingResult, int]:
     for attempt_i in range(MAX_ATTEMPTS_N):
         (result,) = train_stack([replace(job, attempt_i=attempt_i)], data)
         if result.stopped_step is not None:
-            remedy = "Lower rate_max or gradient_norm_max."
+            remedy = "Lower rate_max or gradient_norm_max, which limit the training steps."
             raise TrainingError(f"ContactRegressor: training diverged by step {result.stopped_step}. {remedy}")
         if not result.collapsed:
             return result, attempt_i
     warnings.warn(
-        f"the network collapsed in all of {MAX_ATTEMPTS_N} runs: it predicts nearly the same for all rows. Are X and y "
-        "in the same order? Otherwise, try another rate_max or more steps.",
+        f"the network collapsed in all of {MAX_ATTEMPTS_N} runs: it predicts nearly the same for all rows. Check "
+        "that the rows of X and y are in the same order. If they are, try another rate_max or more steps.",
         ConvergenceWarning,
         stacklevel=3,
     )
@@ -326,7 +326,9 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         from reskin.universal.model import FILE, load_universal
 
         if self.noload_uT is None:
-            raise ParamsError("UniversalRegressor: noload_uT is missing. Pass fields of the untouched skin.")
+            raise ParamsError(
+                "UniversalRegressor: noload_uT is missing. Pass readings of the untouched skin as noload_uT."
+            )
         if self.spread not in ("anywhere", "even", "area"):
             rule = "anywhere, even or area"
             raise ParamsError("UniversalRegressor", "spread", rule, repr(self.spread), "Try: anywhere")
@@ -337,10 +339,12 @@ class UniversalRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc]
         placed, weighed = ~np.isnan(target[:, 0]), ~np.isnan(target[:, 2])
         if (half_known := placed == np.isnan(target[:, 1])).any():
             row_i = int(half_known.argmax())
-            raise SchemaError(f"UniversalRegressor: row {row_i} of y has only one of x_mm and y_mm. Give both or none.")
+            raise SchemaError(
+                f"UniversalRegressor: row {row_i} of y has only one of x_mm and y_mm. State both, or set both to NaN."
+            )
         model = load_universal(file=FILE if self.file is None else Path(self.file), external_uT=self.external_uT)
         if db_uT.shape[1] != model.channels_n:
-            needed = f"This model needs {model.channels_n}: Bx, By, Bz of each chip"
+            needed = f"This model needs {model.channels_n} columns: Bx, By, Bz of each chip"
             raise SchemaError(f"UniversalRegressor: X has {db_uT.shape[1]} columns. {needed}.")
         noload_uT = model.zero(np.asarray(self.noload_uT, float)).noload_uT
         check_is_change("UniversalRegressor", db_uT, noload_uT)

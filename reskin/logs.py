@@ -103,13 +103,13 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
         quiet_n = 0
     if (logged_s := len(b_uT) * step_s(t_s)) < QUIET_MIN_S:
         raise CaptureError(
-            f"{where}: the log has {len(b_uT)} readings ({logged_s:.2g} s); {QUIET_MIN_S:g} s or more without contact "
-            "are needed at its start. Record a longer log."
+            f"{where}: the log has {len(b_uT)} readings ({logged_s:.2g} s), but it must begin with at least "
+            f"{QUIET_MIN_S:g} s without contact. Record a longer log."
         )
     if quiet_n * step_s(t_s) < QUIET_MIN_S:
         raise CaptureError(
             f"{where}: the start without contact lasts {quiet_n * step_s(t_s):.2g} s, less than {QUIET_MIN_S:g} s. "
-            "Leave the skin untouched for the first second."
+            "Record again, and leave the skin untouched for the first second."
         )
     return quiet_n
 
@@ -188,7 +188,7 @@ def truth_at(
     """Return the true x_mm, y_mm and F_N of each reading of a recording that a robot made.
 
     A dwell is a stop of the robot at one place; it lasts from `start_s` to `end_s`. The true values of a reading are
-    those of the dwell during which the reading was taken. Readings between dwells have NaN.
+    the values of the dwell during which the reading was taken. Readings between dwells have NaN.
     """
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])

@@ -67,7 +67,7 @@ def predict(
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT, new_day=new_day)
     if len(files) > 1 and not isinstance(models, Universal):
-        raise ParamsError(f"{files[1]}: a log is estimated by one network. Use one --model.")
+        raise ParamsError(f"{files[1]}: only one network can be used for a log. Use --model only once.")
     inputs = (log, *files, *(file.with_suffix(".json") for file in files))
     if out.resolve() in {file.resolve() for file in inputs}:
         raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
@@ -124,8 +124,8 @@ def warnings(counts: Mapping[str, Any]) -> list[str]:
     sentences, contact_n = list(counts.get("model_warnings", [])), counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
-            f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {contact_n} readings in contact. Are "
-            "the chips in another order, or is this another kind of skin?"
+            f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {contact_n} readings in contact. "
+            "Check the order of the chips in the log, and use a model for this kind of skin."
         )
     if limit_n := counts.get("force_at_limit_readings_n"):
         sentences.append(
@@ -150,7 +150,9 @@ def read_models(
     made = [file for file in files if is_model(file)]
     calibrations = [file for file in files if file not in made and file.is_file() and _is_calibration(file)]
     if new_day and not calibrations and all(file.exists() for file in files):
-        raise ParamsError("--new-day: there is no calibration of an earlier day. Pass one with --model.")
+        raise ParamsError(
+            "--new-day: there is no calibration of an earlier day. Pass a saved calibration with --model."
+        )
     if not (made or calibrations):
         if files and external_uT:
             raise ParamsError(f"{files[0]}: networks have no option for external fields. Use the universal model.")
@@ -159,7 +161,7 @@ def read_models(
         raise ParamsError(f"{missing[0]}: file not found. Check the path.")
     if max(len(made), len(calibrations)) > 1 or len(made) + len(calibrations) < len(files):
         kind = "universal model" if made else "calibration"
-        remedy = "Use it alone, or a universal model with one calibration."
+        remedy = "Pass only this file, or one universal model and one calibration."
         raise ParamsError(f"{(made or calibrations)[0]}: a {kind} cannot be combined with other models. {remedy}")
     calibration, model = calibrations[0] if calibrations else None, made[0] if made else FILE
     return load_universal(calibration, file=model, external_uT=external_uT, new_day=new_day)

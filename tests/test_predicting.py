@@ -233,7 +233,7 @@ def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, mod
 
 
 def test_several_networks_are_refused_for_one_log(tmp_path, model):
-    with pytest.raises(ReskinError, match="a log is estimated by one network. Use one --model"):
+    with pytest.raises(ReskinError, match="only one network can be used for a log. Use --model only once"):
         predict(write_log(tmp_path), [model, model], tmp_path / "out.csv")
     same = predict(write_log(tmp_path), FILE, tmp_path / "out.csv")  # This is the shipped model, named explicitly.
     assert same == predict(write_log(tmp_path), None, tmp_path / "out.csv")
@@ -284,7 +284,7 @@ def test_summary_counts_readings_of_an_unknown_skin_and_forces_at_the_limit(tmp_
 
     swapped = predict(write_presses(tmp_path, chips_on_n=1), None, out)
     assert swapped["unknown_skin_readings_n"] > 0.5 * swapped["contact_readings_n"]
-    assert "Are the chips in another order" in " ".join(warnings(swapped))
+    assert "Check the order of the chips" in " ".join(warnings(swapped))
 
     strong = write_presses(tmp_path, factor=4.0)
     cli.predict(strong, out, None)

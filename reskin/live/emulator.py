@@ -1,6 +1,6 @@
 """An emulated board: a process that sends the bytes that a real board would send.
 
-The bytes are those of a recorded capture or of a simulation. They are sent to a pseudo-terminal or to a TCP socket,
+The bytes come from a recorded capture or from a simulation. They are sent to a pseudo-terminal or to a TCP socket,
 from which other programs read them as from a serial port. Faults can be added to the bytes, such as a chip that is
 stuck or a cable that is unplugged.
 """
@@ -118,7 +118,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
     """
     folder = Path(source)
     if (board is not None or robot) and source != NOMINAL_SOURCE:
-        raise ParamsError(f"{source}: --board and --robot are only for {NOMINAL_SOURCE}. Omit them.")
+        raise ParamsError(f"{source}: --board and --robot can only be used with source {NOMINAL_SOURCE}. Omit them.")
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
     if source == NOMINAL_SOURCE:
@@ -129,7 +129,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
         scene = read_yaml(folder)
         if not isinstance(scene, dict) or "simulate" not in scene:
             raise ParamsError(
-                f"{source}: the scene is recorded, not simulated. Give the folder of one of its captures instead."
+                f"{source}: the scene is recorded, not simulated. Use the folder of one of its captures as the source."
             )
         return simulate(scene["simulate"], scene.get("seed", SEED), source)
     raise ParamsError(
@@ -337,7 +337,10 @@ def _change_values(frames: Frames, fault: str) -> None:
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs a capture with a clock. Use one in format binary-clock.")
+                raise ParamsError(
+                    "--fault: clock-jump needs a capture with a clock of the board. Use a capture in wire format "
+                    "binary-clock."
+                )
             frames.device_s[:] += CLOCK_JUMP_S
 
 
@@ -349,7 +352,7 @@ def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
         return [piece if i % 2 else b"" for i, piece in enumerate(pieces)]
     if fault == "torn":
         return [piece[:-TORN_BYTES_N] if i % TORN_EVERY_N == 0 else piece for i, piece in enumerate(pieces)]
-    rng = rng_for(0, "inject", fault)  # wrong-baud
+    rng = rng_for(0, "inject", fault)  # the remaining fault is `wrong-baud`: the bytes are random
     return [rng.bytes(len(piece)) for piece in pieces]
 
 
@@ -603,7 +606,9 @@ class RobotLog:
 
     def __init__(self, script: Script, file: Path, speed: float = 1.0) -> None:
         if script.true_contacts is None or script.presses_per_pass_n is None:
-            raise ParamsError(f"--robot: no robot presses the skin. Use {NOMINAL_SOURCE}.")
+            raise ParamsError(
+                f"--robot: the source contains no robot that presses the skin. Use source {NOMINAL_SOURCE}."
+            )
         self._cells = _robot_cells(script.true_contacts, script.presses_per_pass_n)
         self._due_s = script.t_s / speed
         self._sent_i, self._last_s = -1, 0.0
@@ -657,7 +662,7 @@ class TouchPrinter:
 
     def __init__(self, script: Script, source: str, say: Callable[[str], object]) -> None:
         if script.true_contacts is None:
-            remedy = "Use nominal, or a simulated scene with protocol log."
+            remedy = "Use source nominal, or the YAML file of a simulated scene with a protocol named log."
             raise ParamsError(f"--true-places: the true places of {source} are unknown. {remedy}")
         contact = np.isfinite(script.true_contacts[:, 0])
         # The first frame of a touch, the frame after its end, the first frame of the next touch, and so on.
@@ -665,7 +670,7 @@ class TouchPrinter:
         self._texts = {}
         for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             x_mm, y_mm, force_N = script.true_contacts[first:end].max(axis=0)
-            self._texts[first] = f"true place: x {x_mm:.1f} mm, y {y_mm:.1f} mm, up to {force_N:.2f} N"
+            self._texts[first] = f"true place: x {x_mm:.1f} mm, y {y_mm:.1f} mm; largest force {force_N:.2f} N"
         self._say, self._sent_i = say, -1
 
     def __call__(self, piece_i: int) -> None:

@@ -81,14 +81,14 @@ class LabelledPress:
         held = np.flatnonzero(size_uT >= PLATEAU * size_uT.max())
         first_s, last_s = float(t_s[held[0]]), float(t_s[held[-1]])
         if self._rest is None:
-            self.problem = "the press began before the label was entered; press again"
+            self.problem = "the press had begun before the label was entered; lift, then press again"
             return
         rest_end_s = self._rest[1] - APPROACH_S
         rest_start_s = max(self._rest[0] + RECOVERY_S, rest_end_s - REST_MAX_S)
         if rest_end_s - rest_start_s < REST_MIN_S:
             self.problem = "the skin was touched shortly before the press; lift for a second, then press again"
         elif last_s - first_s < DWELL_MIN_s:
-            self.problem = "the press was too short; hold it for half a second"
+            self.problem = "the press was too short; press again, and hold the press for half a second"
         else:
             self.rest_s, self.held_s = (rest_start_s, rest_end_s), (first_s, last_s)
             self.db_uT = db_uT[held[0] : held[-1] + 1].mean(axis=0)

@@ -73,7 +73,7 @@ def label_source(
             )
         return from_table(Path(labels))
     if scan not in (None, RANDOM, SNAKE):
-        raise ParamsError(f"--scan: the order of prompts is {RANDOM} or {SNAKE}, not {scan}. The default is {RANDOM}.")
+        raise ParamsError(f"--scan: the order of prompts must be {RANDOM} (default) or {SNAKE}, not {scan}.")
     forces = ForceGauge(port, gauge_baud) if gauge else None
     rng = rng_for(time.time_ns() % 2**31, "prompts")
     return Prompts(places, dwell_s, say, lambda: sys.stdin, forces, rng, scan or RANDOM).source()

@@ -68,11 +68,13 @@ class Server:
         token = request.query.get("token") or request.cookies.get(COOKIE, "")
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
-            raise web.HTTPForbidden(text="token missing or wrong: use the address that reskin live printed\n")
+            raise web.HTTPForbidden(
+                text="the token in the address is missing or wrong: use the address that `reskin live` has printed\n"
+            )
         # Without a token, the host name is checked. This is a protection against DNS rebinding, in which another web
         # site lets its own host name point to this machine.
         if not self._token and not LOCAL_HOST.fullmatch(request.host):
-            raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
+            raise web.HTTPForbidden(text="this page can only be opened as localhost or 127.0.0.1\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
 
@@ -162,7 +164,7 @@ def serve(
         web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)
     except OSError as error:
         if isinstance(error, gaierror) or error.errno in (None, errno.EADDRNOTAVAIL):
-            remedy = "Try 127.0.0.1 (this machine only) or 0.0.0.0 (other machines too)."
+            remedy = "Try 127.0.0.1 (only this machine can connect) or 0.0.0.0 (other machines can connect too)."
             raise ParamsError(f"--host: {host} is not an address of this machine. {remedy}") from None
         reason = "another program uses it" if error.errno == errno.EADDRINUSE else error.strerror
         raise ParamsError(f"--http-port: cannot listen on {http_port}: {reason}. Choose another port.") from None

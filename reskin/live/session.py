@@ -318,7 +318,9 @@ class Session:
             change, estimator = self._changes.popleft(), self.skin.estimator
             try:
                 if not isinstance(estimator, UniversalEstimator):
-                    raise ParamsError("only the universal model can learn a skin, and the model in use is another one.")
+                    raise ParamsError(
+                        "only the universal model can be calibrated on this page, but another model is in use."
+                    )
                 if not self.skin.zeroed:
                     raise ParamsError("there is no no-load reading yet; wait for it, then try again.")
                 self._adapted = change(estimator)
@@ -364,7 +366,7 @@ class Session:
             if done is not None and self._recording is not None:
                 try:
                     if not done.complete:
-                        raise CaptureError(done.problem or "two presses followed each other too quickly")
+                        raise CaptureError(done.problem or "the time between two presses was too short")
                     self._recording.add(done)
                     self._labelled = ""
                 except (ReskinError, OSError) as error:
@@ -542,11 +544,11 @@ class Session:
         if not learn and self._recording is None:
             raise ParamsError(
                 "label: the label would be neither recorded nor used for calibration. Start a recording (key r), or "
-                "tick the box to let the model learn the press."
+                "tick the box to calibrate the model to the press."
             )
         if self._presses is not None:
             raise ParamsError(
-                "label: presses for Adapt or Places are being collected. Finish or cancel them, then enter the label."
+                "label: presses for button Adapt or Places are being collected. Finish or cancel this first."
             )
         self._labelled_press = LabelledPress(Label(True, x_mm, y_mm, Fz_N=force_N), learn=learn)
 

@@ -22,7 +22,7 @@ class SkinFolder:
 
     def __init__(self, folder: Path = SKINS) -> None:
         if folder.exists() and not folder.is_dir():
-            raise ParamsError(f"--skins: {folder} is a file, not a folder. Choose another name.")
+            raise ParamsError(f"--skins: {folder} is a file, not a folder. Choose the name of a folder.")
         self.folder = folder
         self._lock = threading.Lock()
         self._names: list[str] = []
@@ -65,14 +65,16 @@ class SkinFolder:
         """
         file = self.file(name)
         if not model.presses_n:
-            raise SchemaError("not saved: the model has learnt nothing about this skin. First use Adapt or Places.")
+            raise SchemaError(
+                "not saved: the model is not yet calibrated to this skin. First use button Adapt or Places."
+            )
         with self._lock:
             if file.exists():
                 raise ParamsError(f"not saved: {file} exists already. Choose another name.")
             try:
                 model.save(file)
             except OSError as error:
-                remedy = DISK_REMEDIES.get(error.errno or 0, "Try another folder with --skins.")
+                remedy = DISK_REMEDIES.get(error.errno or 0, "Choose another folder with --skins.")
                 raise SchemaError(f"not saved: cannot write {file}: {error.strerror}. {remedy}") from None
             self._listed_s = float("-inf")
         return f"saved {file} (presses: {model.presses_n}, of which labelled: {model.labels_n})"

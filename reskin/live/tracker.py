@@ -180,7 +180,7 @@ class UniversalEstimator:
 
     @property
     def external_uT(self) -> float:
-        """Expected size of external fields, such as that of a magnet; 0 if no external fields are expected."""
+        """Expected size of external fields, such as the field of a magnet; 0 if no external fields are expected."""
         return self._model.external_uT
 
     def suppressor(self, noise_uT: float) -> Float64[np.ndarray, "ch ch"] | None:
@@ -210,13 +210,14 @@ class UniversalEstimator:
         """
         check_presses(db_uT)
         before = self._estimate(db_uT)
-        self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=f"the {len(db_uT)} presses"))
+        step = f"calibration to {len(db_uT)} presses"
+        self._learn(self.learnt._replace(presses_uT=db_uT.astype(np.float64), step=step))
         after = self._estimate(db_uT)
         sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
         misfit = [np.median(estimate.misfit) for estimate in (before, after)]
         return (
-            f"adapted to {len(db_uT)} presses: standard deviation of a place {sd_mm[0]:.2f} mm before, {sd_mm[1]:.2f} "
-            f"mm after; misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
+            f"adapted to {len(db_uT)} presses: median standard deviation of the places {sd_mm[0]:.2f} mm before, "
+            f"{sd_mm[1]:.2f} mm after; median misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
         )
 
     def label(
@@ -243,7 +244,7 @@ class UniversalEstimator:
 
         before_mm, kept_n = error_mm(), int((~held_out).sum())
         guided = Labels(place_mm[~held_out], np.full(kept_n, np.nan), db_uT[~held_out].astype(np.float64))
-        self._learn(self.learnt._replace(guided=guided, step=f"the {kept_n} presses at crosses"))
+        self._learn(self.learnt._replace(guided=guided, step=f"calibration to {kept_n} presses at known places"))
         return (
             f"adapted to {kept_n} known places: median error at {held_out.sum()} other places "
             f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
@@ -267,10 +268,11 @@ class UniversalEstimator:
         check_presses(db_uT[None])
         before = self._estimate(db_uT[None])
         one = Labels(np.array([place_mm], float), np.array([force_N]), db_uT[None].astype(np.float64))
-        self._learn(self.learnt._replace(typed=self.learnt.typed.followed_by(one), step="the last labelled press"))
+        typed = self.learnt.typed.followed_by(one)
+        self._learn(self.learnt._replace(typed=typed, step="calibration to the last labelled press"))
         error_mm = float(np.linalg.norm(before.place_mm[0] - one.place_mm[0]))
         forces = "" if np.isnan(force_N) else f", force {before.force_N[0]:.2f} N instead of {force_N:.2f} N"
-        return f"calibrated to a labelled press; before it, the place was wrong by {error_mm:.2f} mm{forces}"
+        return f"calibrated to a labelled press; before, the error of its place was {error_mm:.2f} mm{forces}"
 
     def load(self, file: Path) -> str:
         """Replace all calibration data by a saved calibration; return a text for the user.
@@ -284,13 +286,13 @@ class UniversalEstimator:
         if not file.is_file():  # for example, because another program deleted the file after the page had listed it
             raise SchemaError(f"{file}: the file does not exist any more. Choose another skin.")
         origin = copy(self.learnt.origin).remember(file)
-        self._learn(LearningState.start(origin, file.stem, f"the loading of {file.stem}"))
+        self._learn(LearningState.start(origin, file.stem, f"loading of skin {file.stem}"))
         return f"loaded {file} (presses: {origin.presses_n}, of which labelled: {origin.labels_n})"
 
     def undo(self) -> str:
         """Revert the last calibration step; return a text for the user."""
         if not self.undoable:
-            return "nothing to undo: the model has learnt nothing here yet"
+            return "nothing to undo: the model has not been calibrated on this page"
         step = self._states.pop().step
         self._use(self.learnt)
         return f"undone: {step}"
@@ -343,7 +345,7 @@ def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
     if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
         raise ParamsError(
             f"{where}: the model is calibrated to one skin ({models.presses_n} presses) and cannot be used for "
-            f"{len(ports)} boards. Open only the board of that skin, or omit the model."
+            f"{len(ports)} boards. Open only the board with this skin, or omit the model."
         )
 
 
@@ -610,11 +612,14 @@ class LiveSkin:
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
                 f"{self.port}: the board has {3 * chips_n} channels, but the model has {estimator.channels_n}. "
-                "Use a model that was trained on such boards."
+                "Use a model for boards with this number of channels."
             )
         self.estimator = None
         chips = f"{estimator.channels_n // 3} chips"
-        self._model_problem = f"no place or force: the {estimator.name} is for {chips}. Use a model for this board."
+        self._model_problem = (
+            f"no place or force is estimated: the {estimator.name} is for boards with {chips}. Use a model for this "
+            "board."
+        )
 
     def _start_stream(self, detected: find.DetectedBoard) -> None:
         self._stream = FrameStream(detected.wire, detected.chips_n)

@@ -82,7 +82,7 @@ def _learnt(state: LearningState) -> str:
         f"in {state.origin_name or 'the file'}": state.origin.presses_n,
         "anywhere": len(state.presses_uT),
         "at crosses": len(state.guided.db_uT),
-        "labelled by you": len(state.typed.db_uT),
+        "with a label that you entered": len(state.typed.db_uT),
     }
     return ", ".join(f"{count} press{'es' if count > 1 else ''} {what}" for what, count in counts.items() if count)
 
@@ -112,8 +112,8 @@ def _least_force_of_universal(model: Universal) -> str:
         return f"{NOT_MEASURED}; {trained}"
     found = measured.detection
     return (
-        f"lightest recorded presses {_join(found.lightest_N, '.2g')} N, of which {_join(found.detected_pct, '.0f')} % "
-        f"were detected; lighter ones {NOT_MEASURED}; {trained}"
+        f"{_join(found.detected_pct, '.0f')} % of the lightest recorded presses ({_join(found.lightest_N, '.2g')} N) "
+        f"were detected; lighter presses {NOT_MEASURED}; {trained}"
     )
 
 

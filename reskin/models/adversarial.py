@@ -25,7 +25,7 @@ from reskin.models.optimiser import AdamW, one_cycle
 from reskin.models.recipe import Schedule
 from reskin.models.train import clip_gradients
 
-DISCRIMINATOR_WIDTH = 64  # assumed
+DISCRIMINATOR_WIDTH = 64  # number of units in a hidden layer of the discriminator; this number is assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
 RAMP_RATE = 10.0  # the factor 10 in the formula of `ramp` (Ganin et al.)
 # Widths of the discriminator's layers. The third layer has `FEATURES_N` outputs, because the class `Stack` requires it.

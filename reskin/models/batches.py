@@ -68,7 +68,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     """Prepare a job for training: fit a scaler, scale the rows, and draw the initial weights.
 
     The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network. In this case,
-    the scaler and the initial weights are those of the trained network.
+    the scaler and the initial weights are taken from the trained network.
 
     Returns the prepared job and the scaler.
     """

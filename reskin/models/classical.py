@@ -213,7 +213,11 @@ def _thin(
     left_n = most_n - int(heavy.sum())
     if left_n < 1:
         raise TrainingError(
-            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} labelled rows of the skin", most_n, "Increase it."
+            "rbf_ridge",
+            "rows_max_n",
+            f"more than the {heavy.sum()} labelled rows of the skin",
+            most_n,
+            "Increase rows_max_n.",
         )
     kept = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
     return kept, np.where(heavy, weight * left_n / len(light), weight)[kept]
@@ -225,7 +229,9 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
     least_n = settings.neighbours_n if isinstance(settings, Neighbours) else 1
     if fewest_n < least_n:
         rule = f"{least_n} or more for each target"
-        raise TrainingError(settings.method, "training rows", rule, fewest_n, "Record more indentations.")
+        raise TrainingError(
+            settings.method, "training rows", rule, fewest_n, "Record more indentations of which this target is known."
+        )
     if not np.isfinite(inputs).all():
         broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")

@@ -72,8 +72,8 @@ class TrainingData:
 class TrainingResult:
     """The result of a training run.
 
-    Networks with equal settings are trained together as a stack (see `reskin.models.network`). Therefore, the times are
-    those of the stack.
+    Networks with equal settings are trained together as a stack (see `reskin.models.network`). Therefore, the times
+    are the times of the whole stack.
 
     key: the name of the result in the cache.
     weights, scaler: the trained network. If training diverged, the weights are those before the divergence.

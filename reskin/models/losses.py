@@ -2,8 +2,8 @@
 
 The triplet loss is computed from triplets, which this module draws at random. A triplet consists of three points of the
 same group, where a group is a skin or a line of pokes: an anchor, a positive and a negative. The positive is strictly
-nearer to the anchor than the negative. The loss makes the network's features of the anchor more similar to those of the
-positive than to those of the negative.
+nearer to the anchor than the negative. The loss makes the network's features of the anchor more similar to the
+features of the positive than to the features of the negative.
 """
 
 from dataclasses import dataclass
@@ -99,12 +99,15 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
     flat = np.flatnonzero((lowest == highest).all(axis=1))
     if len(flat):
         where, found = f"triplets of group {names[flat[0]]}", f"all {count[flat[0]]} points are at one place"
-        raise TrainingError(f"{where}: {found}. Poke at several places, or leave the group out.")
+        remedy = "Add presses at other places to this group, or remove the group from the training rows."
+        raise TrainingError(f"{where}: {found}. {remedy}")
     is_anchor = np.zeros(len(place), bool)
     for first, n in zip(start, count, strict=True):
         is_anchor[order[first : first + n]] = _find_anchors(place[order[first : first + n]])
     if not is_anchor.any():
-        raise TrainingError(f"triplets: all {len(place)} points are equally far from each other. Poke at more places.")
+        raise TrainingError(
+            f"triplets: all {len(place)} points are equally far from each other. Add presses at other places."
+        )
     return TripletPoints(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
 
 
@@ -130,7 +133,10 @@ def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: n
         if not len(left):
             return positive, negative
     place = points.place[anchor[left[0]]].tolist()
-    raise TrainingError(f"triplets: {MAX_DRAWS_N} draws from the anchor at {place} were ties. Poke at more places.")
+    raise TrainingError(
+        f"triplets: for the anchor at {place}, {MAX_DRAWS_N} draws gave no two points at different distances. Add "
+        "presses at other places."
+    )
 
 
 def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.Generator) -> Int64[np.ndarray, " b"]:
@@ -156,8 +162,8 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    The result is the same as that of `np.unique(place, axis=0, ...)`. That function takes three times as long, because
-    it compares rows as records.
+    `np.unique(place, axis=0, ...)` gives the same result, but takes three times as long, because it compares rows as
+    records.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

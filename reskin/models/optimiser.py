@@ -42,7 +42,7 @@ class AdamW:
 
     This class calls the function `torch.optim.adamw.adamw` instead of using the class `torch.optim.AdamW`. The first
     use of that class in a process would import PyTorch's compiler, which takes a second of CPU time. The results are
-    bit-identical to those of `torch.optim.AdamW`.
+    bit-identical to the results of `torch.optim.AdamW`.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from reskin.config import Strict
 
-# Name of the recipe whose results are compared with those of the paper. The other recipes are variants of it.
+# Name of the recipe whose results are compared with the results of the paper. The other recipes are variants of it.
 HEADLINE = "paper"
 
 # The name of a recipe. Only some characters are allowed, because the names of files contain it.
@@ -24,8 +24,8 @@ class Schedule(Strict):
     steps_n: the number of training steps.
     batch_n: the number of rows in a batch.
     rate_max: the largest learning rate of the schedule.
-    gradient_norm_max: the largest norm of a gradient. The gradient is that of a network's loss, in scaled units, with
-        respect to all its weights together. A gradient with a larger norm is scaled down to this norm.
+    gradient_norm_max: the largest norm of the gradient of a network's loss, in scaled units, with respect to all
+        weights of the network. A gradient with a larger norm is scaled down to this norm.
     weight_decay: the weight decay of AdamW.
     """
 
@@ -76,7 +76,8 @@ class AugmentedRecipe(Recipe):
 class AdaptationRecipe(Schedule):
     """The settings of the adaptation of a trained network to a new skin (section 5 of the paper).
 
-    The loss is that of the recipe, plus a triplet loss on unlabelled pokes of the new skin along lines.
+    The loss is the loss of the recipe with which the network was trained, plus a triplet loss on unlabelled pokes of
+    the new skin along lines.
 
     unlabelled_weight: the weight of the triplet loss on the unlabelled pokes. It is 0 in the control experiment, which
         trains for equally many steps without the pokes.
@@ -88,7 +89,8 @@ class AdaptationRecipe(Schedule):
 class FineTuningRecipe(Schedule):
     """The settings of the fine-tuning of a trained network to a new skin.
 
-    The loss is that of the recipe, plus the squared error on a few labelled pokes of the new skin.
+    The loss is the loss of the recipe with which the network was trained, plus the squared error on a few labelled
+    pokes of the new skin.
 
     own_weight: the weight of the squared error on the labelled pokes of the new skin.
     """

@@ -52,7 +52,8 @@ def run_jobs(
     data
         The rows to which the row numbers of the jobs refer.
     executor
-        Runs the training of each stack (jobs that are trained together) in a worker process.
+        Executor with worker processes. Jobs that are trained together are called a stack; each stack is trained in one
+        worker process.
     cache
         Folder with the results of completed training runs.
     log
@@ -63,7 +64,7 @@ def run_jobs(
         collapsed = [i for i, result in enumerate(results) if result.collapsed]
         if not collapsed:
             break
-        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other random numbers")
+        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed and are repeated with other random numbers")
         retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
         for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
             seconds = results[i].seconds + result.seconds
@@ -82,7 +83,7 @@ def _run_once(
     missing = [(stack, files) for stack, files in planned if not all([_is_intact(file, log) for file in files])]
     fresh = {key for stack, _ in missing for key in stack}
     if len(fresh) < len(unique):
-        log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
+        log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before and are not repeated")
     if missing:
         # The name of the file contains the number of this process, because several processes may run jobs on the same
         # data at the same time.
@@ -177,7 +178,7 @@ def _is_intact(file: Path, log: Callable[[str], None]) -> bool:
     try:
         io.read_tensors(file)
     except SchemaError as error:
-        log(f"warning: a cached result is damaged and is trained again ({str(error).partition('. ')[0]})")
+        log(f"warning: a cached result is damaged, so its training run is repeated ({str(error).partition('. ')[0]})")
         io.remove(file)
         return False
     return True

@@ -37,7 +37,7 @@ BLOCK_STEPS_N = 50
 # Training is stopped if the mean squared error exceeds this value, because networks hardly ever recover from such an
 # error. The error is in scaled units, in which a network that always predicts the mean has an error of 1.
 DIVERGED = 1e8
-# Whether a network has collapsed (predicts nearly the same value for all inputs) is checked only after this number of
+# A network has collapsed if it predicts nearly the same value for all inputs. This is checked only after this number of
 # steps or more, because after fewer steps, the network may not have learned anything yet.
 CHECKED_STEPS_N = 200
 CHECKED_ROWS_N = 2000  # approximate number of training rows, evenly spaced, on which collapse is checked
@@ -68,7 +68,9 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
     torch.set_num_threads(1)
     started_s, start_s, on, first = time.time(), time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
-        raise TrainingError("RESKIN_DEVICE=cuda, but torch finds no CUDA device. Unset it to train on the CPU.")
+        raise TrainingError(
+            "RESKIN_DEVICE is cuda, but torch finds no CUDA device. To train on the CPU, unset RESKIN_DEVICE."
+        )
     prepared, scalers = zip(*(prepare(job, data) for job in jobs), strict=True)
     architecture = first.recipe.architecture
     outcomes = train(prepared, architecture, first.schedule, first.loss_weights, on)
@@ -133,8 +135,7 @@ def train(
 def clip_gradients(net: Stack, norm_max: float) -> None:
     """Clip the gradient of each network to a norm of at most `norm_max`.
 
-    The norm is that of the gradient with respect to all weights of the network. A gradient with a larger norm is scaled
-    down.
+    The norm is computed over all weights of the network. A gradient with a larger norm is scaled down.
     """
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(

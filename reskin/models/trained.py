@@ -104,12 +104,12 @@ def read_network(model: Path) -> Network:
         raise ParamsError(f"{model}: model file not found. {_find_models(model)}")
     if model.suffix != SUFFIX:
         weights = model.with_suffix(SUFFIX)
-        remedy = f"Use {weights}." if weights.is_file() else "If it should be one, copy it again."
+        remedy = f"Use {weights}." if weights.is_file() else f"Pass a {SUFFIX} file, or copy a damaged file again."
         raise ParamsError(f"{model}: not a trained model ({SUFFIX}) or a saved calibration. {remedy}")
     if not card_file.is_file():
         raise ParamsError(
-            f"{card_file}: card of the model not found. Copy it with its .safetensors file. If {model.name} is a "
-            "calibration of the universal model, load it with reskin.load_universal."
+            f"{card_file}: card of the model not found. Copy the card to the folder of {model.name}. If {model.name} "
+            "is a calibration of the universal model, load it with reskin.load_universal."
         )
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
@@ -130,8 +130,9 @@ def read_network(model: Path) -> Network:
     weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
     if inputs_n != weights_n:
         raise SchemaError(
-            f"{card_file}: the card's {card.input.channels_n} channels with inputs {card.recipe.inputs} are {inputs_n} "
-            f"inputs, but the weights are for {weights_n}. Is this the card of this model?"
+            f"{card_file}: according to the card, {card.input.channels_n} channels with inputs {card.recipe.inputs} "
+            f"are {inputs_n} inputs, but the weights are for {weights_n}. Use the card that was written with this "
+            "model."
         )
     require("torch", model)
     return Network(content, tensors)
@@ -159,8 +160,8 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
         if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
             networks.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
     if not networks:
-        what = f"no networks of recipe {recipe} with board {board} held out"
-        raise SchemaError(f"{models}: {what}. Train them: add lobo to the scene's experiments.")
+        what = f"there are no networks of recipe {recipe} that were trained without board {board}"
+        raise SchemaError(f"{models}: {what}. To train them, add lobo to the experiments of the scene.")
     return networks
 
 

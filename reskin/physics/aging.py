@@ -35,10 +35,12 @@ class Prony:
             If a time constant is not positive and finite, a share is negative, or the sum of the shares is above 1.
         """
         if not (np.isfinite(self.tau_s) & (self.tau_s > 0)).all():
-            raise ParamsError("prony", "every tau", "above 0 s and finite", f"{self.tau_s}", "Check its unit.")
+            raise ParamsError(
+                "prony", "every time constant tau", "above 0 s and finite", f"{self.tau_s}", "State tau_s in s."
+            )
         if not ((self.share >= 0).all() and self.share.sum() <= 1):
-            rule = "0 or more, with a sum of at most 1"
-            raise ParamsError("prony", "share", rule, f"{self.share}", "Lower the shares.")
+            rule = "0 or more, and the sum of all shares must be at most 1"
+            raise ParamsError("prony", "every share", rule, f"{self.share}", "Change the values of `share`.")
 
 
 SKIN_RELAXATION = Prony(  # assumed values
@@ -140,7 +142,7 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
-        raise ParamsError("relaxation", "time step", rule, f"{dt_s}", "Sort the times.")
+        raise ParamsError("relaxation", "time step", rule, f"{dt_s}", "Sort the times in ascending order.")
     x = dt_s / prony.tau_s
     return np.exp(-x) * state + prony.share * change * _mean_decay(x)
 
@@ -226,7 +228,7 @@ def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: flo
     remaining = 1 - settling * settled - ageing * np.log10(1 + contacts_n / AGEING_CONTACTS)
     if not (remaining > 0).all():
         got = f"{remaining.min():.3g} after {contacts_n.max()} contacts"
-        raise ParamsError("wear", "remaining force", "above 0", got, "Lower settling or ageing.")
+        raise ParamsError("wear", "remaining force", "above 0", got, "Reduce the settings settling and ageing.")
     return remaining
 
 
@@ -248,11 +250,14 @@ def baseline_walk(
     _check_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)
     if (new_n < 0).any():
-        raise ParamsError(f"wear: the contact count decreases by {-new_n.min()}. Sort the contacts.")
+        raise ParamsError(
+            f"wear: the contact count decreases by {-new_n.min()} between readings. "
+            "Sort the readings by their contact count."
+        )
     steps_T = step_T * np.sqrt(new_n)[:, None] * rng.standard_normal((len(contacts_n), channels_n))
     return np.cumsum(steps_T, axis=0)
 
 
 def _check_counts(contacts_n: Int[np.ndarray, " n"]) -> None:
     if contacts_n.size and contacts_n.min() < 0:
-        raise ParamsError("wear", "contact count", "0 or more", f"{contacts_n.min()}", "Count from 0.")
+        raise ParamsError("wear", "contact count", "0 or more", f"{contacts_n.min()}", "Start to count at 0.")

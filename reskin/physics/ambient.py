@@ -1,8 +1,8 @@
 """Ambient fields: the earth's field, and the field that an iron ball adds. All values are in SI units.
 
 In a uniform field, an iron ball adds the field of a single dipole at the centre of the ball. In the field of nearby
-dipoles, such as those of a skin, the ball adds the field of an image dipole and of image poles for each of the dipoles.
-In reality, the field of the ball also changes the magnetisation of the skin. This effect is neglected.
+dipoles, such as the dipoles of a skin, the ball adds the field of an image dipole and of image poles for each of the
+dipoles. In reality, the field of the ball also changes the magnetisation of the skin. This effect is neglected.
 """
 
 import numpy as np

@@ -157,9 +157,9 @@ def displace(material: Material, change: Waves, depth_m: float, press: IndentedL
     hoop = material.hoop * (1 + second.hoop * (1 + first.hoop / 2))
     moved = Material(material.r_m + second.r_m, material.z_m + second.z_m, material.f + _gradient(second) @ half, hoop)
     if not moved.z_m.max() < RIM_MAX * press.thickness_m:
-        rule = f"such that the rim stays below {RIM_MAX} times the skin's thickness"
+        rule = f"so small that the rim around the tip is lower than {RIM_MAX} times the skin's thickness"
         got = f"{depth_m / press.thickness_m:.3g} of the thickness"
-        raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
+        raise ParamsError("poke", "depth", rule, got, "Reduce the depth of the indentation.")
     return moved
 
 
@@ -256,7 +256,7 @@ def tabulate(
     """Tabulate the displacement and the rotation of the material for all depths up to `deepest_m`.
 
     The result is interpolated between tables for values of ln(R/h) that are multiples of `SIZE_STEP`. The depths in the
-    table are those of the ladder, so the last depth is slightly greater than `deepest_m`. The values at one depth do
+    table are the depths of `LADDER`, so the last depth is slightly greater than `deepest_m`. The values at one depth do
     not depend on `deepest_m`.
 
     Parameters
@@ -276,7 +276,9 @@ def tabulate(
     depth_m = thickness_m * depth_scale(size) * LADDER
     if not 0 < deepest_m <= depth_m[-1]:
         rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the greatest depth that can be computed"
-        raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
+        raise ParamsError(
+            "poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Reduce the depth of the indentations."
+        )
     rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
     return _tabulate(thickness_m, tip_radius_m, rungs_n, heights, base)
 
@@ -310,7 +312,7 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
         rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the greatest tabulated depth"
-        raise ParamsError("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate deeper.")
+        raise ParamsError("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate up to a larger deepest_m.")
     if depth_m <= 0:
         return table.moved[0]
     if depth_m < table.depth_m[1]:
@@ -370,8 +372,9 @@ def _follow_ladder(
         depth = depth_scale(size) * float(LADDER[rung_i])
         material = displace(material, _pressure_change(table_i, rung_i, base), depth, IndentedLayer(1.0, size, base))
         if not np.abs(np.linalg.det(material.f) * material.hoop - 1).max() <= DET_F_ERROR_MAX:
-            rule = f"such that the volume of the material is conserved within {DET_F_ERROR_MAX:.0%}"
-            raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
+            rule = f"so small that the computed volume of the material changes by at most {DET_F_ERROR_MAX:.0%}"
+            got = f"{depth:.3g} of the thickness"
+            raise ParamsError("poke", "depth", rule, got, "Reduce the depth of the indentation.")
         parts[rung_i] = material.r_m - rest.r_m, material.z_m - rest.z_m, np.tan(rotation_angle(material.f) / 2)
     return np.moveaxis(parts, 1, 2).reshape(rungs_n, len(heights), len(COARSE_R), 3)
 

@@ -198,7 +198,9 @@ def force(
     """
     check_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
-        raise ParamsError("layer", "modulus", "0 Pa or more", f"{modulus_Pa}", "Check the skin's modulus.")
+        raise ParamsError(
+            "layer", "modulus", "0 Pa or more and finite", f"{modulus_Pa}", "Correct modulus_kPa of the skin."
+        )
     root_m = np.sqrt(np.maximum(depth_m, 0.0))
     return modulus_Pa * root_m**3 * _force_curve(thickness_m, tip_radius_m, base)(root_m)
 
@@ -213,11 +215,13 @@ def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius
     """
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
-            raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
+            raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "State this length in m.")
     limit_m = min(thickness_m, tip_radius_m)
     if not (np.isfinite(depth_m) & (depth_m < limit_m)).all():
-        rule = f"finite and below {1e3 * limit_m:.3g} mm, the lesser of thickness and tip radius"
-        raise ParamsError("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep.")
+        rule = f"finite and below {1e3 * limit_m:.3g} mm, the smaller of the skin's thickness and the tip's radius"
+        raise ParamsError(
+            "poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Reduce the depth of the indentation."
+        )
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:

@@ -93,8 +93,10 @@ def array_field(
     corner.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
-        got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
-        raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
+        rule = f"from 0 to {thickness_m:.3g} m, inside the skin"
+        got = f"{nodes_m[:, 2].min():.3g} to {nodes_m[:, 2].max():.3g} m"
+        remedy = "Pass the places of the nodes before the skin is deformed."
+        raise ParamsError("magnet array", "height of the nodes", rule, got, remedy)
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
     # The sign of a corner is the product of three signs, for x, y and z. Each is positive if the corner is at the upper
     # end of the cube along this axis, and negative at the lower end. The differences sum these signs over the cubes.
@@ -175,7 +177,13 @@ def place_nodes(
     """
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
-        raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Correct the design.")
+        raise ParamsError(
+            "quadrature",
+            "thickness, cell and layers",
+            "above 0",
+            got,
+            "Correct the skin's thickness or the quadrature.",
+        )
     (along_x_m, widths_x_m), (along_y_m, widths_y_m) = (_cells(side_m, rule) for side_m in sides_m)
     gauss, weights = np.polynomial.legendre.leggauss(rule.layers_n)
     x_m, y_m, z_m = np.meshgrid(along_x_m, along_y_m, (1 + gauss) / 2 * thickness_m, indexing="ij")
@@ -217,7 +225,9 @@ def field_of_each(
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
     if r2.size and not r2.min() > 0:
-        raise ParamsError("dipole field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
+        raise ParamsError(
+            "dipole field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip out of the skin."
+        )
     along = 3 * (moment * separation).sum(axis=0) / r2
     each = (along * separation - moment) * (MU0_4PI / (r2 * np.sqrt(r2)))
     return np.moveaxis(each, 0, 2)
@@ -233,7 +243,9 @@ def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
     if not np.isfinite(change_T).all():
-        raise ParamsError("change of field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip.")
+        raise ParamsError(
+            "change of field", "distance to a chip", "above 0 m", "0 or NaN", "Move the chip out of the skin."
+        )
     return change_T
 
 

@@ -84,14 +84,18 @@ def _check_drag(
     friction: float,
 ) -> None:
     if not np.isfinite(path_m).all():
-        raise ParamsError("drag", "every place", "finite", "NaN or infinity", "Correct the path.")
+        raise ParamsError("drag", "every place of the tip", "finite", "NaN or infinity", "Correct the path of the tip.")
     along = np.diagonal(stiffness, axis1=1, axis2=2)
     for what, unit, values in (("normal force", "N", normal_N), ("stiffness", "N/m", along)):
         if not (np.isfinite(values) & (values >= 0)).all():
             worst = values[~(np.isfinite(values) & (values >= 0))][0]
-            raise ParamsError("drag", what, f"0 {unit} or more and finite", f"{worst}", "Check its sign.")
+            raise ParamsError(
+                "drag", what, f"0 {unit} or more and finite", f"{worst}", "Correct this value or its sign."
+            )
     if not 0 <= friction < np.inf:
-        raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")
+        raise ParamsError(
+            "drag", "friction", "0 or more and finite", f"{friction}", "Correct the friction coefficient."
+        )
 
 
 # Distance in thicknesses by which tables extend beyond the contact. Material that is farther away does not move.
@@ -174,9 +178,10 @@ def slip_traction(contact: layer.Contact) -> Traction:
     """Return the traction q of a sliding tip.
 
     According to Coulomb's law q = mu p, the traction is proportional to the pressure p. The simulation uses this
-    traction at all stops of a drag, including those at which the tip still sticks, because the tip begins to slide
-    after one or two millimetres. The tangential stiffness for this traction is lower than for `stick_traction`: by 19
-    to 20 % on the nominal skin at depths of 0.2 to 1.2 mm, and by 1/6 on a very thick layer.
+    traction at all stops of a drag, although the tip still sticks at the first stops. The
+    reason is that the tip begins to slide after one or two millimetres. The tangential stiffness for this traction is
+    lower than for `stick_traction`: by 19 to 20 % on the nominal skin at depths of 0.2 to 1.2 mm, and by 1/6 on a very
+    thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
@@ -221,7 +226,7 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
-        raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Press deeper.")
+        raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Increase the depth of the drag.")
     contact = layer.contact_of_depth(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     reach_m = thickness_m * deformation.reach(tip_radius_m / thickness_m, base)
     return tabulate(slip_traction(contact), thickness_m, reach_m)
@@ -254,8 +259,9 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
     By default, the table extends to `REACH` thicknesses beyond the contact.
     """
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
-        rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
-        raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
+        rule = f"above 0 m and at most {WIDEST} times the skin's thickness"
+        got = f"{traction.radius_m} m on a skin with a thickness of {thickness_m} m"
+        raise ParamsError("drag", "contact radius", rule, got, "Reduce the depth of the drag.")
     if reach_m is None:
         reach_m = traction.radius_m + REACH * thickness_m
     r_m = np.linspace(0, reach_m, TABLE_R_N)
@@ -342,8 +348,8 @@ def shear_displacement(
     """
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * shear_map.z_m[-1]):
-        rule, got = f"0 to {RIM_MAX} times the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
-        raise ParamsError("drag", "height of nodes", rule, got, "Press less deep.")
+        rule, got = f"0 to {RIM_MAX} times the skin's thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
+        raise ParamsError("drag", "height of nodes", rule, got, "Reduce the depth of the drag.")
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     return ShearDisplacement(
         *_at_places(shear_map.parts, (shear_map.r_m[1], shear_map.z_m[1]), places_m, centre_m, shear_m2)
@@ -377,8 +383,8 @@ def shear_in_steps(
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = shear_map.steepest_per_m2 * float(np.hypot(*shear_m2))
     if not steepest <= STEEPEST:
-        rule, remedy = f"at most {STEEPEST} everywhere", "Drag with less friction, or less far before it slips."
-        raise ParamsError("drag", "half of the curl", rule, f"{steepest:.3g}", remedy)
+        rule, remedy = f"at most {STEEPEST} everywhere", "Reduce the friction coefficient or the depth of the drag."
+        raise ParamsError("drag", "half of the curl of the displacement", rule, f"{steepest:.3g}", remedy)
     steps_n = max(1, int(np.ceil(steepest / STEP)))
     part_N, ahead_m = force_N / steps_n, shear_m2 / shear_map.stiffness_m / steps_n
     moved_m, half_curl = np.zeros_like(places_m), np.zeros_like(places_m)
@@ -407,7 +413,9 @@ def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.nd
 
 def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[np.ndarray, "2"]:
     if not 0 < modulus_Pa < np.inf:
-        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Check the skin's modulus.")
+        raise ParamsError(
+            "drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Correct modulus_kPa of the skin."
+        )
     return force_N * (3 / modulus_Pa)  # the shear modulus G of an incompressible material is a third of Young's modulus
 
 

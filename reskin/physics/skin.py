@@ -229,7 +229,7 @@ def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None
     if outside.any():
         x_mm, y_mm = indentations_m[np.argmax(outside), :2] / milli
         rule = "on the skin, within {:.4g} and {:.4g} mm of its centre along x and y".format(*half_m / milli)
-        remedy = "Poke elsewhere, or lower skin_seat_mm."
+        remedy = "Choose a place on the skin, or reduce skin_seat_mm, the random offset of the skin."
         raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
 
 

@@ -242,7 +242,7 @@ def depth_at(
     clipped. `count_clipped` returns the number of clipped depths.
     """
     if not modulus_Pa > 0:
-        raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Check its unit.")
+        raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Correct modulus_kPa of the skin.")
     curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
     relative_m2 = np.maximum(force_N, 0.0) / modulus_Pa  # a negative force is treated as 0
     return np.interp(np.cbrt(relative_m2**2), curve_m2, curve_m)

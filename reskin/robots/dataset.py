@@ -151,7 +151,7 @@ def read_recording(file: Path, rate_hz: float | None) -> Recording:
     if "indentation" in table.column_names:
         return _of_readings(table, str(file), rate_hz)
     if "device_s" in table.column_names and rate_hz is None and not _all_finite(table["device_s"]):
-        raise ParamsError(f"{file}: the frames have no times. State their rate, such as --rate-hz 400.")
+        raise ParamsError(f"{file}: the frames have no times. State their rate, for example with --rate-hz 400.")
     return _of_log(str(file), {}, sd_card.keep_whole(*read_frames(table, rate_hz or np.nan, str(file)), str(file)))
 
 
@@ -168,8 +168,8 @@ def _of_capture(folder: Path) -> Recording:
     header = read_header(folder)
     if header.layout not in ("native", "sd-card"):
         raise CaptureError(
-            f"{folder}: this is a capture of layout {header.layout}. Export its table of ingested readings, "
-            f"data/indentations/SCENE/{header.capture}.parquet."
+            f"{folder}: a capture of layout {header.layout} cannot be exported. Run `reskin add` and `dvc repro`, and "
+            f"export its table of ingested readings, data/indentations/SCENE/{header.capture}.parquet."
         )
     log = read_any_log(folder, 1.0)
     return _of_log(str(folder), _about(header), log, _labels(folder, header, log[0]))
@@ -180,7 +180,9 @@ def _about(header: Any) -> dict[str, str]:
 
 
 def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[str, Float32[np.ndarray, "f _"]]:
-    """Return the labels of each reading of a capture: those of the dwell in which it was taken, or NaN between dwells.
+    """Return the labels of each reading of a capture.
+
+    These are the labels of the dwell in which the reading was taken. Readings between dwells have NaN.
 
     The result maps each feature to its values; it is empty if the capture has no probe log.
     """
@@ -189,8 +191,8 @@ def _labels(folder: Path, header: Header, t_s: Float[np.ndarray, " f"]) -> dict[
         return {}
     if not header.clock.marks:
         raise CaptureError(
-            f"{folder}: the labels in {PROBE_FILE} are on another clock. Add the capture with `reskin add`, run "
-            "`dvc repro`, and export the table of ingested readings."
+            f"{folder}: the labels in {PROBE_FILE} are on another clock than the readings. Add the capture to a scene "
+            "with `reskin add`, run `dvc repro`, and export the table of ingested readings."
         )
     log = probe.parse(file, str(file))
     probe_s = clocks.from_marks(np.array(header.clock.marks), str(folder)).probe_s(t_s)
@@ -209,7 +211,7 @@ def _of_readings(table: pa.Table, where: str, rate_hz: float | None) -> Recordin
         values[feature] = np.stack([getattr(readings, name) for name in names], axis=1)
     timed = np.isfinite(readings.t_s).all()
     if not timed and rate_hz is None:
-        raise ParamsError(f"{where}: the readings have no times. State their rate, such as --rate-hz 100.")
+        raise ParamsError(f"{where}: the readings have no times. State their rate, for example with --rate-hz 100.")
     return Recording(where, _about(readings), values, readings.t_s if timed else None, readings.indentation)
 
 
@@ -232,11 +234,11 @@ def find_features(recordings: Sequence[Recording]) -> dict[str, list[str]]:
         problem = ""
         if (own := _known(other)) != features:
             names, own_names = ({name for part in each.values() for name in part} for each in (features, own))
-            problem = f"it and {first.where} differ in the values {', '.join(sorted(names ^ own_names))}"
+            problem = f"only this recording or only {first.where} contains {', '.join(sorted(names ^ own_names))}"
         elif _source(other) != _source(first):
-            problem = f"it is {_source(other)}, but {first.where} is {_source(first)}"
+            problem = f"this recording is {_source(other)}, but {first.where} is {_source(first)}"
         if problem:
-            raise SchemaError(f"{other.where}: {problem}. Export them to different folders.")
+            raise SchemaError(f"{other.where}: {problem}. Export these recordings to different folders.")
     return features
 
 
@@ -266,10 +268,12 @@ def find_rate(recordings: Sequence[Recording], rate_hz: float | None) -> int:
     found = [rate_hz if recording.t_s is None else _rate_hz(recording) for recording in recordings]
     rates = sorted(rate for rate in found if rate is not None)
     if not rates:
-        raise ParamsError("--fps: no episode has two readings at different times. State the rate: --fps.")
+        raise ParamsError("--fps: no episode has two readings at different times. State the frame rate with --fps.")
     if rates[-1] > (1 + RATE_TOLERANCE) * rates[0]:
         got = f"{rates[0]:.4g} to {rates[-1]:.4g} Hz"
-        raise ParamsError(f"--fps: the recordings have different rates, {got}. Choose one: --fps.")
+        raise ParamsError(
+            f"--fps: the recordings have different rates, {got}. State the frame rate of the dataset with --fps."
+        )
     return round(float(np.median(rates)))
 
 
@@ -296,7 +300,7 @@ def split(
     if recording.t_s is not None:
         step_s = np.diff(recording.t_s)
         if (~ends & (step_s < 0)).any():
-            raise CaptureError(f"{recording.where}: the times go backwards. Was the board reset? Split the file there.")
+            raise CaptureError(f"{recording.where}: the times go backwards. Split the file at this time.")
         ends = ends | (step_s > GAP_S)
     for rows in np.split(np.arange(len(recording.part)), np.flatnonzero(ends) + 1):
         kept, late_s = rows, 0.0

@@ -115,10 +115,10 @@ def simulate_capture(
         marks=tuple((float(t_s), float(offset_s + rate * t_s)) for t_s in frame_s[[0, -1]]),
         protocol=plan.description,
         overruns={
-            "field held at 50 mT": frames.clipped_n,
-            "field past int16": frames.wrapped_n,
-            "force past the sensor": past_range_n,
-            "stops past 0.6 of the thickness": response.beyond_verified_n,
+            "field values clipped at 50 mT": frames.clipped_n,
+            "field values that overflow int16": frames.wrapped_n,
+            "force values beyond the range of the sensor": past_range_n,
+            "stops deeper than 0.6 of the skin's thickness": response.beyond_verified_n,
         },
         card_rate_hz=rig.rate_hz if isinstance(presses, Walk) else None,
     )

@@ -112,7 +112,9 @@ class Grid(ProtocolSettings):
         pokes = protocol(self.depths_mm, self.passes_n)
         stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
         return _upright_plan(
-            stops, f"65-point grid, {len(self.depths_mm)} depths, {self.passes_n} passes", pokes.pass_i
+            stops,
+            f"presses at the 65 places of the grid, at {len(self.depths_mm)} depths, in {self.passes_n} passes",
+            pokes.pass_i,
         )
 
 
@@ -148,8 +150,8 @@ class Drag(ProtocolSettings):
             np.concatenate([y_mm[:, direction] for direction in directions]),
             np.repeat(depth_mm[:, None], stops_n, axis=1),
         )
-        description = f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {self.passes_n} passes, "
-        description += f"stops every {2 * CENTRE_MM / (stops_n - 1):g} mm"
+        description = f"tip dragged along lines every {PITCH_MM:g} mm, at {depths_n} depths, in {self.passes_n} passes"
+        description += f", with stops every {2 * CENTRE_MM / (stops_n - 1):g} mm"
         pass_i = np.repeat(np.arange(self.passes_n, dtype=np.int32), depths_n * lines_n)
         return _upright_plan(stops, description, pass_i)
 
@@ -180,7 +182,8 @@ class Hand(_RandomDepth):
             y_mm=place_mm[:, 1:],
             depth_mm=rng.uniform(*self.depth_mm, size=(pokes_n, 1)),
             tilt=np.tan(np.radians(self.tilt_sd_deg) * rng.standard_normal((pokes_n, 2)).clip(-2, 2)),
-            description=f"by hand, {self.lines_n} lines of {self.pokes_per_line_n} pokes, order known only",
+            description=f"presses by hand along {self.lines_n} lines, {self.pokes_per_line_n} per line; only the order "
+            "of the presses is known",
             labelled=False,
         )
 
@@ -199,12 +202,12 @@ class Scatter(_RandomDepth):
         """Draw places and depths from uniform distributions."""
         if not 2 * self.margin_mm < min(skin_mm):
             rule = f"less than half of the skin's shorter side, {min(skin_mm) / 2:g} mm"
-            raise ParamsError("protocol scatter", "margin_mm", rule, self.margin_mm, "Lower it.")
+            raise ParamsError("protocol scatter", "margin_mm", rule, self.margin_mm, "Reduce margin_mm.")
         most_mm = np.array(skin_mm) - self.margin_mm
         place_mm = rng.uniform(self.margin_mm, most_mm, size=(self.pokes_n, 2))
         depth_mm = rng.uniform(*self.depth_mm, size=(self.pokes_n, 1))
-        description = f"{self.pokes_n} pokes scattered over {skin_mm[0]:g} x {skin_mm[1]:g} mm, "
-        description += f"{self.margin_mm:g} mm from its edges"
+        description = f"{self.pokes_n} presses at random places on a skin of {skin_mm[0]:g} x {skin_mm[1]:g} mm, "
+        description += f"at least {self.margin_mm:g} mm from its edges"
         stops = Stops(place_mm[:, :1], place_mm[:, 1:], depth_mm)
         return _upright_plan(stops, description, centre_mm=(skin_mm[0] / 2, skin_mm[1] / 2))
 
@@ -237,12 +240,13 @@ class Load(_OnlyTemperature):
         weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
         centre_mm = np.full(weight_N.shape, CENTRE_MM)
         stops = Stops(centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
-        description = f"{self.passes_n} fillings of a glass, to {self.force_max_N:g} N by {self.step_N:g} N"
+        description = f"a glass on the skin, filled {self.passes_n} times to {self.force_max_N:g} N "
+        description += f"in steps of {self.step_N:g} N"
         return _upright_plan(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
 
 
 class Press(_OnlyTemperature):
-    """Presses at places of the grid, which are read throughout (dynamic data, section 7 of the paper).
+    """Presses at places of the grid, with readings during the whole press (dynamic data, section 7 of the paper).
 
     The depth of a press over time is half a period of a sine. Each frame is one stop.
     """
@@ -257,7 +261,7 @@ class Press(_OnlyTemperature):
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
         """Draw the place, the duration and the largest depth of each press.
 
-        All presses have the same number of stops, which is that of the longest press. After a shorter press, the tip
+        All presses have as many stops as the longest press. After a shorter press, the tip
         stays above the skin for the remaining stops.
         """
         least_s, most_s = self.duration_s
@@ -269,7 +273,9 @@ class Press(_OnlyTemperature):
             depths_mm[i, : long_n[i]] = half_sine(int(long_n[i]), float(peak_mm))
         flat = np.ones(depths_mm.shape)
         stops = Stops(place_mm[:, :1] * flat, place_mm[:, 1:] * flat, depths_mm)
-        return _upright_plan(stops, f"{self.presses_n} presses of {least_s:g} to {most_s:g} s, read throughout")
+        return _upright_plan(
+            stops, f"{self.presses_n} presses that last {least_s:g} to {most_s:g} s, with readings at all times"
+        )
 
 
 class Walk(_OnlyTemperature):
@@ -300,7 +306,7 @@ class Walk(_OnlyTemperature):
             for part in (half_sine(int(stance), float(peak_mm)), np.full(int(swing), LIFTED_MM))
         ]
         stops = Stops(place_mm[None, :, 0], place_mm[None, :, 1], np.concatenate(parts)[None])
-        return _upright_plan(stops, f"a walk of {self.steps_n} steps")
+        return _upright_plan(stops, f"{self.steps_n} steps of a walk in one continuous recording")
 
 
 Protocol = Annotated[Grid | Drag | Hand | Scatter | Load | Press | Walk, Field(discriminator="kind")]
@@ -352,7 +358,7 @@ def _depth_under_load(skin: Skin, load_N: float) -> float:
 
     if missing_N(deepest_m) < 0:
         rule = f"at most {missing_N(deepest_m) + load_N:.3g} N, the force at the greatest depth"
-        raise ParamsError(f"skin {skin.name}", "weight", rule, f"{load_N:.3g} N", "Lower force_max_N.")
+        raise ParamsError(f"skin {skin.name}", "weight", rule, f"{load_N:.3g} N", "Reduce force_max_N.")
     return float(brentq(missing_N, -skin.depth_zero_m, deepest_m, xtol=DEPTH_STEP_M))
 
 

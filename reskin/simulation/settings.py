@@ -56,7 +56,8 @@ class SimulationSettings(Strict):
         used = {term for protocol in self.protocols.values() for term in protocol.terms}
         if used != self.terms.named():
             raise ValueError(
-                f"terms must be those that the protocols list, {sorted(used)}, not {sorted(self.terms.named())}"
+                f"terms must be those that the protocols list ({sorted(used)}), but section terms contains "
+                f"{sorted(self.terms.named())}"
             )
         for name, protocol in self.protocols.items():
             if protocol.boards not in self.boards:
@@ -66,14 +67,16 @@ class SimulationSettings(Strict):
             if isinstance(protocol, Hand) and protocol.tilt_sd_deg > 0 and "friction" not in protocol.terms:
                 raise ValueError(f"protocol {name}: a tilted stylus (tilt_sd_deg) needs the term friction")
             if isinstance(protocol, Drag) and "friction" not in protocol.terms:
-                raise ValueError(f"protocol {name}: a drag needs the term friction, without which there is no shear")
+                raise ValueError(
+                    f"protocol {name}: a drag needs the term friction, because only friction shears the skin"
+                )
             kind, skins_n = self.boards[protocol.boards], protocol.skins_n
             if skins_n > (have_n := kind.boards_n * kind.skins_per_board_n):
                 raise ValueError(
                     f"protocol {name}: skins_n {skins_n} is more than the {have_n} skins of {protocol.boards} boards"
                 )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
-            raise ValueError("kinds of boards must have different letters")
+            raise ValueError("two kinds of boards have the same letter; each kind must have a letter of its own")
         return self
 
     @model_validator(mode="after")

@@ -30,8 +30,8 @@ NOISE_uT = (3.3, 3.3, 5.0)  # standard deviations of a reading's noise along x, 
 # The error of the law that is expected from recorded boards is multiplied by a random factor between 0 and this value.
 RESIDUAL_SCALE_MAX = 2.0
 # Ranges of the relative rms error of the law, from which the error of each skin is drawn. The first range is for
-# simulated skins if recorded boards of the same rig are known, the second for simulated skins if no board is known, and
-# the third for recorded boards.
+# simulated skins if recorded boards of the same rig are known. The second range is for simulated skins if no board is
+# known, and the third range is for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
 # The random error of the law is a sum of cosine waves: range of its length scale in place, its length scale in log
 # force, and number of waves.
@@ -92,7 +92,7 @@ class SkinPrior:
 class Batch:
     """The skins of one training step, with the presses on each skin.
 
-    The first `PLACES_N` presses of a skin are for conditioning: the network is conditioned on those of them for which
+    The first `PLACES_N` presses of a skin are for conditioning: the network is conditioned on each of them for which
     `kept` is 1. For the remaining presses of the skin, the network is trained to predict `target`, which contains
     scaled values of x, y and log F.
     """
@@ -150,10 +150,10 @@ def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.nd
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw on which presses of each of n skins the network is conditioned.
+    """Draw the presses on which the network is conditioned, for each of n skins.
 
     The result is 1 for these presses, and 0 for others. A fraction `NO_PRESSES_SHARE` of the skins has no such press.
-    The other skins have 1 to 65.
+    The other skins have 1 to 65 such presses.
     """
     kept_n = np.where(rng.random(n) < NO_PRESSES_SHARE, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)

@@ -22,7 +22,8 @@ from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # values in one reading of the paper's board, which has five chips with three axes each
-# Largest accepted field. It is 20 times the range of a chip. Its square can be represented in single precision.
+# Largest accepted field, which is 20 times the range of a chip. The square of this value can be represented in single
+# precision.
 FIELD_MAX_uT = 1e6
 RANGE_FACTOR = 2.0  # a force that is outside the model's range by this factor or more is probably in a wrong unit
 # Largest number of labels. There is a limit because the memory grows with the square of the number of labels, and the
@@ -81,7 +82,7 @@ def check_labels(
     check_number(rows_n)
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
-    _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
+    _need("labels", "places", f"on the skin, from {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
     _need("labels", "forces", "above 0 N", forces_N, forces_N > 0)
     _need("labels", "forces", "finite", forces_N, np.isfinite(forces_N))
     return places_mm, forces_N
@@ -90,8 +91,8 @@ def check_labels(
 def check_number(labels_n: int) -> None:
     """Raise SchemaError if there are more than LABELS_MAX_N labels."""
     if labels_n > LABELS_MAX_N:
-        rule = f"at most {LABELS_MAX_N} can be used, those of earlier days included"
-        raise SchemaError(f"labels: {labels_n} are too many, {rule}. Select some of them.")
+        rule = f"At most {LABELS_MAX_N} labels can be used, including the labels of earlier days"
+        raise SchemaError(f"labels: {labels_n} labels are too many. {rule}. Select some of them.")
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
@@ -100,15 +101,17 @@ def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q
     inside = (force_N > least_N / RANGE_FACTOR) & (force_N < RANGE_FACTOR * most_N)
     if not inside.all():
         got = f"{force_N[~inside][0]:.6g} N"
-        rule = f"about {least_N:.3g} to {most_N:.3g} N, the model's range"
-        raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or omit the press.")
+        rule = f"about {least_N:.3g} to {most_N:.3g} N, which is the force range of the model"
+        remedy = "Convert forces in other units to N. Omit presses with forces outside the range."
+        raise SchemaError("labels", "forces", rule, got, remedy)
 
 
 # Users may pass field changes where readings are needed, or readings where field changes are needed. Such mistakes are
 # detected by comparing two distances: readings of presses are near the no-load reading, but field changes are near 0.
-# Values are refused if they are so close to the wrong one of these two points that the distance to it, divided by the
-# distance to the right one, is below this limit. On the boards of scene lab, the median of this ratio is 0.15 to 0.22
-# for values of the wrong kind, and 4 or more for values of the right kind.
+# Each kind of value therefore has a point to which it should be near (the no-load reading or 0), and a point from which
+# it should be far. Values are refused if their distance to the second point, divided by their distance to the first
+# point, is below this limit. On the boards of scene lab, the median of this ratio is 0.15 to 0.22 for values of the
+# wrong kind, and 4 or more for values of the right kind.
 NEAR_MAX = 0.5
 
 
@@ -119,9 +122,9 @@ def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]
     """
     strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), db_uT.shape[1] // 3, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
-        rule = f"{NOISE_uT:g} uT or more at some chip"
-        remedy = "Are the fields in uT? Convert mT or G, or press the skin."
-        raise SchemaError("presses", "field changes", rule, f"{strongest_uT:.3g} uT at most", remedy)
+        rule = f"{NOISE_uT:g} uT or more at one chip at least"
+        remedy = "Convert fields in mT or G to uT. If they are in uT, press the skin harder."
+        raise SchemaError("presses", "field changes", rule, f"at most {strongest_uT:.3g} uT", remedy)
     return db_uT
 
 
@@ -131,8 +134,10 @@ def check_is_reading(where: str, b_uT: Float[np.ndarray, "m ch"], noload_uT: Flo
     `where` is the name of the calling function, for the error message.
     """
     if _median_norm(b_uT) < NEAR_MAX * _median_norm(b_uT - noload_uT):
-        problem = f"{where}: the values are nearer to 0 uT than to the no-load reading, like field changes"
-        raise SchemaError(f"{problem}. Pass readings, from which the no-load reading is not subtracted.")
+        problem = (
+            f"{where}: the values seem to be field changes, because they are nearer to 0 uT than to the no-load reading"
+        )
+        raise SchemaError(f"{problem}. Pass the readings themselves: do not subtract the no-load reading from them.")
 
 
 def check_is_change(where: str, db_uT: Float[np.ndarray, "m ch"], noload_uT: Float[np.ndarray, " ch"]) -> None:
@@ -141,8 +146,10 @@ def check_is_change(where: str, db_uT: Float[np.ndarray, "m ch"], noload_uT: Flo
     `where` is the name of the calling function, for the error message.
     """
     if _median_norm(db_uT - noload_uT) < NEAR_MAX * _median_norm(db_uT):
-        problem = f"{where}: the values are nearer to the no-load reading than to 0 uT, like readings"
-        raise SchemaError(f"{problem}. Pass field changes: subtract the no-load reading.")
+        problem = (
+            f"{where}: the values seem to be readings, because they are nearer to the no-load reading than to 0 uT"
+        )
+        raise SchemaError(f"{problem}. Pass field changes: subtract the no-load reading from the readings.")
 
 
 def _median_norm(values_uT: Float[np.ndarray, "m ch"]) -> float:
@@ -152,7 +159,7 @@ def _median_norm(values_uT: Float[np.ndarray, "m ch"]) -> float:
 def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndarray, "..."]) -> None:
     if not valid.all():
         wrong = np.argwhere(~valid)[0]
-        raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
+        raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit the press or reading with this value.")
 
 
 # Formats of calibration files, newest first. Files in older formats can still be read, but contain less: format 1 does
@@ -168,7 +175,7 @@ UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
 # Larger files are refused. The largest calibration (five full days with all labels, on a board with 64 chips) has a
 # size of 4.1 MB.
 FILE_BYTES_MAX_N = 2**23
-REMEDY = "Use a file that `save` wrote."
+REMEDY = "Use a calibration that `Universal.save` or the page of `reskin live` has saved."
 # A file states the name of its board under the first key. If it does not, it is for the board of the second name.
 BOARD, PAPER_BOARD = "board", "reskin"
 
@@ -319,13 +326,15 @@ def read_calibration(
     """
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
-            f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
+            f"{file}: the file has {bytes_n:,} bytes, but a saved calibration has at most {FILE_BYTES_MAX_N:,}. "
+            f"{REMEDY}"
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
     if "rest_slope_uT" in tensors:
-        raise SchemaError(f"{file}: this is a universal model, not a calibration. Pass it as file=.")
+        remedy = "In Python, pass it to load_universal as the argument `file`."
+        raise SchemaError(f"{file}: this file is a universal model, not a saved calibration. {remedy}")
     if (own := metadata.get(BOARD, PAPER_BOARD)) != board:
-        remedy = f"Load it with the model that was made for board {own}."
+        remedy = f"Use this calibration with the model that was made for board {own}."
         raise SchemaError(file, "the calibrated board", f"{board}, the board of the model", own, remedy)
     if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
         added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses(channels_n)}

@@ -99,7 +99,10 @@ def skin_function(skin: "Universal", quiet_uT: Float[np.ndarray, "*f ch"] | None
     if quiet_uT is not None:
         db_uT = check_readings(quiet_uT, skin.channels_n) - noload_uT
         if len(db_uT) < 2:
-            raise SchemaError(f"quiet_uT: {len(db_uT)} readings do not show the noise. Pass a second of readings.")
+            raise SchemaError(
+                f"quiet_uT: {len(db_uT)} readings are too few to estimate the noise. Pass the readings of about one "
+                "second without contact."
+            )
         suppressor = skin.suppressor(noise_uT(db_uT))
         contact_uT = contact_threshold_uT(db_uT, suppressor)
     lattice = calibrated.skin.evaluator.lattice

@@ -1,9 +1,9 @@
 """Calibration of the forces of a skin: a straight line from estimated to true forces, on logarithmic scales.
 
-The field change of a press grows slowly with its force F, about as F^0.2 to F^0.3 on recorded boards. A small relative
-error of the simulated field change (`reskin.universal.law`) therefore causes a relative error of the estimated force
-that is several times as large. The estimated forces of one skin are all wrong by a similar factor, which changes slowly
-with force. The line corrects this factor. It is fitted to presses with known forces.
+The field change of a press grows slowly with its force F, about as F^0.2 to F^0.3 on recorded boards. Therefore, if
+the simulated field change (`reskin.universal.law`) has a small relative error, the relative error of the estimated
+force is several times as large. The estimated forces of one skin are all wrong by a similar factor, which changes
+slowly with force. The line corrects this factor. It is fitted to presses with known forces.
 """
 
 import math

@@ -59,7 +59,7 @@ class Gaussians:
     def solve(self, read: Float32[np.ndarray, "n ch"], which: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, "n ch"]:
         """Return C^-1 (d - m) for each reading d.
 
-        The mean m and the covariance C are those of one Gaussian per reading, whose index is in `which`.
+        For each reading, the mean m and the covariance C belong to the Gaussian whose index is in `which`.
         """
         row, solved, f = self.row[:, which], np.zeros_like(read), 0
         for i in range(read.shape[1]):
@@ -296,8 +296,8 @@ def products(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Combine the map's probabilities of place and of force with normal distributions of place and of force.
 
-    The probability of a place is summed over all forces, and that of a force over all places. Both are then multiplied
-    by the normal distributions, which come from networks.
+    The probability of a place is the sum over all forces, and the probability of a force is the sum over all places.
+    Both are then multiplied by the normal distributions, which come from networks.
 
     Parameters
     ----------

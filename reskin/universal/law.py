@@ -63,7 +63,8 @@ def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[
 # The field of a skin is an integral over its volume, which is computed with a quadrature rule. This is the same rule as
 # in scene `quick`: the cheapest rule whose error is below 2 % of the field change (measured by experiment `runtime`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
-# A cheaper rule, with which the skins for training networks are simulated. Its error is smaller than that of the law.
+# A cheaper rule, with which the skins for training networks are simulated. Its error is smaller than the error of the
+# law, which is the difference between the law and real skins.
 COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)
 
 
@@ -87,7 +88,7 @@ class Law:
     # A press displaces the skin towards the centre of the skin, by this number of um per mm of distance between the
     # press and the centre. This displacement and the following one are called the slide of the skin.
     away_um_mm: float
-    # A press also displaces the skin by this vector, which is the same at all places, because the rig gives way.
+    # Under a press, the rig gives way. This displaces the skin by this vector, which is the same at all places.
     give_x_um: float
     give_y_um: float
     # The following parameters are not fitted.
@@ -95,7 +96,7 @@ class Law:
     # chosen on both boards of scene lab.
     lets_go_N: float = 8.0
     # Lateral stiffness (7 N/mm) divided by the friction coefficient (0.8), both from nominal.yaml, key skin.hold. It
-    # determines how much of the slide friction can cause when a press is light.
+    # limits the slide under a light press, because friction can then cause only a part of the displacement.
     grip_N_mm: float = 8.75
     tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
@@ -104,7 +105,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """What is the same for all boards of a scene: the nominal skin, the positions of the chips, the tip and the area.
+    """The properties that all boards of a scene share: nominal skin, positions of the chips, tip and area of presses.
 
     `start_law` is the law at which fits start. It is also the mean of the priors of the fitted parameters. By default,
     it is `START`.
@@ -114,7 +115,7 @@ class Setup:
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # whether all fields have the opposite sign, as those of a checkerboard skin turned by 90° have
+    skin_flipped: bool  # whether all fields have the opposite sign, as if a checkerboard skin were turned by 90°
     tip_radius_mm: float
     rule: Quadrature = RULE
     coarse_rule: Quadrature = COARSE
@@ -186,8 +187,8 @@ def simulate_uT(
     """Return the field changes that presses cause at the chips, along the board's axes.
 
     `place_mm` and `force_N` are the labels of the presses. The offset and the rotation of the labels, which are
-    parameters of the law, convert labelled places to true places. If `rest` is given, its dipoles replace those of the
-    setup, for example to simulate a skin with uneven filler. They must be at the same nodes.
+    parameters of the law, convert labelled places to true places. If `rest` is given, its dipoles replace the dipoles
+    of the setup, for example to simulate a skin with uneven filler. They must be at the same nodes.
     """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)

@@ -91,20 +91,27 @@ class BoardLayout(Strict):
                 raise ValueError(f"chips {places.index(place)} and {i} are at the same place {place} mm")
         apart_mm = [math.dist(place, other) for i, place in enumerate(places) for other in places[:i]]
         if min(apart_mm, default=CHIPS_APART_MM) < CHIPS_APART_MM:
-            raise ValueError(f"two chips are {min(apart_mm):g} mm apart. Are the positions in mm?")
+            raise ValueError(
+                f"two chips are {min(apart_mm):g} mm apart, but the smallest distance is {CHIPS_APART_MM:g} mm. State "
+                "the positions of the chips in mm"
+            )
         for axis, half_mm, side_mm in zip("xy", self.half_mm, self.skin.size_mm, strict=True):
             if half_mm + EDGE_MM > side_mm / 2:
                 problem = f"area.half_{axis}_mm is {half_mm:g}, but half the skin's size is {side_mm / 2:g}"
-                raise ValueError(f"{problem}; the area must end {EDGE_MM:g} mm or more from the edge")
+                raise ValueError(f"{problem}; the area must end {EDGE_MM:g} mm or more before the edge of the skin")
         deepest_mm = slide.DEEPEST * max(THICKNESSES) * self.skin.thickness_mm
         least_mm = deepest_mm / min(TIPS)
         if self.tip_radius_mm <= least_mm:
             problem = f"tip_radius_mm is {self.tip_radius_mm:g}, but must be above {least_mm:.3g}"
             raise ValueError(
-                f"{problem} for a skin of {self.skin.thickness_mm:g} mm: use a larger tip or a thinner skin"
+                f"{problem} for a skin with a thickness of {self.skin.thickness_mm:g} mm: use a larger tip or a "
+                "thinner skin"
             )
         if not 2 * self.force_N[0] <= self.force_N[1]:
-            raise ValueError(f"force_N is {list(self.force_N)}; the largest must be at least twice the least")
+            raise ValueError(
+                f"force_N is {list(self.force_N)}; the second value (the largest force) must be at least twice the "
+                "first (the smallest force)"
+            )
         for name in self.spreads:
             if name not in NOMINAL_SPREADS:
                 known = ", ".join(NOMINAL_SPREADS)
@@ -215,8 +222,9 @@ def read_layout(file: Path | str) -> BoardLayout:
         if str(file) not in known:
             guess = did_you_mean(file, known)
             raise ParamsError(
-                f"{file}: not a YAML file, and not a layout of the project ({', '.join(known)}).{guess} Write a layout "
-                f"file: copy {FOLDER / 'reskin.yaml'} and edit it."
+                f"{file}: this is neither a YAML file nor a layout that comes with the project "
+                f"({', '.join(known)}).{guess} To write your own layout, copy {FOLDER / 'reskin.yaml'} and edit the "
+                "copy."
             )
         path = FOLDER / f"{file}.yaml"
     return as_layout(read_yaml(path), str(path))

@@ -8,16 +8,17 @@ This module uses the following terms:
 - The law (`reskin.universal.law`) is a simulation that gives the field change of a press at any place with any force.
   Its parameters, such as the gap between skin and chips, differ from skin to skin. The central law has the mean
   parameters.
-- The error of the law is the difference between the field change of a skin and that of the law. It is given relative
-  to the size of the field change, |dB|. A Gaussian process describes how this error varies with place and force.
+- The error of the law is the difference between the field change of a skin and the field change that the law gives.
+  It is given relative to the size of the field change, |dB|. A Gaussian process describes how this error varies with
+  place and force.
 - A hypothesis is a pair of a place and a force that a press may have.
 - The map is conditioned on data of a skin: each datum (no-load field, press at an unknown place, labelled press)
   changes the distribution of the skin's parameters and of the error of the law.
 
 Before conditioning, the parameters are normally distributed about those of the central law. A standard deviation of
 this distribution is called the spread of a parameter. Tables contain the field changes of the central law and their
-derivatives with respect to the parameters, so that the field change of other parameters is found by linear
-extrapolation.
+derivatives with respect to the parameters, so that the field change for other parameters can be computed
+by linear extrapolation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,8 +62,8 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
 # Nominal parameters. The form of the law and the parameters gap, amplitude, `away_um_mm` and `lets_go_N` come from the
-# recorded boards of scene lab. Gap and amplitude are one of many pairs that fit a board about equally well. The modulus
-# is that of Dragon Skin 10 with filler (150 to 230 kPa). See `Law` for the meaning of each parameter.
+# recorded boards of scene lab. Many other pairs of gap and amplitude fit a board about equally well. The modulus is a
+# usual value for the silicone Dragon Skin 10 with filler (150 to 230 kPa). See `Law` for the meaning of each parameter.
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
 # To compute a derivative by finite differences, each parameter is changed by this value times its spread.
 STEP = 0.4
@@ -165,7 +166,7 @@ EVEN = 0.5
 class Residual:
     """Gaussian process that predicts the law's relative errors on a new board from its errors on known boards.
 
-    The known errors are those of m presses on boards with known parameters.
+    The known errors are the errors of the law for m presses on boards with known parameters.
     """
 
     place_mm: Float[np.ndarray, "m 2"]
@@ -258,8 +259,9 @@ class Hypotheses:
 
     @cached_property
     def noise_cov(self) -> Float[np.ndarray, "ch ch"]:
-        """Covariance of that part of a reading that the skin does not cause: noise and, if there is one, the external
-        field.
+        """Covariance of the part of a reading that the skin does not cause.
+
+        This part is noise and, if there is one, the external field.
         """
         noise = NOISE_uT**2 * np.eye(len(self.error_cov))
         return noise if self.external_cov is None else noise + self.external_cov
@@ -289,8 +291,9 @@ class Hypotheses:
 
     @cached_property
     def expected_uT(self) -> Float32[np.ndarray, "h ch"]:
-        """Expected field change of each hypothesis before conditioning: that of the central law plus the law's error
-        that is expected from known boards.
+        """Expected field change of each hypothesis before conditioning.
+
+        This is the field change of the central law, plus the error of the law that is expected from known boards.
         """
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
@@ -311,12 +314,12 @@ def lattice(tables: Tables, residual: Residual, external_cov: Float[np.ndarray, 
 
 # How a skin slides under a press can change from one day to the next. SLIDE lists the parameters that describe the
 # slide; all other parameters stay the same. If the slide has changed, SLIDE_CORRELATION is the correlation of each of
-# these parameters between the two days, and ERROR_CORRELATION that of the law's errors. Both values were chosen on
-# simulated skins (tests/benchmarks/test_days_benchmark.py).
+# these parameters between the two days, and ERROR_CORRELATION is the correlation of the law's errors. Both values were
+# chosen on simulated skins (tests/benchmarks/test_days_benchmark.py).
 SLIDE = ("away_um_mm", "give_x_um", "give_y_um", "lets_go_N")
 SLIDE_CORRELATION, ERROR_CORRELATION = 0.0, 0.7
-# Standard deviation of the difference between a no-load field and that of the law. It combines the offsets of the chips
-# (200 uT) and the error of the law (250 uT).
+# Standard deviation of the difference between the no-load field of a skin and the no-load field of the law. It combines
+# the offsets of the chips (200 uT) and the error of the law (250 uT).
 OFFSET_uT = 320.0
 SHARE_MIN = 0.03  # however many labels there are, this fraction of the variance of the law's error always remains
 # Weight of an unlabelled press. It is below 1 because the law's errors at nearby places are correlated, so that many
@@ -372,8 +375,9 @@ class Likelihoods:
     channels_n: int
 
     def misfit(self) -> Float[np.ndarray, " n"]:
-        """Return the misfit of each reading, which is chi^2 of its most likely hypothesis, divided by the number of
-        channels.
+        """Return the misfit of each reading.
+
+        The misfit is chi^2 of the most likely hypothesis, divided by the number of channels.
         """
         return self.chi2[np.arange(len(self.chi2)), self.best] / self.channels_n
 
@@ -446,8 +450,8 @@ class MapEvaluator:
         self.gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, noise_cov)
         invalid = ~np.isfinite(self.gaussians.log_det)
         if invalid.any():
-            what = f"{int(invalid.sum())} covariances of its hypotheses are not positive definite"
-            raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
+            what = f"the covariances of {int(invalid.sum())} hypotheses (places and forces) are not positive definite"
+            raise SchemaError(f"map of a skin: {what}. Take the no-load reading again: call zero.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
         """Return, for each hypothesis, the expected relative error of the law and how uncertain it still is.

@@ -12,8 +12,8 @@ Three classes contain both parts at different stages of calibration:
 
 These three classes use the frame and the axes of the board, and work for any board. `Universal` is the class for users.
 It is made for the board of one layout (`reskin.universal.layout`); the model that comes with the project is for the
-paper's board. `Universal` takes readings along the axes of the chips, and its places are in the frame of the labels, in
-which the centre of the board is at the layout's `centre_mm`.
+paper's board. `Universal` takes readings along the axes of the chips. Its places are in the frame of the labels. In
+this frame, the centre of the board is at the layout's `centre_mm`.
 
 A likelihood power is the exponent to which a likelihood is raised. A power below 1 increases standard deviations. It is
 used where likelihoods are multiplied as if errors were independent although they are correlated.
@@ -94,8 +94,9 @@ SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networ
 # `network_offsets_mm` corrects the places of the networks twice. The first correction, from unlabelled presses, loses
 # weight as labels are added: it is divided by 1 + this value * number of labels.
 FADES_PER_LABEL = 0.15
-# The error of the networks in place is a constant error on each skin, with the first standard deviation, plus an error
-# that differs from press to press, with the second one.
+# The error of the networks in place is assumed to be the sum of two parts: a part that is the same for all presses on a
+# skin, with the first standard deviation, and a part that differs from press to press, with the second standard
+# deviation.
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0
 # A warning is given if chi^2 per channel exceeds this assumed value. For skins like those in training, it is about 1.
 MISFIT_MAX = 4.0
@@ -103,7 +104,7 @@ MISFIT_MAX = 4.0
 # may be another skin. In scene lab, recordings of one board differ by at most 5 %, and recordings of different boards
 # by 65 %.
 OTHER_SKIN_MIN = 0.25
-BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
+BLOCK_N = 200  # readings are evaluated in blocks of this size, which limits the memory
 # With external fields, the errors of map and networks are more strongly correlated. The likelihood power is therefore
 # divided by 1 + external_uT / (POWER_uT + POWER_PER_LABEL_uT * labels). Both values were chosen so that 90 % intervals
 # contain 90 % of the true values on simulated skins.
@@ -132,8 +133,8 @@ class Evaluation:
     The likelihood power affects standard deviations and, in `by_map`, also places and forces.
 
     `line` calibrates the forces (`reskin.universal.force`). If only few forces are known, they are used in two ways:
-    `likelihoods` are those of the map that is conditioned on the presses with known forces, and `unlabelled` those of
-    the map that is not conditioned on them. `few` contains these presses.
+    `likelihoods` comes from the map that is conditioned on the presses with known forces, and `unlabelled` from a map
+    that is not conditioned on these presses. `few` contains the presses.
     """
 
     evaluator: MapEvaluator
@@ -324,9 +325,10 @@ class PressCalibration:
 
     @cached_property
     def moved(self) -> SkinMap:
-        """The map, with the same shift of places as the networks if the shift was estimated from random presses.
+        """The map, with its places moved by the same shift as the places of the networks.
 
-        Random presses are presses at random places all over the area of presses. Without them, this is `skin`.
+        The map is moved only if the shift was estimated from presses at random places all over the area of presses.
+        Otherwise, this is `skin`.
         """
         return move_places(self.skin, self.centre_mm) if len(self.spread.data.area_uT) else self.skin
 
@@ -396,8 +398,8 @@ class PressCalibration:
 
         Two maps are compared: one for an unchanged slide, and one for a changed slide. The log odds are the log
         likelihood of the press under the first map minus its log likelihood under the second map. A likelihood is the
-        sum over all places and forces, because those of the press are unknown. Both maps are conditioned on the labels
-        of the day of this object.
+        sum over all places and forces, because the place and the force of the press are unknown. Both maps are
+        conditioned on the labels of the day of this object.
         """
         same, changed = (
             logsumexp(-0.5 * skin.evaluator.evaluate(db_uT).deviance.astype(float), axis=1)
@@ -547,7 +549,7 @@ class Universal:
         """Start without any calibration data; raise SchemaError if `external_uT` is out of range."""
         if not 0 <= self.external_uT <= EXTERNAL_MAX_uT:
             rule = f"0 to {EXTERNAL_MAX_uT:,.0f} uT"
-            remedy = "Pass the size of the fields that change while the skin moves; the earth's field has about 50 uT."
+            remedy = "Pass the expected change of the external field, for example 30 uT for the earth's field."
             raise SchemaError("universal model", "external_uT", rule, self.external_uT, remedy)
         self._noload_uT: np.ndarray | None = None
         self._turned_given = False  # whether the user stated the orientation of the skin
@@ -624,7 +626,7 @@ class Universal:
         Raises SchemaError if `zero` has not been called yet.
         """
         if self._noload_uT is None:
-            raise SchemaError("the model has no no-load reading: call zero(...) with readings without contact first.")
+            raise SchemaError("the model has no no-load reading. First call zero with readings without contact.")
         return self._noload_uT
 
     @property
@@ -649,7 +651,9 @@ class Universal:
         Raises SchemaError if `zero` has not been called yet.
         """
         if not self.zeroed:
-            raise SchemaError("mounting: the model has no no-load reading. First call zero.")
+            raise SchemaError(
+                "mounting: the model has no no-load reading. First call zero with readings without contact."
+            )
         return find_mounting(self.tables, self._sign * self._data.rest_uT, turned=self._data.turned)
 
     @property
@@ -679,16 +683,17 @@ class Universal:
         usual_uT = float(np.median(np.linalg.norm(self.noload_uT.reshape(-1, 3), axis=1)))
         if usual_uT < WEAKEST_uT:
             return [
-                f"the no-load field is weaker than the earth's field: {usual_uT:.3g} uT at most chips. Pass readings "
-                "in uT (convert mT or G), from which the no-load reading is not subtracted."
+                f"the no-load field is weaker than the earth's field: its median over the chips is {usual_uT:.3g} uT. "
+                "Convert readings in mT or G to uT, and do not subtract the no-load reading from them."
             ]
         found = self.mounting.warnings(turnable=self.turnable)
         if self._saved_uT is not None:
             changed = float(np.linalg.norm(self.noload_uT - self._saved_uT) / np.linalg.norm(self._saved_uT))
             if changed > OTHER_SKIN_MIN:
                 found.append(
-                    f"the no-load field differs by {changed:.0%} from that of the saved calibration. If this is "
-                    "another skin, load its own calibration, or calibrate it from scratch."
+                    f"the no-load field differs by {changed:.0%} from the no-load field in the saved calibration. If "
+                    "this is another skin, load the calibration of this skin, or calibrate the model without a saved "
+                    "one."
                 )
         frame = self.label_frame
         of_labels = None if frame is None else frame.warning()
@@ -781,17 +786,18 @@ class Universal:
         """
         noload_uT = check_readings(b_uT, self.channels_n)
         if not len(noload_uT):
-            raise SchemaError("zero: there are no readings without contact. Read the board before a contact.")
+            raise SchemaError("zero: the array of readings is empty. Pass readings that were taken without contact.")
         if turned and not self.turnable:
             problem = f"a quarter turn does not reverse the fields of skin {self.layout.name}"
-            raise SchemaError(f"zero: {problem}. Call it without `turned`.")
+            raise SchemaError(f"zero: {problem}. Call zero without the argument `turned`.")
         kept = keep and self.zeroed
         # If there are presses to keep, or the user has stated the orientation, the orientation must stay the same.
         # Otherwise, this may be another skin, whose orientation is determined again.
         bound = kept and (self.presses_n > 0 or self._turned_given)
         if bound and turned not in (None, self._data.turned):
             raise SchemaError(
-                "zero: the presses to keep are from a skin in the other orientation. Call it without keep."
+                "zero: the calibration to keep is of a skin in the other orientation. To keep it, omit the argument "
+                "`turned`; to start a new calibration, omit `keep`."
             )
         noload_uT = noload_uT.mean(axis=0)
         rest_uT = self.layout.to_board(noload_uT[None])[0]
@@ -821,7 +827,9 @@ class Universal:
             the paper's board, this area is an octagon 16 mm wide. Estimated places are then moved onto this area.
         """
         if even and area:
-            raise SchemaError("see: presses are either evenly spread or at random places. Set even or area, not both.")
+            raise SchemaError(
+                "see: presses are either evenly spread or at random places. Set only one of `even` and `area`."
+            )
         db_uT, data = self._check_change("see", check_readings(b_uT, self.channels_n)), self._data
         if not len(db_uT):
             return self
@@ -949,7 +957,7 @@ class Universal:
         Raises SchemaError if `zero` was not called before, because the model then has no no-load reading.
         """
         if self._noload_uT is None:
-            raise SchemaError("save: the model has no no-load reading. First call zero.")
+            raise SchemaError("save: the model has no no-load reading. First call zero with readings without contact.")
         write_calibration(self._data, Path(file), self.layout.name)
 
     def export_onnx(self, file: Path | str, quiet_uT: Float[np.ndarray, "*f ch"] | None = None) -> None:
@@ -1095,7 +1103,7 @@ def load_universal(
         return model.remember(calibration, new_day=new_day)
     if new_day:
         raise SchemaError(
-            "new_day: there is no calibration of an earlier day. Pass a saved calibration, or omit new_day."
+            "new_day: there is no calibration of an earlier day. Pass a file with a saved calibration, or omit new_day."
         )
     return model
 
@@ -1119,12 +1127,14 @@ def _format_of(card: Any) -> str:
 def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers, BoardLayout, Mapping[str, Any]]:
     card_file = file.with_suffix(".json")
     if file.is_file() and not card_file.is_file():
-        problem = f"{file}: its card {card_file.name} is missing"
-        raise SchemaError(f"{problem}. Copy the card as well; if the file is a saved calibration, pass it first.")
+        problem = f"{file}: its model card {card_file.name} is missing. Copy the card to the same folder"
+        raise SchemaError(f"{problem}. If this file is a saved calibration, pass it as `calibration`, not as `file`.")
     card = io.read_json(card_file)
     form = _format_of(card)
     if form not in (FORMAT, FORMAT_3):
-        remedy = "Use the files of this version, or make the model again: reskin model make"
+        remedy = (
+            "Use a model that was made with this version of reskin, or make the model again with `reskin model make`."
+        )
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file, digest_needed=True)
     map_arrays = {

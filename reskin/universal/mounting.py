@@ -1,12 +1,12 @@
 """Check how a skin is mounted on its board, and how the axes of the labels are oriented.
 
-The poles of the paper's skin alternate like the fields of a checkerboard. If the skin is glued on after one or three
-quarter turns, every field therefore has the opposite sign. Half a turn changes nothing. If the skin is glued on upside
-down, fields have the same sign and are about 1.3 times as large.
+The poles of the paper's skin alternate like the fields of a checkerboard. Therefore, if the skin is turned by one or
+three quarter turns before it is glued on, every field has the opposite sign. Half a turn changes nothing. If the skin
+is glued on upside down, fields have the same sign and are about 1.3 times as large.
 
 The no-load field shows whether a skin is turned. Without this check, the universal model would estimate wrong places on
-a turned skin, because the field change of a press on a turned skin resembles that of a press on the opposite side of a
-skin that is not turned.
+a turned skin, because two field changes are similar: the field change of a press on a turned skin, and the field change
+of a press on the opposite side of a skin that is not turned.
 
 Presses at known places show whether the axes of the labels are oriented as the user has stated.
 """
@@ -28,7 +28,7 @@ NOLOAD_MISFIT_MAX = 12.0
 LABELS_MIN_N = 3  # with fewer labels, the orientation of their axes is not checked
 FRAME_LOG_ODDS_MIN = 5.0  # another orientation of the labels' axes is reported if its log odds are at least this value
 FRAME_SD_MM = 1.0  # standard deviation of that part of the errors in place that the estimated uncertainty omits
-# This fraction of the estimated places is assumed to be useless. They may be anywhere on an area of this size.
+# This fraction of the estimated places is assumed to be useless: such a place may be anywhere on an area of this size.
 OUTLIER_SHARE, AREA_MM2 = 0.1, 200.0
 
 TURNED = "turned by a quarter"
@@ -38,9 +38,10 @@ TURNED = "turned by a quarter"
 class Mounting:
     """Orientation of a skin on its board: turned by a quarter, or not turned.
 
-    `turned` is True if all fields have the opposite sign of the fields on the recorded boards. `log_odds` is the
-    logarithm of the probability of this orientation divided by that of the other orientation. It is negative if the
-    other orientation fits better. `misfit` is chi^2 per channel of the no-load field.
+    `turned` is True if the skin is turned by a quarter, so that all fields have the opposite sign of the fields on the
+    recorded boards. `log_odds` is the logarithm of the probability of this orientation divided by the probability of
+    the other orientation. It is negative if the other orientation fits better. `misfit` is chi^2 per channel of the
+    no-load field.
     """
 
     turned: bool
@@ -61,20 +62,23 @@ class Mounting:
         sentences = []
         if self.misfit > NOLOAD_MISFIT_MAX:
             sentences.append(
-                "the no-load field is unlike those of the skins that the model was trained on (chi^2 per channel "
-                f"{self.misfit:.3g}, limit {NOLOAD_MISFIT_MAX:g}). Are the chips in another order, or the skin another?"
+                "the no-load field is unlike the no-load fields of the skins on which the model was trained (chi^2 per "
+                f"channel {self.misfit:.3g}, limit {NOLOAD_MISFIT_MAX:g}). Check the order of the chips in the "
+                "readings, and use a model for this kind of skin."
             )
         found = TURNED if self.turned else "not turned"
         if turnable and self.log_odds < -LOG_ODDS_MIN:
             sentences.append(
-                f"the skin is taken as {found}, but its no-load field fits the other orientation better (log odds "
-                f"{self.log_odds:.1f}). Take the no-load reading again, without contact and without `turned`."
+                f"the skin is assumed to be {found}, but its no-load field fits the other orientation better (log odds "
+                f"{self.log_odds:.1f}). Take the no-load reading again without contact, and call zero without the "
+                "argument `turned`."
             )
         elif turnable and self.log_odds < LOG_ODDS_MIN:
             sentences.append(
-                f"the skin is taken as {found}, but its no-load field fits both orientations (log odds "
-                f"{self.log_odds:.1f}). If you know the orientation, state it in Python: zero(noload_uT, turned=True "
-                "or False). Otherwise, compare errors at known places in both orientations."
+                f"the skin is assumed to be {found}, but its no-load field fits both orientations (log odds "
+                f"{self.log_odds:.1f}). If you know the orientation, state it in Python with zero(noload_uT, "
+                "turned=True) or turned=False. Otherwise, press some known places, and use the orientation in which "
+                "their estimates are more accurate."
             )
         return sentences
 
@@ -137,8 +141,8 @@ class LabelFrame:
         if self.log_odds < FRAME_LOG_ODDS_MIN:
             return None
         return (
-            f"the labelled places fit the estimated places better if they are {self.name} (log odds "
-            f"{self.log_odds:.1f}). Correct the axes of the labels, and call label again."
+            f"the labelled places fit the estimated places better if the labelled places are {self.name} (log odds "
+            f"{self.log_odds:.1f}). Convert the labelled places to the axes of the board, and call label again."
         )
 
 

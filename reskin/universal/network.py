@@ -19,8 +19,8 @@ Weights = Mapping[str, np.ndarray]
 
 LAYERS_N = 3  # number of hidden layers of the regressor
 # The inputs are the direction dB/|dB| of the field change, log|dB|, and the no-load field. These constants scale them
-# to values of about 1: dB/|dB| is multiplied by the first, the second is subtracted from log|dB|, and the no-load field
-# is divided by the third.
+# to values of about 1: dB/|dB| is multiplied by DIRECTION_GAIN, LOG_uT is subtracted from log|dB|, and the no-load
+# field is divided by REST_uT.
 DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0
 # If |dB| is smaller than this value, dB is divided by this value instead of |dB|. Otherwise, the direction of tiny
 # field changes would consist of noise.

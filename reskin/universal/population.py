@@ -24,8 +24,9 @@ PRESSES_N = 2 * PLACES_N  # number of presses on each skin: the first half is fo
 PITCH_MM, JITTER_MM = 2.0, 0.05
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
-# The following constants describe how boards and skins vary, in addition to the parameters of the law. These values and
-# the spreads of the parameters are assumed. Thickness and tip radius are relative to those of the setup.
+# Boards and skins differ in the parameters of the law, and also in the properties that the following constants
+# describe. The values of these constants and the spreads of the parameters are assumed. Thickness and tip radius are
+# relative to the thickness and the tip radius of the setup.
 THICKNESSES = {0.9: 0.07, 0.95: 0.24, 1.0: 0.38, 1.05: 0.24, 1.1: 0.07}  # relative thickness: its probability
 TIPS = {0.875: 0.25, 1.0: 0.5, 1.25: 0.25}  # relative tip radius: its probability
 # Increase of the logarithm of the amplitude per mm of gap. In fits to the boards of scene lab, a larger gap comes with
@@ -34,8 +35,8 @@ LOG_AMPLITUDE_PER_MM = 0.95
 # The magnetisation of the filler varies from place to place. Its logarithm is a sum of cosine waves with this standard
 # deviation, this length scale, and this number of waves.
 FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64
-# Standard deviations over chips of: the relative gain of an axis, the cross-talk between axes, the rotation of the chip
-# about each axis, and the offset of an axis.
+# Standard deviations over chips, in this order: of the relative gain of an axis, of the cross-talk between axes, of the
+# rotation of the chip about each axis, and of the offset of an axis.
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
 # Smallest values of drawn parameters. With the smallest gap, no chip is inside the skin. With the smallest value of
 # `away_um_mm`, a press never displaces the skin away from its centre. With the smallest value of `lets_go_N`, this

@@ -83,7 +83,10 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
     known = placed & (force_N > 0) if forces_known else placed
     if not known.any():
         what = f"board {captures[0].board} has no press with a known place and force"
-        raise SchemaError(f"experiment compare: {what}. Record both, or remove the experiment from the scene.")
+        raise SchemaError(
+            f"experiment compare: {what}. Record the places and forces of presses, or remove "
+            "the experiment from the scene."
+        )
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],
@@ -172,10 +175,10 @@ def memory(
 ) -> float | None:
     """Return the fraction of the field change of a press that remains in the next no-load reading.
 
-    In each capture, a linear regression explains the no-load readings by the field change of the previous press, the
-    field change of the next press, and a polynomial in time for the drift. The result is the mean over captures of the
-    coefficient of the previous press. A capture is skipped if it is too short, or if it does not have a new no-load
-    reading before each press. The result is None if all captures are skipped.
+    In each capture, a linear regression explains the no-load readings by three terms: the field change of the previous
+    press, the field change of the next press, and a polynomial in time, which describes the drift. The result is the
+    coefficient of the previous press, averaged over captures. A capture is skipped if it is too short, or if it does
+    not have a new no-load reading before each press. The result is None if all captures are skipped.
     """
     coefficients = []
     for capture_i in np.unique(presses.capture_i):

@@ -215,7 +215,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
         assert np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
         await tab.value("boards[0].parts.label.click()")
         await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
-        assert await tab.text("learnt") == "1 press labelled by you"
+        assert await tab.text("learnt") == "1 press with a label that you entered"
 
         await tab.value("boards[0].parts.skinbox.open = true; boards[0].parts.name.focus()")
         for key in "zap1":  # Text that is typed into a field must not press the buttons Zero, Adapt and Places.

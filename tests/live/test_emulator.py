@@ -217,7 +217,7 @@ class TestFaults:
         assert frames_n("torn") == len(SCRIPT) - 2 * 10  # Each torn frame also costs the frame after it.
 
     def test_clock_jump_needs_frames_with_a_clock(self):
-        with pytest.raises(ParamsError, match="needs a capture with a clock"):
+        with pytest.raises(ParamsError, match="needs a capture with a clock of the board"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
                 parse_fault("clock-jump@0.5"),
@@ -298,7 +298,8 @@ def test_true_place_is_printed_when_a_touch_begins(times):
         play(script, reader, times, on_sent=printer)
     sent_n, texts = zip(*printed, strict=True)
     assert texts == 2 * (
-        "true place: x 4.0 mm, y 12.0 mm, up to 0.50 N", "true place: x 12.0 mm, y 4.0 mm, up to 1.75 N",
+        "true place: x 4.0 mm, y 12.0 mm; largest force 0.50 "
+            "N", "true place: x 12.0 mm, y 4.0 mm; largest force 1.75 N",
     )  # fmt: skip
     first_n = np.array([101, 301, len(script) + 101, len(script) + 301])
     assert np.all((np.array(sent_n) >= first_n) & (np.array(sent_n) < first_n + 256))
@@ -351,5 +352,5 @@ class TestRobot:
     def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")
         for options in ({"board": "b1"}, {"robot": True}):
-            with pytest.raises(ParamsError, match="only for nominal"):
+            with pytest.raises(ParamsError, match="can only be used with source nominal"):
                 read_script(str(tmp_path / "c0"), **options)

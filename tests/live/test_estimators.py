@@ -112,7 +112,7 @@ def test_model_is_adapted_to_collected_presses(random_pokes):
     np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # The tolerance in uT allows for noise of 3 uT.
     estimator = UniversalEstimator(load_universal())
     estimator.set_noload(random_pokes[0])
-    assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
+    assert "adapted to 12 presses: median standard deviation of the places" in estimator.adapt(pokes.db_uT)
     before = estimator(pokes.db_uT.astype(np.float32))
     estimator.set_noload(random_pokes[0])  # A new no-load reading keeps the adaptation.
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
@@ -154,7 +154,7 @@ def test_presses_within_the_noise_are_refused(random_pokes):
     estimator.set_noload(noload_uT)
     before = estimator(db_uT.astype(np.float32)).target
     for calibrate in (estimator.adapt, lambda weak_uT: estimator.label(b_uT[:, :2], weak_uT, np.arange(len(b_uT)) < 3)):
-        with pytest.raises(SchemaError, match="field changes must be 4.5 uT or more at some chip"):
+        with pytest.raises(SchemaError, match="field changes must be 4.5 uT or more at one chip at least"):
             calibrate(1e-3 * db_uT)
     estimator.set_noload(noload_uT)
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
@@ -229,7 +229,8 @@ def test_short_contact_is_not_a_press():
 def test_universal_model_is_refused_for_boards_with_another_number_of_chips():
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
-    assert "no place or force: the universal model is for 5 chips. Use a model for this board." in skin.alarms()
+    problem = "no place or force is estimated: the universal model is for boards with 5 chips."
+    assert f"{problem} Use a model for this board." in skin.alarms()
     assert all(np.isnan(batch.target).all() for batch in readings)
 
 

@@ -98,7 +98,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
     try:
         until(reader.waiting.is_set, session)
         until(lambda: session.skin.zeroed, session)
-        assert "learnt nothing about this skin" in text_after(session, {"save": "s1"})
+        assert "is not yet calibrated to this skin" in text_after(session, {"save": "s1"})
         assert "nothing to undo" in text_after(session, {"press": "undo"})
         assert not folder.exists()
         before = session.skin.estimator(db_uT).target
@@ -124,7 +124,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         assert (folder / "s1.safetensors").read_bytes() == content
         assert session.state()["skins"] == ["s1"]
 
-        assert text_after(session, {"press": "undo"}) == f"undone: the {PRESSES_N} presses"
+        assert text_after(session, {"press": "undo"}) == f"undone: calibration to {PRESSES_N} presses"
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
         assert "the file does not exist" in text_after(session, {"load": "s2"})
         (folder / "s3.safetensors").write_text("no calibration")
@@ -138,7 +138,7 @@ def test_calibration_is_saved_undone_and_loaded(random_pokes, tmp_path):  # noqa
         state = session.state()
         assert state["model"] == "universal model, shipped with reskin, with the saved skin s1"
         assert state["learnt"] == f"{PRESSES_N} presses in s1"
-        assert text_after(session, {"press": "undo"}) == "undone: the loading of s1"
+        assert text_after(session, {"press": "undo"}) == "undone: loading of skin s1"
         np.testing.assert_array_equal(session.skin.estimator(db_uT).target, before)
     finally:
         session.stop()
@@ -159,18 +159,21 @@ def test_model_is_calibrated_to_labelled_presses(random_pokes):  # noqa: F811
     for i in range(3):
         unknown = i == 1
         text = estimator.add_label(tuple(place_mm[i].tolist()), math.nan if unknown else force_N[i], db_uT[i])
-        assert text.startswith("calibrated to a labelled press; before it, the place was wrong by ")
+        assert text.startswith("calibrated to a labelled press; before, the error of its place was ")
         assert ("force" in text) != unknown
     labelled = [0, 2]
     model = load_universal().zero(noload_uT).label(place_mm[labelled], force_N[labelled], b_uT[labelled])
     expected = model.label(place_mm[[1]], None, b_uT[[1]], keep=True).predict(b_uT)
     found = estimator(db_uT.astype(np.float32)).target
     np.testing.assert_allclose(found, expected, atol=0.02)  # The tolerance in mm and N is that of single precision.
-    for wrong_mm, wrong_N, message in (((99.0, 8.0), 1.0, "on the skin"), ((8.0, 8.0), 900.0, "the model's range")):
+    for wrong_mm, wrong_N, message in (
+        ((99.0, 8.0), 1.0, "on the skin"),
+        ((8.0, 8.0), 900.0, "the force range of the model"),
+    ):
         with pytest.raises(SchemaError, match=message):
             estimator.add_label(wrong_mm, wrong_N, db_uT[3])
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, found)
-    assert estimator.undo() == "undone: the last labelled press"
+    assert estimator.undo() == "undone: calibration to the last labelled press"
     assert len(estimator.learnt.labels.force_N) == 2
 
 
@@ -283,7 +286,7 @@ def feed(press, contact, seconds, rate_hz=100.0):
 
 @pytest.mark.parametrize(
     ("parts", "problem"),
-    [([(True, 1.0)], "began before the label"), ([(False, 0.3), (True, 1.0)], "touched shortly before"),
+    [([(True, 1.0)], "begun before the label"), ([(False, 0.3), (True, 1.0)], "touched shortly before"),
      ([(False, 1.0), (True, 0.03)], "too short")],
 )  # fmt: skip
 def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):

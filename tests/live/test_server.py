@@ -107,7 +107,7 @@ def test_page_receives_estimates_and_the_buttons_zero_and_record_work(tmp_path, 
             assert (state["expected"], state["least_force"]) == ("not measured for this network", "not measured")
             await socket.send_json({"save": "s1"})
             refused = await until(socket, lambda message: bool(message.get("adapted")))
-            assert "only the universal model can learn a skin" in refused["adapted"]
+            assert "only the universal model can be calibrated on this page" in refused["adapted"]
             await socket.send_json({"seen": poke["number"]})
             await socket.send_json({"press": "record"})
             recording = await until(socket, lambda message: bool(message.get("recording")))

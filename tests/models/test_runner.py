@@ -166,7 +166,7 @@ def test_finished_jobs_are_read_from_the_cache(tmp_path):
     first = run(jobs(), tmp_path)
     again = run(jobs(), tmp_path, InlineExecutor(die_after=0), log)
     assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
-    assert log == ["3 of 3 training runs were finished before"]
+    assert log == ["3 of 3 training runs were finished before and are not repeated"]
 
 
 @pytest.mark.parametrize(

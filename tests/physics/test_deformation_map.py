@@ -127,7 +127,7 @@ def test_lower_surface_of_a_slipping_skin_stays_on_its_base(depth_m):
 def test_table_of_a_thin_skin():
     thin = deformation.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
     assert deformation.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
-    with pytest.raises(ParamsError, match="depth must be such that"):
+    with pytest.raises(ParamsError, match="depth must be so small that"):
         deformation.tabulate(0.2e-3, TIP_M, 0.12e-3, heights=(0.5, 1.0), base="bonded")
 
 

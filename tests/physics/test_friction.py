@@ -155,8 +155,8 @@ def test_skin_without_stiffness_is_dragged_without_force():
 @pytest.mark.parametrize(
     ("what", "of"),
     [
-        ("every place", {"path_m": np.array([[0.0, np.nan], [0.0, 0.0]])}),
-        ("every place", {"path_m": np.array([[0.0, 0.0], [np.inf, 0.0]])}),
+        ("every place of the tip", {"path_m": np.array([[0.0, np.nan], [0.0, 0.0]])}),
+        ("every place of the tip", {"path_m": np.array([[0.0, 0.0], [np.inf, 0.0]])}),
         ("normal force", {"normal_N": np.array([1.0, -1e-9])}),
         ("normal force", {"normal_N": np.array([np.nan, 1.0])}),
         ("stiffness", {"stiffness_N_per_m": -1.0}),

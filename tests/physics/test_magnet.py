@@ -81,7 +81,7 @@ def test_field_of_the_array_equals_the_specification():
 
 
 def test_place_outside_the_slab_is_refused():
-    with pytest.raises(ParamsError, match="places must be inside the slab"):
+    with pytest.raises(ParamsError, match="height of the nodes must be from 0 to .*, inside the skin"):
         magnet.array_field(np.array([[0.0, 0.0, 2.1e-3]]), THICKNESS_M, "same")
 
 

@@ -494,8 +494,11 @@ def test_midpoint_steps_conserve_volume(depth_m, force_N, loss):
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
         ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, np.nan]]))),
-        ("half of the curl", lambda: displace([3, 0], random_places_m(), by=shear.shear_in_steps)),
-        ("half of the curl", lambda: displace([0, np.nan], random_places_m(), by=shear.shear_in_steps)),
+        ("half of the curl of the displacement", lambda: displace([3, 0], random_places_m(), by=shear.shear_in_steps)),
+        (
+            "half of the curl of the displacement",
+            lambda: displace([0, np.nan], random_places_m(), by=shear.shear_in_steps),
+        ),
         ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
     ],
 )

@@ -185,16 +185,16 @@ def test_export_of_wrong_input_raises_and_writes_no_files(tmp_path):
     folder = write_stream(tmp_path, "binary")
     (folder / PROBE_FILE).write_text(DWELLS)
     for files, options, error, message in (
-        ([good, simulated], {}, SchemaError, "it is simulated, but .*a.parquet is recorded"),
-        ([good, unlabelled], {}, SchemaError, "differ in the values Fz_N. Export them to different folders"),
+        ([good, simulated], {}, SchemaError, "this recording is simulated, but .*a.parquet is recorded"),
+        ([good, unlabelled], {}, SchemaError, "contains Fz_N. Export these recordings to different folders"),
         ([good, slow], {}, ReskinError, "different rates, 10 to 100 Hz"),
-        ([good, write_log(tmp_path)], {}, SchemaError, "differ in the values"),
+        ([good, write_log(tmp_path)], {}, SchemaError, "only this recording or only .* contains"),
         ([backwards], {"fps": 10}, CaptureError, "the times go backwards"),
         ([folder], {}, CaptureError, "labels in probe.csv are on another clock"),
         ([good], {"fps": 0}, ReskinError, "--fps: 0 is not from 1 to"),
         ([good], {"task": " "}, ReskinError, "--task: the text is empty"),
         ([still], {}, ReskinError, "no episode has two readings at different times"),
-        ([tmp_path / "a_capture"], {}, CaptureError, "capture of layout lab. Export its table of ingested readings"),
+        ([tmp_path / "a_capture"], {}, CaptureError, "a capture of layout lab cannot be exported"),
         ([tmp_path / "missing"], {}, SchemaError, "file not found"),
     ):
         with pytest.raises(error, match=message):

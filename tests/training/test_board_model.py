@@ -158,7 +158,7 @@ def test_saved_calibration_is_refused_for_other_boards(made, tmp_path):
     np.testing.assert_allclose(again.predict(press_uT), model.predict(press_uT), rtol=1e-4)
     with pytest.raises(SchemaError, match="calibrated board must be reskin, the board of the model; got square"):
         load_universal(file)
-    with pytest.raises(SchemaError, match="places must be on the skin, .-7.0, 14.0. to .7.0, 26.0. mm"):
+    with pytest.raises(SchemaError, match="places must be on the skin, from .-7.0, 14.0. to .7.0, 26.0. mm"):
         model.label([[8.0, 8.0]], [2.0], press_uT[:1])
 
 
@@ -189,7 +189,8 @@ def test_board_is_read_live_with_the_model_for_its_layout(made):
     assert np.isfinite(np.concatenate([batch.target[batch.contact] for batch in readings])).all()
     assert any(batch.contact.any() for batch in readings)
     other, _ = play_to_skin(make_script(pokes_n=1, chips_n=5), predicting.read_models([made]))
-    assert "no place or force: the universal model is for 4 chips. Use a model for this board." in other.alarms()
+    problem = "no place or force is estimated: the universal model is for boards with 4 chips."
+    assert f"{problem} Use a model for this board." in other.alarms()
 
 
 def test_model_card_states_the_layout_and_the_limits_of_use(made):

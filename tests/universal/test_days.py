@@ -252,7 +252,7 @@ def test_too_many_or_invalid_days_are_refused(first_day, monkeypatch):
     io.write_tensors(file, tensors, header)
     monkeypatch.setattr(calibration, "LABELS_MAX_N", 10)
     later = load_universal(file, new_day=True)
-    with pytest.raises(SchemaError, match="labels: 11 are too many"):
+    with pytest.raises(SchemaError, match="labels: 11 labels are too many"):
         later.label(PLACES_MM, np.ones(5), np.tile(rest_uT + 100, (5, 1)))
     assert later.presses_n == 22
 
@@ -300,7 +300,7 @@ def test_turned_skin_has_the_same_estimates_on_a_new_day(skin, tmp_path, externa
         later.zero(sign * rest_uT, keep=True).see(sign * changed_uT)
         assert not later.slide.same
         found.append((later.slide.log_odds, *vars(later.estimate(sign * changed_uT)).values()))
-        with pytest.raises(SchemaError, match="from a skin in the other orientation"):
+        with pytest.raises(SchemaError, match="of a skin in the other orientation"):
             later.zero(-sign * rest_uT, keep=True, turned=not turned)
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -198,12 +198,12 @@ def test_onnx_export_of_the_whole_shipped_model_equals_python(tmp_path):
 
 
 def test_failed_export_is_explained_and_writes_no_file(tmp_path, monkeypatch):
-    with pytest.raises(SchemaError, match="no no-load reading: call zero"):
+    with pytest.raises(SchemaError, match="no no-load reading. First call zero"):
         load_universal().export_c(tmp_path / "skin.h")
     model = coarse("unlabelled")
     with pytest.raises(SchemaError, match="14 numbers"):
         model.export_c(tmp_path / "skin.h", np.zeros(14))
-    with pytest.raises(SchemaError, match="1 readings do not show the noise"):
+    with pytest.raises(SchemaError, match="1 readings are too few to estimate the noise"):
         model.export_c(tmp_path / "skin.h", quiet()[:1])
     assert not list(tmp_path.iterdir())
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)

@@ -74,20 +74,24 @@ def read_text(text):
     [
         ("turn_deg: 180", "turn_deg: 45", "chips.1.turn_deg must be 0, 90, 180 or 270; got 45"),
         ("x_mm: 7.0", "x_mm: 0.0", r"chips 0 and 3 are at the same place \(0.0, 0.0\) mm. Correct these settings"),
-        ("x_mm: 7.0", "x_mm: 0.007", "two chips are 0.007 mm apart. Are the positions in mm. Correct these settings"),
+        ("x_mm: 7.0", "x_mm: 0.007", "two chips are 0.007 mm apart, but the smallest distance is 0.5 mm"),
         ("centre_mm: [8.0, 8.0]", "centre_mm: [8.0]", "centre_mm.1 is missing. Add this key"),
         (
             "half_x_mm: 8.0",
             "half_x_mm: 9.8",
-            "half the skin's size is 10; the area must end 0.5 mm or more from the edge",
+            "half the skin's size is 10; the area must end 0.5 mm or more before the edge",
         ),
         ("gap_mm: 1.6", "gap_mm: 0.1", "gap_mm must be greater than or equal to 0.8; got 0.1"),
         ("gap_mm: 1.6", "gap: 1.6", "gap is not a known parameter"),
         ("tip_radius_mm: 2.0", "", "tip_radius_mm is missing"),
-        ("tip_radius_mm: 2.0", "tip_radius_mm: 1.0", "tip_radius_mm is 1, but must be above 1.81 for a skin of 2 mm"),
+        (
+            "tip_radius_mm: 2.0",
+            "tip_radius_mm: 1.0",
+            "tip_radius_mm is 1, but must be above 1.81 for a skin with a thickness of 2 mm",
+        ),
         ("polarity: checkerboard", "polarity: chequer", "skin.polarity must be 'checkerboard' or 'same'; got"),
         ("half_x_mm: 8.0", "half_x_mm: 11.0", "area.half_x_mm is 11, but half the skin's size is 10"),
-        ("force_N: [0.05, 9.5]", "force_N: [5.0, 9.5]", "the largest must be at least twice the least"),
+        ("force_N: [0.05, 9.5]", "force_N: [5.0, 9.5]", "the second value .the largest force. must be at least twice"),
         ("spreads: {}", "spreads: {gap: 1.0}", "gap is not a parameter of the law .* Did you mean gap_mm"),
         ("name: reskin", "name: my board", "name must be"),
         ("chips:", "chips: []\nchips_of_mine:", "chips_of_mine is not a known parameter"),
@@ -104,5 +108,7 @@ def test_wrong_layouts_are_refused(old, new, message, tmp_path):
 def test_missing_layout_files_are_reported(tmp_path):
     with pytest.raises(ParamsError, match="none.yaml: file not found"):
         read_layout(tmp_path / "none.yaml")
-    with pytest.raises(ParamsError, match="reskim: not a YAML file, .*anyskin, eflesh, reskin.*Did you mean reskin"):
+    with pytest.raises(
+        ParamsError, match="reskim: this is neither a YAML file nor .*anyskin, eflesh, reskin.*Did you mean reskin"
+    ):
         read_layout("reskim")

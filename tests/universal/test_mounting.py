@@ -111,7 +111,7 @@ def test_orientation_stated_by_the_user_is_used_and_kept():
     assert model.mounting.turned
     assert "fits the other orientation better" in " ".join(model.warnings)
     assert model.zero(rest_uT, keep=True).mounting.turned
-    with pytest.raises(SchemaError, match="presses to keep are from a skin in the other orientation"):
+    with pytest.raises(SchemaError, match="calibration to keep is of a skin in the other orientation"):
         model.zero(rest_uT, keep=True, turned=False)
     # Without `keep`, the model finds the orientation again from the new no-load reading.
     assert not model.zero(rest_uT).mounting.turned
@@ -184,7 +184,7 @@ def test_warning_names_the_wrong_axes_of_labels(frame):
         assert found.warning() is None
     else:
         assert found.name == frame
-        assert f"if they are {frame}" in found.warning()
+        assert f"if the labelled places are {frame}" in found.warning()
 
 
 @pytest.mark.parametrize(

@@ -114,5 +114,5 @@ def test_mean_of_evenly_spread_presses_determines_the_origin_of_the_places(skin)
 
 def test_covariance_that_is_not_positive_definite_is_refused(skin):
     broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
-    with pytest.raises(SchemaError, match="covariances of its hypotheses are not positive definite"):
+    with pytest.raises(SchemaError, match="covariances of .* hypotheses .places and forces. are not positive definite"):
         _ = broken.evaluator

@@ -148,7 +148,7 @@ def test_boards_without_known_forces_have_only_the_table_of_axes(monkeypatch):
             {"layout": "my_board.yaml"},
             "my_board.yaml is the name of a file, .* Replace the name by the content",
         ),
-        ({"layout": "reskim"}, "reskim: not a YAML file.*Did you mean reskin"),
+        ({"layout": "reskim"}, "reskim: this is neither a YAML file.*Did you mean reskin"),
         ({"skin_mm": [20.0, 20.0]}, "skin_mm cannot be set together with layout"),
         ({"layout": SQUARE | {"gap": 1.0}}, "compare.layout: gap is not a known parameter"),
     ],
