@@ -42,14 +42,14 @@ def pad_of(db_uT: np.ndarray, joint_counts: np.ndarray | None = None) -> Pad:
 # --- External fields ---
 
 
-def test_distance_of_the_magnet_and_size_of_its_field_are_estimated():
+def test_estimated_distance_and_field_of_the_magnet_equal_the_simulated_ones():
     cov = external.covariance(np.array(CHIPS_MM), 100.0, 60.0)
     rng = rng_for(0, "moving hand", "source")
     db_uT = rng.multivariate_normal(np.zeros(15), cov, 2000, method="eigh") + NOISE_uT * rng.standard_normal((2000, 15))
     assert hand.find_source(db_uT, NOISE_uT) == (60.0, 100.0)
 
 
-def test_uniform_field_in_a_turned_board_keeps_its_length():
+def test_uniform_field_has_the_same_length_after_the_board_is_turned():
     changes_uT = to_board(hand.turn(50.0, 3000, rng_for(0, "turn"))).reshape(-1, 5, 3)
     np.testing.assert_allclose(changes_uT, np.repeat(changes_uT[:, :1], 5, axis=1), atol=1e-9)
     # After the turn, the fields have random directions, so their mean is 0 and the mean change is minus the first
@@ -83,7 +83,7 @@ def test_contact_threshold_equals_that_of_the_live_page(external_uT):
 
 @pytest.mark.parametrize("learner", ["ridge", "boosting"])
 @pytest.mark.parametrize("trained_on", [OTHER, FIRST_HALF])
-def test_compensation_removes_fields_that_depend_on_joint_angles(learner, trained_on):
+def test_compensation_by_joint_angles_removes_fields_that_depend_on_them(learner, trained_on):
     rng = rng_for(0, "moving hand", learner)
     slopes = rng.normal(size=15)
     pads = []
@@ -116,7 +116,7 @@ def test_option_for_external_fields_removes_false_contacts_and_keeps_true_ones()
     assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_pct"] == 0
 
 
-def test_groups_that_name_unknown_captures_are_refused():
+def test_groups_with_unknown_captures_or_unequal_numbers_of_them_are_refused():
     pads = {"a": pad_of(np.zeros((10, 15)))}
     group = hand.Group(name="one", threshold=("a",), tested=("b",))
     with pytest.raises(ParamsError, match=r"groups: one: no capture b of layout leaphand in the scene \(it has: a\)"):

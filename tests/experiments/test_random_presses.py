@@ -96,7 +96,7 @@ def test_more_labels_than_presses_are_refused(board):
         label_sets(board, draw, (0, 500))
 
 
-def test_nearest_label_predicts_its_own_reading_exactly(board):
+def test_nearest_label_method_is_exact_for_the_labelled_presses(board):
     scores = score_nearest(board.presses, board.presses)
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1

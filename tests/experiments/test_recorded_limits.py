@@ -100,7 +100,7 @@ def test_fitted_shift_is_the_mean_difference():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 99))
-def test_tested_readings_are_neither_at_known_places_nor_of_unlabelled_presses(draw_i):
+def test_tested_readings_exclude_known_places_and_unlabelled_presses(draw_i):
     board = make_board()
     draw = limits.draw_presses(board, SECTION, 2021, draw_i)
     tested = np.unique(board.press_i[draw.tested])
@@ -155,7 +155,7 @@ def test_registration_removes_an_error_that_is_a_rigid_motion(scores):
         assert row["shift_mm"] == pytest.approx(np.sqrt(5))
 
 
-def test_registration_fitted_to_the_tested_readings_has_the_smallest_error(scores):
+def test_no_registration_has_a_smaller_error_than_one_fitted_to_the_tested_readings(scores):
     """A rigid motion that is fitted to the tested readings themselves gives a lower bound for the squared error."""
     for row in scores:
         if row["known"] in (limits.SHIFT, limits.RIGID):
@@ -164,7 +164,7 @@ def test_registration_fitted_to_the_tested_readings_has_the_smallest_error(score
             assert bound["rigid_limit_mm2"] <= row["mse_xy_mm2"] + 1e-12
 
 
-def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
+def test_universal_model_has_scores_for_each_way_of_using_the_known_presses(scores):
     uses = {limits.UNCHANGED, limits.SHIFT, limits.RIGID, limits.LABELS}
     for presses_n in (0, 20):
         for method in ("universal, boards of the rig", "universal, simulated alone"):
@@ -278,7 +278,7 @@ def test_presses_at_one_place_are_in_the_same_fold():
 
 @settings(deadline=None)
 @given(st.integers(0, 99), st.floats(5, 60))
-def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold_uT):
+def test_reading_exceeds_the_threshold_if_the_needed_field_change_is_exceeded(seed, threshold_uT):
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((4, 15))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -291,7 +291,7 @@ def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold
     assert (np.linalg.norm(just_below, axis=2)[needed_uT > 0] <= threshold_uT).all()
 
 
-def test_needed_field_change_without_noise_equals_the_threshold():
+def test_needed_field_change_equals_the_threshold_if_there_is_no_noise():
     needed_uT = limits.needed_changes_uT(np.eye(15)[:2], np.zeros((1, 15)), 24.0)
     np.testing.assert_allclose(needed_uT, 24.0)
 

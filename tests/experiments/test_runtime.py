@@ -103,7 +103,7 @@ def test_skin_built_with_a_quadrature_equals_the_simulated_skin():
     assert ours.depth_zero_m == drawn.depth_zero_m
 
 
-def test_places_of_pokes_are_relative_to_the_pattern_of_magnets():
+def test_pokes_are_at_fixed_places_relative_to_the_shifted_skin():
     one = trial(skin_seat_mm=1.0)
     assert np.abs(one.skin.seat_m).min() > 0
     places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
@@ -170,7 +170,7 @@ def test_gauss_nodes_integrate_polynomials_exactly():
         assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
 
 
-def test_tabulated_path_of_material_equals_the_computed_flow():
+def test_tabulated_paths_of_material_points_equal_the_computed_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
     path, poke_m, material = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
@@ -226,7 +226,7 @@ def test_finer_quadratures_have_smaller_errors(quadratures):
     assert error_of(rows, "magpylib cuboids", 2, 2) > error_of(rows, "magpylib cuboids", 1, 4)
 
 
-def test_error_of_the_reference_is_a_tenth_of_the_error_limit(quadratures):
+def test_error_of_the_reference_is_below_a_tenth_of_the_error_limit(quadratures):
     rows, _ = quadratures
     assert rows[0].method == REFERENCE
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
@@ -303,7 +303,7 @@ def test_no_rule_is_chosen_if_all_errors_are_above_the_limit():
     assert choice.differs
 
 
-def test_rule_in_use_has_no_error_if_it_was_not_tried():
+def test_error_of_the_quadrature_in_use_is_missing_if_it_was_not_tried():
     assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
 
 

@@ -92,13 +92,13 @@ def test_smallest_resolved_step_does_not_depend_on_the_scale_of_fields(factor):
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
-def test_all_steps_from_the_smallest_resolved_one_on_are_resolved():
+def test_smallest_resolved_step_is_the_one_above_which_all_steps_are_resolved():
     assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
     assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
     assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
 
 
-def test_with_large_noise_no_step_is_resolved():
+def test_no_step_is_resolved_if_the_noise_is_large():
     numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
@@ -188,7 +188,7 @@ def glass(noise_uT):
     return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
 
 
-def test_if_even_the_finest_step_is_resolved_it_is_an_upper_limit():
+def test_table_says_at_most_if_even_the_finest_step_is_resolved():
     table = tables(glass(0.0)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "at most 0.1"
     assert table["ours"][1] == "at most 10"  # A weight of 0.1 N is 10.2 mL of water.

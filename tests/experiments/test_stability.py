@@ -45,7 +45,7 @@ def test_every_case_passes(cases):
     assert failed(cases) == set()
 
 
-def test_rows_are_unique_and_describe_the_outcome(cases):
+def test_each_case_has_one_row_with_expected_and_actual_outcome(cases):
     assert len({(case.area, case.case) for case in cases}) == len(cases)
     assert {case.area for case in cases} == {"time", "physics", "chip", "wire"}
     assert all(case.should and case.happened for case in cases)
@@ -61,7 +61,7 @@ def sliding():
     return sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
 
 
-def test_base_without_damping_is_detected(monkeypatch):
+def test_sliding_cases_detect_a_base_without_damping(monkeypatch):
     monkeypatch.setattr(contact, "_in_series", lambda layer_N_per_m, _: layer_N_per_m[:, None, None] * np.eye(2))
     assert failed(sliding()) == {
         "a drag with friction 10 on a skin that slides",
@@ -69,7 +69,7 @@ def test_base_without_damping_is_detected(monkeypatch):
     }
 
 
-def test_slide_without_rotation_and_linear_depth_are_detected(monkeypatch):
+def test_sliding_cases_detect_a_missing_rotation_and_a_wrong_force_curve(monkeypatch):
     def straight(force_N, *, thickness_m, **kwargs):
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
         return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **kwargs), curve_m)
@@ -87,7 +87,7 @@ def extremes():
     return extreme_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
 
 
-def test_too_short_depth_table_is_detected(monkeypatch):
+def test_depth_table_that_ends_before_the_greatest_depth_is_detected(monkeypatch):
     monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
     at_depth = deformation.at_depth
     monkeypatch.setattr(
@@ -109,12 +109,12 @@ def test_wrong_layer_compliance_is_detected_for_all_tips(monkeypatch):
         one.cache_clear()
 
 
-def test_cells_as_wide_as_the_gap_are_detected(monkeypatch):
+def test_quadrature_with_cells_wider_than_the_gap_is_detected(monkeypatch):
     monkeypatch.setattr(extremes_module, "CELL_SHARE", 1.5)
     assert len(failed(near(DESIGN.skin))) >= 2
 
 
-def test_fixed_stiffening_thickness_is_detected(monkeypatch):
+def test_stiffening_that_ignores_the_thickness_of_the_skin_is_detected(monkeypatch):
     monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
     monkeypatch.setattr(slide, "stiffening", lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3)
     assert failed(extremes()) == {"a skin of 0.2 mm", "a skin of 20 mm"}
@@ -130,7 +130,7 @@ def test_streams_of_other_boards_are_checked(monkeypatch, chips_n, gain_sel):
     assert failed(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
-def test_case_without_the_expected_error_and_nan_fail():
+def test_case_fails_if_the_expected_error_is_not_raised_or_its_value_is_nan():
     def raises():
         raise CaptureError("here: a thing must be so; got nothing. Mend it.")
 
@@ -155,12 +155,12 @@ def test_peak_memory_counts_arrays_that_exist_at_once():
 # Each of the following tests disables one guard of the library. A stability case must detect the missing guard.
 
 
-def test_naive_small_step_quotient_is_detected(monkeypatch):
+def test_formula_that_loses_digits_in_small_time_steps_is_detected(monkeypatch):
     monkeypatch.setattr(aging, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
     assert "dt / tau_min 1e-16" in failed(time_cases())
 
 
-def test_decreasing_time_is_detected(monkeypatch):
+def test_missing_check_for_infinite_time_steps_is_detected(monkeypatch):
     monkeypatch.setattr(aging.np, "isfinite", lambda _: np.True_)
     assert "a time step of inf s" in failed(time_cases())
 
@@ -189,7 +189,7 @@ def test_missing_chip_saturation_is_detected(monkeypatch):
         ("reset_chips", lambda *_: np.zeros(5, bool), "chip 3 lost its settings"),
     ],
 )
-def test_missing_guard_is_detected(monkeypatch, guard, disabled, case):
+def test_chip_cases_detect_that_a_check_for_faults_is_disabled(monkeypatch, guard, disabled, case):
     monkeypatch.setattr(faults, guard, disabled)
     assert any(name.startswith(case) for name in failed(chip_cases(DESIGN.chip, 5, SEED)))
 

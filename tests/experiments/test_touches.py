@@ -87,7 +87,7 @@ def test_residual_is_small_only_for_the_pair_of_places_that_is_touched(split_pad
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_a_place_without_training_rows_is_mistaken_for_two(split_pad):
+def test_touch_of_a_place_that_was_not_in_training_is_taken_for_two_touches(split_pad):
     result = evaluate_detection(*split_pad, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
@@ -126,7 +126,7 @@ def test_unusable_recordings_are_omitted_with_a_reason():
     assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
 
 
-def test_if_all_recordings_are_of_pairs_the_reason_is_reported():
+def test_result_states_why_recordings_of_pairs_alone_cannot_be_used():
     _, double = pad()
     result = sort_recordings(double)
     assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."

@@ -240,7 +240,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     assert [file.name for file in (tmp_path / "skins").iterdir()] == ["zap1.safetensors"]
 
 
-def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  # noqa: F811
+def test_key_a_adapts_the_model_to_presses(tmp_path, random_pokes):  # noqa: F811
     async def act(tab: Tab) -> None:
         await tab.until(
             "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"

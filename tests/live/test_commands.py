@@ -68,7 +68,7 @@ def test_recording_of_an_emulated_board_can_be_marked_as_simulated(tmp_path):
         assert parse((tmp_path / source / HEADER_FILE).read_text(), "header").source == source
 
 
-def test_options_for_wire_format_and_chips_need_a_port(tmp_path):
+def test_options_wire_and_chips_raise_without_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
             commands.record(None, seconds=0.5, out=tmp_path / "run1", **(NO_OPTIONS | options))

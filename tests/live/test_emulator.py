@@ -93,7 +93,7 @@ def test_no_byte_is_lost_while_nobody_reads_from_the_open_port(port):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_script_begins_again_when_the_port_is_reopened(port):
+def test_emulated_board_starts_again_when_its_port_is_reopened(port):
     # When a port is opened, bytes that wait there are discarded, so some of the first frames may be missing.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
@@ -121,7 +121,7 @@ def test_option_speed_multiplies_the_frame_rate_of_the_script(times, speed):
     np.testing.assert_allclose(reader.arrival_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
-def test_reader_that_is_late_gets_at_most_a_tenth_of_a_second_at_once(times):
+def test_reader_that_pauses_then_receives_at_most_a_tenth_of_a_second_at_once(times):
     reader = FakeReader(times, late_i=100, late_s=2.0)
     play(SCRIPT, reader, times)
     late_s = np.array(reader.arrival_s) - SCRIPT.t_s
@@ -130,7 +130,7 @@ def test_reader_that_is_late_gets_at_most_a_tenth_of_a_second_at_once(times):
     assert max(Counter(reader.arrival_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
-def test_link_has_the_same_name_after_unplugging(tmp_path):
+def test_link_to_an_emulated_board_returns_with_its_name_after_unplugging(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = make_port(str(link))
     player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
@@ -146,7 +146,7 @@ def test_link_has_the_same_name_after_unplugging(tmp_path):
     end.unplug()
 
 
-def test_link_that_is_in_use_is_an_error_and_is_not_removed(tmp_path):
+def test_make_port_raises_if_the_link_is_in_use_and_keeps_the_link(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     leads_to = link.readlink()
@@ -187,7 +187,7 @@ def test_invalid_names_of_ports_are_refused(tmp_path):
 
 
 class TestFaults:
-    def test_faults_of_values_change_only_frames_within_their_time(self):
+    def test_faults_that_change_values_change_only_frames_during_the_fault(self):
         for name in (
             "failed-read",
             "chip-reset",
@@ -206,7 +206,7 @@ class TestFaults:
             assert differs[inside].mean() > 0.4, name
             assert [len(piece) for piece in changed.pieces] == [len(piece) for piece in SCRIPT.pieces]
 
-    def test_faults_of_bytes_change_the_number_of_frames(self):
+    def test_faults_that_drop_or_repeat_bytes_change_the_number_of_frames(self):
         def frames_n(name: str) -> int:
             return len(
                 decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
@@ -273,7 +273,7 @@ def test_true_contacts_of_a_capture_are_unknown(tmp_path):
     assert read_script(str(write_script(POKE_SCRIPT, tmp_path / "c0"))).true_contacts is None
 
 
-def test_true_contact_is_that_of_the_last_frame_that_was_sent(times):
+def test_true_contact_belongs_to_the_last_frame_that_was_sent(times):
     true = np.arange(3.0 * len(SCRIPT)).reshape(-1, 3)
     script, found = replace(SCRIPT, true_contacts=true), []
     board = EmulatedBoard(script, SimpleNamespace(name="port"))
@@ -348,7 +348,7 @@ class TestRobot:
         untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
         assert np.abs(untouched[0] - untouched[1]).max() > 50  # The difference is in uT.
 
-    def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
+    def test_options_for_the_nominal_board_raise_for_other_sources(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")
         for options in ({"board": "b1"}, {"robot": True}):
             with pytest.raises(ParamsError, match="only for nominal"):

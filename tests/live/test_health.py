@@ -108,7 +108,7 @@ def test_chip_that_reads_zeros_is_named():
     }
 
 
-def test_repeated_frames_and_jumps_of_the_clock_raise_alarms():
+def test_repeated_frames_and_clock_jumps_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
@@ -151,7 +151,7 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_equal_change_on_all_chips_is_reported_as_an_external_field():
+def test_alarm_for_external_fields_is_raised_if_all_chips_change_equally():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
     health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # This change is too weak to be judged.

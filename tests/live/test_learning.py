@@ -299,7 +299,7 @@ def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
     np.testing.assert_allclose(press.db_uT, 100.0)
 
 
-def test_page_describes_the_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
+def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
     measured = read_measured(MEASURED_FILE)
     noload_uT, b_uT, place_mm, force_N = random_pokes
     shipped = UniversalEstimator(load_universal())

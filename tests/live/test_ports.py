@@ -52,7 +52,7 @@ def test_devices_that_send_other_bytes_are_not_taken_for_boards():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_arbitrary_bytes_are_described_without_an_error(data, size):
+def test_bytes_of_an_unknown_device_are_described_without_an_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     found = find.recognise("port", chunks)
     assert str(found).startswith("port: ")
@@ -70,7 +70,7 @@ def test_frames_with_random_values_are_described_without_an_error(seed, chips_n)
     assert found.describe_rate().startswith("port: ")
 
 
-def test_chips_without_noise_have_no_detectable_step():
+def test_steps_of_chips_are_unknown_if_readings_have_no_noise():
     script = make_script(pokes_n=0)
     without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
     assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
@@ -109,7 +109,7 @@ def test_busy_port_is_an_error_of_one_sentence():
         assert str(find.detect_board(name, 0.1)).startswith(busy)
 
 
-def test_other_device_is_not_a_serial_port():
+def test_opening_a_device_that_is_not_a_serial_port_raises():
     with pytest.raises(CaptureError, match=f"{os.devnull}: cannot open the port: it is not a serial port"):
         find.open_port(os.devnull, find.BAUD)
 
@@ -144,7 +144,7 @@ class TestReplugging:
 
         return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, timeout_s=1.0), printed
 
-    def test_port_of_a_board_that_is_plugged_in_again_is_found(self):
+    def test_board_that_is_plugged_in_again_is_found_at_its_new_port(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
         assert found == "c"  # The board may then have another port.
         assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]

@@ -147,7 +147,7 @@ class connect:
         await self._socket.close()
 
 
-def test_killed_recording_can_be_added(shell, tmp_path):
+def test_recording_of_a_killed_process_can_be_added(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)

@@ -158,7 +158,7 @@ def test_invalid_label_sources_are_refused(labels, gauge, scan, message):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 
-def test_prompted_places_are_in_random_order_by_default():
+def test_places_are_prompted_in_random_order_by_default():
     assert label_source("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
     assert label_source("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
     assert label_source(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"

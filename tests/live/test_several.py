@@ -105,7 +105,7 @@ def skin_at(port: str) -> LiveSkin:
     return skin
 
 
-def test_error_in_the_model_is_raised_to_the_caller():
+def test_error_in_the_model_is_raised_in_the_thread_that_iterates_over_skins():
     failing, working = skin_at("failing"), skin_at("working")
     failing.estimator = FailingModel()
     with LiveSkins([failing, working]) as skins:

@@ -35,7 +35,7 @@ SCRIPT = make_script(pokes_n=2)
 LATE = {"no data", "slower than before: frames are missing"}
 
 
-def test_every_reading_has_time_place_and_force(tmp_path):
+def test_estimates_in_contact_have_the_place_and_force_of_the_poke(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
     unread_n = 1000  # At most this number of frames is discarded if the pseudo-terminal is opened late.
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -66,7 +66,7 @@ def test_estimates_of_several_models_are_averaged_with_a_standard_deviation(tmp_
     assert touched.sd_F_N == pytest.approx(0.0, abs=0.01)
 
 
-def test_caller_that_is_slow_gets_the_latest_reading(tmp_path):
+def test_slow_caller_receives_the_latest_reading(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
@@ -148,7 +148,7 @@ def test_no_load_reading_waits_until_the_skin_is_not_touched():
     assert not play_to_skin(moving)[0].zeroed
 
 
-def test_zero_called_in_another_thread_restarts_the_no_load_reading():
+def test_no_load_reading_restarts_if_another_thread_calls_zero():
     class ZeroingList(list):
         def append(self, frames):  # This function runs between two statements of the thread that reads the port.
             super().append(frames)

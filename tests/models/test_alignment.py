@@ -63,7 +63,7 @@ def test_direct_standardisation_recovers_a_linear_map():
     np.testing.assert_allclose(direct(SOURCE, SOURCE @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_direct_standardisation_keeps_directions_without_pairs():
+def test_direct_standardisation_does_not_change_channels_that_no_pair_covers():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)

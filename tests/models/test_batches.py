@@ -33,7 +33,7 @@ def test_every_step_has_a_batch_for_each_term():
         }
 
 
-def test_terms_without_data_get_no_batches():
+def test_batches_have_no_arrays_for_loss_terms_without_data():
     assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 

@@ -181,7 +181,7 @@ def test_predictions_scale_with_the_unit_of_the_targets(method, seed, power):
 
 @every_method
 @pytest.mark.parametrize("shift_mm", [-500.0, 3.0, 40.0])
-def test_predictions_shift_with_the_places_of_the_targets(method, shift_mm):
+def test_shifting_the_training_places_shifts_the_predictions(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
     # Places are rounded to multiples of 1/64 mm, so that they are exact after the shift.

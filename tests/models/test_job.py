@@ -57,14 +57,14 @@ def test_adaptation_ignores_places_and_forces_of_the_new_skin(rows, new):
     assert (once.predicted == blind.predicted).all()
 
 
-def test_adaptation_ignores_the_names_of_skins_of_its_pokes():
+def test_adaptation_ignores_to_which_skin_its_unlabelled_pokes_belong():
     assert equal_results(
         train_job(adaptation(), example_data()),
         train_job(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0")),
     )
 
 
-def test_adaptation_depends_on_field_changes_and_order_of_the_pokes_on_lines():
+def test_adaptation_depends_on_the_fields_and_the_order_of_the_unlabelled_pokes():
     once, along = train_job(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
     assert not equal_results(once, train_job(adaptation(along=backwards), example_data()))
@@ -72,7 +72,7 @@ def test_adaptation_depends_on_field_changes_and_order_of_the_pokes_on_lines():
     assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
-def test_lines_contain_no_places_and_no_forces():
+def test_lines_of_unlabelled_pokes_contain_no_places_and_no_forces():
     assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
 
 
@@ -115,7 +115,7 @@ def test_fine_tuning_uses_only_the_given_labels_of_the_new_skin():
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
-def test_test_rows_do_not_change_the_trained_network(scaling, view):
+def test_trained_network_does_not_depend_on_test_rows(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
     once = train_job(job, example_data())
     planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
@@ -181,7 +181,7 @@ def test_adaptation_and_control_have_equal_batches():
 
 
 @pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
-def test_folds_and_seeds_have_different_batches(changes):
+def test_jobs_of_other_folds_or_seeds_have_other_weights_and_batches(changes):
     other = replace(pooled(), **changes)
     assert (
         prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
@@ -225,13 +225,13 @@ OTHER_ROWS = {
 
 
 @pytest.mark.parametrize("what", sorted(INFLUENTIAL_ROWS))
-def test_cache_key_changes_with_rows_that_influence_the_result(what):
+def test_cache_key_changes_if_a_row_that_influences_the_result_changes(what):
     kind, rows = INFLUENTIAL_ROWS[what]
     assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
 
 
 @pytest.mark.parametrize("what", sorted(OTHER_ROWS))
-def test_cache_key_ignores_rows_without_influence(what):
+def test_cache_key_is_unchanged_if_a_row_without_influence_changes(what):
     kind, rows = OTHER_ROWS[what]
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
@@ -261,7 +261,7 @@ def test_different_settings_have_different_cache_keys():
     assert len({key(job) for job in jobs}) == len(jobs)
 
 
-def test_restart_after_collapse_has_other_weights_and_batches():
+def test_training_is_restarted_after_a_collapse_with_other_weights_and_batches():
     """If a training run collapses to a constant output, it is repeated with other random numbers."""
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
@@ -271,7 +271,7 @@ def test_restart_after_collapse_has_other_weights_and_batches():
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
-def test_initial_bias_of_the_output_layer_is_the_mean_target(scaling):
+def test_initial_bias_of_the_output_layer_predicts_the_mean_target(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = with_values(example_data(), "target", np.arange(3), np.nan)
     prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))
@@ -308,14 +308,14 @@ def test_cache_key_ignores_the_names_of_experiment_and_recipe():
     assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
-def test_cache_key_ignores_rows_that_the_job_does_not_use():
+def test_cache_key_is_unchanged_if_rows_that_the_job_does_not_use_are_removed():
     rows = example_data()
     fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
-def test_data_digest_depends_on_the_skin_of_each_row():
+def test_data_digest_changes_if_rows_belong_to_other_skins():
     rows = example_data()
     other = replace(rows, skin=np.roll(rows.skin, 1))
     assert JobKeys(rows).data_digest() != JobKeys(other).data_digest()

@@ -99,7 +99,7 @@ def test_result_of_a_job_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
-def test_each_set_of_rows_is_sent_to_workers_once(tmp_path, monkeypatch):
+def test_each_set_of_rows_is_written_once_for_all_workers(tmp_path, monkeypatch):
     sent, written = [], []
     here, write = InlineExecutor(), io.write_tensors
     monkeypatch.setattr(
@@ -179,7 +179,7 @@ def test_finished_jobs_are_read_from_the_cache(tmp_path):
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_additional_job_trains_only_its_stack(tmp_path, more, trained_n):
+def test_adding_a_job_trains_only_the_stack_of_the_new_job(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
@@ -207,7 +207,7 @@ def test_different_jobs_with_the_same_name_are_both_trained(tmp_path):
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
-def test_cache_has_no_files_in_subfolders(tmp_path):
+def test_results_are_written_directly_to_the_folder_of_the_cache(tmp_path):
     run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 

@@ -182,7 +182,7 @@ def test_points_of_the_loss_curve_are_evenly_spaced_up_to_the_last_step(steps_n)
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 1), (1, 16), (3, 16), (17, 1), (32, 100)])
-def test_any_number_of_rows_trains_in_any_batch(n, batch_n):
+def test_training_works_for_any_number_of_rows_and_any_batch_size(n, batch_n):
     (outcome,) = run([some_job(n=n)], recipe(steps_n=3, batch_n=batch_n))
     assert np.isfinite(outcome.curve).all()
     assert outcome.stopped_step is None

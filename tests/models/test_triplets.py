@@ -91,7 +91,7 @@ def test_error_names_the_group_whose_points_are_all_at_one_place():
         triplet_points(place, skins)
 
 
-def test_places_may_differ_along_one_axis_only():
+def test_triplets_are_possible_if_places_differ_along_one_axis_only():
     assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
@@ -108,7 +108,7 @@ def test_group_without_an_anchor_is_refused():
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
-def test_possible_anchors_equal_those_of_a_double_loop(places):
+def test_points_that_can_be_anchors_equal_those_found_by_a_double_loop(places):
     expected = [
         len({(x - u) ** 2 + (y - v) ** 2 for j, (u, v) in enumerate(places) if j != i}) > 1
         for i, (x, y) in enumerate(places)

@@ -51,7 +51,7 @@ def test_field_outside_equals_magpylib_sphere(mu_r):
 
 
 @given(MU_R)
-def test_normal_b_and_tangential_h_are_continuous_on_the_surface_of_the_ball(mu_r):
+def test_fields_satisfy_the_boundary_conditions_on_the_surface_of_the_ball(mu_r):
     observers_m = on_sphere(RADIUS_M)
     normal = outward(observers_m)
     outside_T, inside_T = B_T + field(observers_m, mu_r=mu_r), 3 * mu_r / (mu_r + 2) * B_T
@@ -115,6 +115,6 @@ def test_random_directions_are_uniform_unit_vectors():
     np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.012)
 
 
-def test_earth_field_has_its_magnitude_and_dip():
+def test_earth_field_has_the_given_magnitude_and_points_down():
     assert np.linalg.norm(EARTH_T) == pytest.approx(EARTH_SIZE_T)
     assert EARTH_T[2] < 0 < EARTH_T[0]

@@ -134,7 +134,7 @@ def test_array_with_more_than_64_chips_is_refused():
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_drawn_gaps_are_positive():
+def test_gaps_drawn_with_large_spreads_are_positive():
     wide = spreads(board_gap=0.5, board_uneven=0.5)
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])

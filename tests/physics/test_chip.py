@@ -82,7 +82,7 @@ def test_readings_are_whole_numbers_of_steps():
     np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)
 
 
-def test_saturation_depends_on_the_field_without_the_offset():
+def test_chip_saturates_by_the_field_without_its_offset():
     _, overruns = read([0, 0, 49.9e-3], board(offset_T=200e-6))
     assert overruns.clipped_n == 0
     assert read([0, 0, 49.9e-3], board(gain=1.1))[1].clipped_n == 1
@@ -108,7 +108,7 @@ phases_s = st.floats(0, CONVERSION_S)
 
 
 @given(rates_hz, phases_s)
-def test_frame_contains_the_last_conversion_that_is_finished(rate_hz, phase_s):
+def test_frame_contains_the_last_conversion_that_ended_before_the_frame(rate_hz, phase_s):
     frame_s = (1 + np.arange(40)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)

@@ -80,7 +80,7 @@ def test_field_of_the_array_equals_the_specification():
     assert 0.38 < np.median(size_T) < 0.65
 
 
-def test_place_outside_the_slab_is_refused():
+def test_field_of_the_array_raises_for_a_place_outside_the_slab():
     with pytest.raises(ParamsError, match="places must be inside the slab"):
         magnet.array_field(np.array([[0.0, 0.0, 2.1e-3]]), THICKNESS_M, "same")
 

@@ -189,7 +189,7 @@ def test_shear_stress_at_the_surface_equals_the_traction():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(2e-3, H_M)])
-def test_every_horizontal_plane_carries_the_force(traction):
+def test_shear_stress_on_every_horizontal_plane_sums_to_the_applied_force(traction):
     r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
     for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
@@ -333,7 +333,7 @@ def test_skin_moves_with_the_tip_and_rotates_forward():
     assert not middle.half_curl[:, [0, 2]].any()
 
 
-def test_base_and_far_nodes_do_not_move():
+def test_nodes_at_the_base_and_far_from_the_contact_do_not_move():
     base = displace([0.5, 0.3], random_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
     assert base.half_curl.any()  # The material at the base shears, and therefore rotates, although it does not move.
@@ -441,7 +441,7 @@ def test_displacement_of_already_moved_nodes_rotates_with_the_force():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
-def test_steepest_gradient_of_the_table_is_that_of_its_places(traction):
+def test_stored_steepest_gradient_is_the_largest_gradient_in_the_table(traction):
     table, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)

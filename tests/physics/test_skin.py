@@ -150,7 +150,7 @@ def test_field_change_equals_the_difference_of_two_fields():
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_stability_cases_hold_for_extreme_skins_and_pokes(base):
+def test_field_changes_are_finite_and_consistent_for_extreme_skins_and_pokes(base):
     usual, again, renamed = (skin(UNEVEN, name, base=base) for name in ("s7", "s7", "s8"))
     soft, hard = (skin(UNEVEN, "s7", base=base, modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))
     bare, strong = (skin(UNEVEN, "s7", base=base, saturation_T=times * 0.11) for times in (0, 5))
@@ -181,7 +181,7 @@ def test_tip_above_a_thin_skin_changes_nothing():
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
-def test_shifting_skin_or_poke_and_board_is_equivalent():
+def test_shifting_the_skin_equals_shifting_poke_and_board_in_the_opposite_direction():
     # Shifting the skin is equivalent to shifting the poke and the chips in the opposite direction.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
@@ -193,7 +193,7 @@ def test_shifting_skin_or_poke_and_board_is_equivalent():
     assert np.abs(found - change((2e-3, 1e-3, DEPTH_M))).max() > 1e-3 * PEAK_T
 
 
-def test_wider_skin_changes_nothing_far_from_its_edges():
+def test_field_change_far_from_the_edges_does_not_depend_on_the_width_of_the_skin():
     # Both numbers of magnets, 8 and 12, are even. Therefore the same poles are over the chips, which are at least 25 mm
     # away from the edges.
     wide, wider = (
@@ -208,7 +208,7 @@ def test_wider_skin_changes_nothing_far_from_its_edges():
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
 
-def test_pokes_up_to_the_edges_of_the_skin_are_accepted():
+def test_poke_inside_the_edges_is_accepted_and_outside_raises():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):
@@ -332,7 +332,7 @@ def held_skin(spread=UNEVEN, **changes):
     return skin(spread, base="slipping", hold=HELD | changes)
 
 
-def test_skin_held_by_springs_slides_as_a_rigid_body():
+def test_skin_held_by_springs_slides_as_a_rigid_body_up_to_the_friction_limit():
     one, free = skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=30), skin(UNEVEN, base="slipping")
     poke_m = np.array([[3e-3, -2e-3, 0.7e-3]])
     [(_, _, free_m)] = moved_dipoles(free, poke_m)
@@ -369,7 +369,7 @@ def test_bonded_skin_held_by_springs_is_refused():
         skin(base="bonded", hold=HELD)
 
 
-def test_rotated_skin_equals_a_board_rotated_in_the_opposite_direction():
+def test_rotating_the_skin_equals_rotating_the_board_in_the_opposite_direction():
     rotated = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
     first = skin(base="slipping").nodes_m
     angle = np.arctan2(rotated.nodes_m[0, 1], rotated.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])

@@ -61,14 +61,14 @@ def test_pull_at_the_edge_of_a_square_moves_and_rotates_it_as_in_the_closed_form
 
 
 @given(places_m, displacements_m)
-def test_motion_has_the_given_displacement_at_the_place(place_m, taken_m):
+def test_rigid_motion_has_the_given_displacement_at_the_pressed_place(place_m, taken_m):
     move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
 @given(places_m, displacements_m)
-def test_motion_rotates_with_pull_and_place(place_m, taken_m):
+def test_rotating_pull_and_place_rotates_the_rigid_motion(place_m, taken_m):
     """A pull along the line through the middle causes no rotation."""
     (move_m, spin_rad), quarter = motion_of(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = motion_of(quarter @ place_m, quarter @ taken_m)
@@ -114,7 +114,7 @@ def test_friction_limits_the_slide(place_m, taken_m, force_N):
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
 
 
-def test_firm_press_moves_the_skin_by_the_full_displacement():
+def test_friction_allows_no_slide_at_zero_force_and_the_full_slide_at_a_large_one():
     whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
         found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)

@@ -140,7 +140,7 @@ def test_contacts_that_are_longer_than_the_pauses_determine_the_offset() -> None
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
 
 
-def test_part_of_a_stream_suffices_if_travel_times_are_irregular() -> None:
+def test_offset_is_found_from_a_part_of_the_stream_if_travel_times_are_irregular() -> None:
     log, truth = log_of(100, 0.2), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
@@ -163,7 +163,7 @@ def test_stream_of_a_periodic_protocol_is_refused_because_several_offsets_fit(pa
     lost=st.floats(0, 0.3),
     indentations_n=st.integers(15, 60),
 )
-def test_offset_found_from_incomplete_data_is_correct_or_refused(
+def test_offset_from_incomplete_data_is_either_correct_or_an_error_is_raised(
     faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
 ) -> None:
     log, truth = log_of(indentations_n, 0.25, travel_s), clock_map(7.0)

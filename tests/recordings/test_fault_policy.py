@@ -102,7 +102,7 @@ def test_chip_with_power_on_settings_is_refused_or_flagged():
     assert 1.0 <= log.records["chip_reset"].first <= 3.0
 
 
-def test_fault_without_a_time_does_not_change_the_span_of_its_kind():
+def test_fault_at_an_unknown_time_does_not_change_first_and_last_time_of_its_kind():
     mask, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
     log = FaultLog(DEFAULT_POLICY, "x", "ms")
     for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
@@ -204,7 +204,7 @@ def noisy_fields_uT(rows_n: int) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(failed=st.sets(st.tuples(st.integers(0, 49), st.integers(0, CHIPS_N - 1))))
-def test_row_is_valid_if_no_chip_has_failed(failed: set[tuple[int, int]]) -> None:
+def test_rows_are_kept_except_those_in_which_a_chip_has_failed(failed: set[tuple[int, int]]) -> None:
     b_uT, temperature_degC = noisy_fields_uT(50), np.full((50, CHIPS_N), 25.0)
     for row_i, chip_i in failed:
         b_uT[row_i, 3 * chip_i : 3 * chip_i + 3] = faults.FAILED_B_uT

@@ -207,7 +207,7 @@ def test_dropped_frames_are_counted_by_reason() -> None:
     assert rows["reading_i"].tolist() == [0, 1]
 
 
-def test_readings_are_released_when_the_next_indentation_begins() -> None:
+def test_readings_of_an_indentation_are_returned_when_the_next_one_begins() -> None:
     log = log_of([[(2, 6), (2, 6)]] * 50)
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)

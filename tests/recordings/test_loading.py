@@ -164,7 +164,7 @@ def test_error_for_another_file_names_the_file(tmp_path):
         reskin.load_recording(stream / STREAM_FILE)
 
 
-def test_layout_that_is_needed_is_named_in_the_error(shared_data):
+def test_error_for_a_recording_of_another_layout_names_the_layout_and_reskin_add(shared_data):
     for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
         with pytest.raises(ReskinError, match=f"This is layout {layout}: run `reskin add`"):
             reskin.load_recording(shared_data / name)

@@ -116,7 +116,7 @@ def test_protocol_counts_the_data_for_training_and_for_tests():
     assert counts["lobo"]["trained_on_rows_n"] == cards[0]["train_rows_n"]
 
 
-def test_missing_experiment_has_no_numbers():
+def test_numbers_contain_only_the_experiments_that_were_run():
     assert numbers([]) == {"variants": {}}
     assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "protocol", "variants"}
     without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
@@ -128,7 +128,7 @@ def test_missing_experiment_has_no_numbers():
     assert "null" not in json.dumps(numbers())
 
 
-def test_networks_with_other_recipes_are_counted_only_as_variants():
+def test_scores_of_networks_with_other_recipes_are_only_in_the_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
@@ -214,7 +214,7 @@ def gains(contrast: dict) -> dict[str, float]:
     return {board: metrics["accuracy_pct"] for board, metrics in contrast["by_board"].items()}
 
 
-def test_contrasts_of_pokes_are_the_gain_and_its_rest_at_large_numbers():
+def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
     found = contrasts_of_pokes(
         tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
     )
@@ -226,7 +226,7 @@ def test_contrasts_of_pokes_are_the_gain_and_its_rest_at_large_numbers():
     assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
-def test_contrasts_beyond_the_counts_of_a_sweep_are_missing():
+def test_contrasts_at_counts_that_the_sweep_does_not_contain_are_missing():
     found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
@@ -238,7 +238,7 @@ def test_contrasts_beyond_the_counts_of_a_sweep_are_missing():
     }  # fmt: skip
 
 
-def test_contrasts_of_sensors_compare_methods_and_gains():
+def test_contrasts_of_sensors_are_differences_between_methods_and_numbers_of_skins():
     scores = {
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},

@@ -51,7 +51,7 @@ def test_numbers_contain_no_commit_machine_or_times():
     assert numbers["runtime"]["quadratures"][0] == STUDY
 
 
-def test_joining_split_results_gives_them_back():
+def test_results_that_are_split_and_joined_are_unchanged():
     numbers = run(1.0)
     before = copy.deepcopy(numbers)
     assert join(*split(numbers)) == before

@@ -174,7 +174,7 @@ def test_first_section_answers_questions_on_place_and_force(read):
     ]
 
 
-def test_levels_of_headings_are_in_order(read):
+def test_no_level_of_headings_is_skipped(read):
     levels = [int(tag[1]) for tag, _, _ in read.elements if re.fullmatch(r"h[1-6]", tag)]
     assert levels[0] == 1
     assert levels.count(1) == 1
@@ -260,7 +260,7 @@ def test_section_about_the_scene_lists_counts():
     assert about(numbers).endswith("Main captures: 1, with 2,000 readings.")
 
 
-def test_results_with_verdicts_come_first():
+def test_results_with_a_verdict_come_first_in_the_comparison_with_the_paper():
     table, section = checklist(all_experiments()), next(one for one in read_sections() if one.key == "skins")
     shown = beside_paper(section, table)
     assert 0 < len(shown.rows) <= BESIDE_N
@@ -269,7 +269,7 @@ def test_results_with_verdicts_come_first():
     assert judged == sorted(judged, reverse=True)
 
 
-def test_results_that_cannot_be_compared_are_omitted():
+def test_comparison_with_the_paper_omits_results_that_cannot_be_compared():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
     (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "smaller than the paper's: 8,000 contacts"}])).rows
@@ -290,7 +290,7 @@ def test_page_begins_with_the_scene(read):
     assert place < read.words.index(read_sections()[0].title)
 
 
-def test_tables_that_belong_to_no_section_are_shown_with_their_texts_escaped(read):
+def test_page_shows_and_escapes_tables_that_belong_to_no_section(read):
     assert "Surprise" in read.words
     assert "<b>" in read.words  # The tag is shown as text, and not interpreted.
     assert "a & b" in read.words
@@ -362,7 +362,7 @@ def luminance(colour: str) -> float:
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def test_contrast_of_colours_meets_wcag():
+def test_contrast_of_colours_meets_the_guidelines_of_wcag():
     text = render()
     light, dark, printed = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
     for theme in (light, light | dark, light | printed, light | dark | printed):
@@ -435,7 +435,7 @@ def test_index_links_to_tables_and_figures_of_the_paper():
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
-def test_first_sentence_about_each_scene_describes_it(file):
+def test_description_of_each_scene_begins_with_a_short_sentence(file):
     about = about_scene(file.read_text(encoding="utf-8"))
     assert about[0].isupper()
     assert not about.startswith("Scene")

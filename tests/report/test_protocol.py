@@ -28,5 +28,5 @@ def test_count_of_one_is_followed_by_a_singular():
     assert "first 1 pass, tested on 1 pass after every 2 passes; 1 network per policy" in one.ours
 
 
-def test_each_protocol_belongs_to_a_section_of_the_page():
+def test_page_has_a_section_for_each_protocol():
     assert {one.section for one in protocols(all_experiments())} <= {section.key for section in read_sections()}

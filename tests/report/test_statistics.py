@@ -264,7 +264,7 @@ def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
         ([-9.0, 9.0], UNDECIDED),
     ],
 )
-def test_verdict_within_limits_depends_on_the_whole_interval(ends, expected):
+def test_verdict_on_equivalence_depends_on_the_whole_interval(ends, expected):
     assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == expected
 
 
@@ -304,7 +304,7 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_interval_of_the_difference_includes_the_spread_over_training_skins():
+def test_interval_of_a_difference_is_wider_if_the_gain_depends_on_the_training_skin():
     boards = [f"b{i}" for i in range(4)]
     equal_gains = transfer_scores(
         {fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")}
@@ -394,7 +394,7 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
             assert stat["values"] == pytest.approx(means)
 
 
-def test_draws_of_one_board_are_averaged():
+def test_scores_of_several_draws_are_averaged_within_each_board():
     cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
     assert over_boards(tidy(cards)) == over_boards(tidy(adapted_cards()))
     alone = over_boards(tidy([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
@@ -403,7 +403,7 @@ def test_draws_of_one_board_are_averaged():
     assert alone["sd_seeds"] > 0
 
 
-def test_transfer_scores_count_pairs_of_training_and_test_skins():
+def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins():
     rng = rng_for(0, "transfer")
     tested = [f"b{i}" for i in range(1, 5)]
     boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
@@ -424,7 +424,7 @@ def test_transfer_scores_count_pairs_of_training_and_test_skins():
     assert stat["ci95"][0] > 0
 
 
-def test_experiments_transfer_and_lobo_have_equal_test_rows():
+def test_experiment_transfer_tests_each_skin_on_the_same_rows_as_experiment_lobo():
     split = Split(transfer_skins_n=3, pool_passes_n=2)
     table = six_by_three_in_passes(5)
     many = {skin: fold for fold in draw_folds(table, ["lobo"], split, 0) for skin in np.unique(table.skin[fold.test])}
@@ -440,7 +440,7 @@ TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collaps
 
 
 @given(TRAININGS)
-def test_every_attempt_of_a_training_is_counted(done):
+def test_trainings_that_were_repeated_are_counted_with_all_their_attempts(done):
     attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),

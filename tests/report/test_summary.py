@@ -49,7 +49,7 @@ def test_final_model_of_recorded_boards_is_named():
         assert (model["file"] in lines[-1]) is named
 
 
-def test_methods_with_labels_are_shown_with_the_fewest_and_the_most():
+def test_summary_shows_methods_with_the_fewest_and_the_most_labels():
     def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
         scores = {"accuracy_pct": {"mean": accuracy_pct}, "r2_f": {"mean": accuracy_pct / 100}}
         return {"method": method, "inputs": "raw", "labels_n": labels_n, "as_labelled": scores}

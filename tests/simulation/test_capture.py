@@ -141,7 +141,7 @@ def sleeve(**changes):
     return with_protocol("sleeve", SCATTER, boards=SECTIONS["boards"] | {"sleeve": SLEEVE}, **changes)
 
 
-def test_scattered_pokes_are_at_their_labels():
+def test_fields_of_scattered_pokes_are_those_at_the_labelled_places():
     scene = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
     one = capture_of(scene, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([labels_in_contact(one, "x_mm"), labels_in_contact(one, "y_mm")]).astype(float)
@@ -211,7 +211,7 @@ def test_relaxation_lowers_only_the_force(capture):
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
 
-def test_warming_is_read_by_chips_and_weakens_the_field(capture):
+def test_warming_raises_chip_temperatures_and_weakens_the_field(capture):
     warm = capture_of(aged_capture(temperature=TEMPERATURE))
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
@@ -241,7 +241,7 @@ def test_captures_do_not_depend_on_the_order_in_which_they_are_simulated():
     ]
 
 
-def test_skins_of_a_board_have_the_same_chips_and_different_fields(capture):
+def test_skins_of_one_board_have_different_fields(capture):
     other = capture_of(skin="b0_s1")
     # The limit is six standard deviations of the noise.
     assert not np.allclose(frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20)

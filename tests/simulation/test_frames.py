@@ -50,7 +50,7 @@ def test_repeated_conversions_repeat_their_noise():
     assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # A conversion takes 1.84 ms, and a frame 1 ms.
 
 
-def test_chip_reads_the_field_at_the_time_of_its_conversion():
+def test_chip_reads_the_field_of_an_earlier_time_because_conversion_takes_time():
     one = response()
     ramp = one.change_T[:, 0].copy()
     frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))

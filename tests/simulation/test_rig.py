@@ -35,7 +35,7 @@ def plan(protocol=None):
 DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
 
 
-def test_timeline_of_an_indentation_has_its_phases_in_order():
+def test_timeline_of_an_indentation_is_rest_approach_contact_and_retraction():
     frames = timeline(rig(), 1)
     np.testing.assert_allclose(frames.share, [0] * 5 + [1 / 3, 2 / 3] + [1] * 4 + [2 / 3, 1 / 3])
     assert frames.noload_i == 1
@@ -89,7 +89,7 @@ def test_log_has_every_stop_of_a_line():
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 
 
-def test_robot_misses_places_by_the_given_spread():
+def test_position_errors_of_the_robot_have_the_given_standard_deviations():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))

@@ -51,7 +51,7 @@ def test_protocol_without_optional_terms_computes_none_of_them():
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_each_term_calls_only_the_functions_that_it_needs(term):
+def test_each_physics_term_calls_only_the_functions_that_it_needs(term):
     run = functions_run(scene_with(term)) & TERM_FUNCTIONS
     assert run
     assert run <= TERMS[term][1]

@@ -58,7 +58,7 @@ def names(chosen: dict[str, Any]) -> dict[str, str]:
     return {stage: one["recipe_name"] for stage, one in chosen.items()}
 
 
-def test_smallest_place_error_is_chosen_with_the_base_of_adaptation():
+def test_settings_with_the_smallest_place_error_are_chosen():
     chosen = choose(CARDS)
     assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
     assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
@@ -130,7 +130,7 @@ def test_networks_with_other_inputs_or_experiments_are_not_candidates(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
-def test_steps_and_base_are_not_settings():
+def test_chosen_settings_exclude_the_number_of_steps_and_the_base_network():
     for one in choose(CARDS).values():
         assert "steps_n" not in one["settings"]
         assert "base" not in one["settings"]
@@ -169,7 +169,7 @@ def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
 
 
-def test_candidates_must_have_the_same_number_of_steps():
+def test_choice_raises_if_candidates_differ_in_the_number_of_steps():
     slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]

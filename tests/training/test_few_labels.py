@@ -121,12 +121,12 @@ def test_there_is_one_entry_per_method_fold_and_number_of_labels():
     assert entry == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
 
 
-def test_names_of_jobs_are_unique():
+def test_all_jobs_of_the_study_have_different_names():
     names = [one.name for _, one in all_entries(STUDY, NETWORKS)]
     assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
 
 
-def test_entries_of_a_fold_have_the_same_test_and_training_rows():
+def test_all_entries_of_a_fold_have_its_test_and_training_rows():
     for entry, one in all_entries(STUDY, NETWORKS):
         assert (one.test == entry.fold.test).all()
         assert (one.train == entry.fold.train).all()
@@ -228,7 +228,7 @@ def test_fine_tuning_starts_from_the_network_of_its_fold():
         assert (base.method, base.inputs, base.fold, base.labels_n) == (entry.method, entry.inputs, entry.fold, 0)
 
 
-def test_only_listed_networks_are_adapted():
+def test_only_networks_listed_in_the_settings_are_adapted():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
         # All rows of the pool are on a line, because each of the 8 places on the 3 x 3 grid has a neighbour.

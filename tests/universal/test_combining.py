@@ -25,7 +25,7 @@ def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: fl
     return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network, prior_line())
 
 
-def test_mean_place_of_evenly_spread_presses_is_zero_and_labels_reduce_this_shift():
+def test_shift_to_the_middle_of_evenly_spread_presses_is_reduced_by_labels():
     """The first result is the shift that moves the mean place to the middle of the skin.
 
     Labels make this shift smaller.
@@ -70,7 +70,7 @@ def test_lower_likelihood_power_widens_intervals_without_changing_estimates(skin
     assert (lower.sd_mm > full.sd_mm).all()
 
 
-def test_shifted_places_are_moved_back_onto_the_area_of_the_grid():
+def test_shift_that_moves_places_back_onto_the_grid_area_is_found():
     octagon_mm = RNG.uniform(-8, 8, (2000, 2))
     octagon_mm = octagon_mm[inside(octagon_mm)]
     errors = []
@@ -87,7 +87,7 @@ def test_shifted_places_are_moved_back_onto_the_area_of_the_grid():
     assert rms_mm < 0.8 * mean_mm
 
 
-def test_shift_of_the_map_moves_all_estimated_places(skin):
+def test_shifting_the_map_shifts_all_estimated_places(skin):
     place_mm, by_mm = np.array([[3.0, 2.0], [-4.0, 1.0], [0.0, -3.0]]), np.array([0.3, -0.2])
     db_uT = fields_uT(place_mm, np.full(3, 2.0))
     before = skin.evaluator.estimate(db_uT)

@@ -116,7 +116,7 @@ def test_suppressor_removes_uniform_fields_given_along_the_axes_of_the_chips():
     assert np.linalg.norm(shrunk_uT, axis=1).max() < 2 * 4.0
 
 
-def test_single_precision_suffices_for_the_largest_field():
+def test_chi2_in_single_precision_is_accurate_for_the_largest_external_field():
     """chi^2 for the largest external field equals chi^2 in double precision, up to 0.1 or 1 %."""
     model, b_uT = nominal(EXTERNAL_MAX_uT)
     db_uT, skin = to_board(b_uT - model.noload_uT), model.skin

@@ -198,13 +198,13 @@ def test_warning_names_the_wrong_axes_of_labels(frame):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
-def test_each_wrong_choice_of_axes_has_its_name(given, name):
+def test_wrong_axes_of_labels_are_found_and_named(given, name):
     estimate = Estimate(PLACES_MM, np.full((4, 2), 0.6), np.ones(4), np.ones(4), np.full(4, np.nan))
     found = find_label_frame(estimate, np.array([given(*place_mm) for place_mm in PLACES_MM]))
     assert found.name == name
 
 
-def test_frames_are_all_symmetries_of_a_square():
+def test_possible_label_axes_are_the_eight_symmetries_of_a_square():
     matrices = np.array([*frames().values()])
     np.testing.assert_array_equal(matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(2), (8, 1, 1)))
     assert len(np.unique(matrices.reshape(8, 4), axis=0)) == 8

@@ -21,7 +21,7 @@ def test_order_of_presses_does_not_matter():
     assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
 
-def test_masked_press_is_ignored():
+def test_network_ignores_masked_presses():
     network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
     presses = torch.from_numpy(PRESSES_uT[None].astype(np.float32))
     kept = (torch.arange(20) < 5).float()[None]
@@ -40,7 +40,7 @@ def test_inputs_are_the_direction_and_the_log_length_of_field_changes():
     torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
 
 
-def test_disagreement_of_networks_adds_to_the_variance():
+def test_variance_of_several_networks_includes_their_disagreement():
     one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
     both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
     np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
@@ -49,7 +49,7 @@ def test_disagreement_of_networks_adds_to_the_variance():
 
 
 @pytest.mark.parametrize("chips_n", [1, 5])
-def test_weights_fit_any_number_of_chips(chips_n):
+def test_network_can_be_built_for_any_number_of_chips(chips_n):
     weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
     assert predict(
         [weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], PRESSES_uT[:, : 3 * chips_n]

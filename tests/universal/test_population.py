@@ -44,7 +44,7 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
 
-def test_parameters_have_the_given_spreads_and_bounds():
+def test_drawn_parameters_have_the_given_spreads_and_bounds():
     rng = rng_for(1, "laws")
     laws = [draw_law(NOMINAL, NOMINAL_SPREADS, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):

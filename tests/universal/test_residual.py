@@ -16,7 +16,7 @@ ERRORS = rng_for(0, "missed").standard_normal((3, 15))
 
 
 @pytest.mark.parametrize("boards_n", [1, 2, 5])
-def test_prediction_from_boards_with_equal_errors_is_the_shared_part(boards_n):
+def test_errors_that_all_boards_share_are_predicted_for_a_new_board(boards_n):
     found = fit_residual([APART_MM] * boards_n, [FORCE_N] * boards_n, [ERRORS] * boards_n).at(APART_MM, np.zeros(3))
     # Expected: the conditional mean of a normal variable, given n equal values. Each value has the variance 1 + NOISE.
     # The covariance of two boards is SHARED, and so is the covariance of each board with the new board.

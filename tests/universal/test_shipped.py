@@ -175,7 +175,7 @@ def test_presses_one_by_one_calibrate_nearly_as_presses_together(skin):
     assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
-def test_inconsistent_labels_lower_the_likelihood_power_until_new_labels_replace_them(skin):
+def test_inconsistent_labels_lower_the_likelihood_power_until_they_are_replaced(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
@@ -310,7 +310,7 @@ def repeated_labels(labels_n):
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
-def test_saved_skin_keeps_presses_over_the_area_and_which_forces_are_known(skin, tmp_path):
+def test_saved_skin_gives_equal_estimates_if_some_forces_are_unknown(skin, tmp_path):
     rest_uT, read_uT = to_chips(skin.tables.rest_uT[None]), pokes(skin)
     skin.zero(rest_uT).see(rest_uT + np.tile(read_uT, (4, 1)), area=True)
     skin.label(PLACES_MM[:2], None, rest_uT + read_uT[:2])

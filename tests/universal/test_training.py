@@ -50,7 +50,7 @@ def test_random_errors_of_the_law_have_the_given_size():
     assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01
 
 
-def test_number_of_conditioning_presses_varies_from_none_to_all():
+def test_number_of_presses_shown_to_the_network_varies_from_none_to_all():
     kept_n = draw_kept(4000, rng_for(4, "kept")).sum(axis=1)
     assert (kept_n == 0).mean() == pytest.approx(0.25, abs=0.03)
     assert kept_n[kept_n > 0].min() == 1

@@ -188,7 +188,7 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
 
-def test_settings_that_affect_only_speed_need_no_record_of_their_choice(scene):
+def test_audit_needs_no_record_of_the_choice_if_settings_affect_only_speed(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in run_audit(scene))
@@ -321,7 +321,7 @@ def test_recipe_that_differs_from_the_chosen_settings_is_reported(scene, chosen,
     ],
     ids=["a network trained on the board", "test pokes", "pokes of a training skin"],
 )
-def test_adaptation_of_a_wrong_network_or_to_wrong_pokes_is_detected(scene, change, sentence):
+def test_wrong_network_or_wrong_pokes_in_an_adaptation_are_detected(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
     data = load_scene_data(scene)

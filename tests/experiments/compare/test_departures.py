@@ -59,7 +59,7 @@ def test_mirrored_labels_are_named(real):
     assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
 
 
-def test_captures_with_missing_data_have_no_departure(real):
+def test_no_departure_is_reported_without_places_or_with_too_few_presses(real):
     unknown = np.full(len(real), np.nan, np.float32)
     few = select(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
@@ -69,7 +69,7 @@ def test_captures_with_missing_data_have_no_departure(real):
         find_departure([fewer_chips], SECTION, DESIGN)
 
 
-def test_orientation_is_found_without_forces(real):
+def test_mirrored_labels_are_named_although_forces_are_unknown(real):
     unknown = np.full(len(real), np.nan, np.float32)
     assert find_departure([replace(real, Fz_N=unknown)], SECTION, DESIGN) is None
     mirrored = replace(real, Fz_N=unknown, y_mm=16 - real.y_mm)

@@ -146,7 +146,7 @@ def test_flipped_checkerboard_equals_one_rotated_by_a_quarter_turn():
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
-def test_law_without_slide_equals_the_nominal_skin():
+def test_fields_of_the_law_without_slide_equal_those_of_the_nominal_skin():
     plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
@@ -159,7 +159,7 @@ def test_law_without_slide_equals_the_nominal_skin():
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
-def test_presses_beyond_the_greatest_depth_are_counted_and_computed_at_this_depth():
+def test_presses_deeper_than_the_greatest_depth_get_the_field_of_this_depth():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
     layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
@@ -174,12 +174,12 @@ def test_presses_beyond_the_greatest_depth_are_counted_and_computed_at_this_dept
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 
 
-def test_presses_beyond_the_force_curve_of_the_nominal_skin_are_counted():
+def test_presses_harder_than_the_largest_force_of_the_nominal_skin_are_counted():
     known_N, _ = law._nominal_curve(SETUP)
     assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
 
 
-def test_cosine_explained_part_and_growth_of_simple_fields():
+def test_measures_of_agreement_have_the_expected_values_for_simple_fields():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
     assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
@@ -240,7 +240,7 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
 
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
-def test_fit_to_a_third_of_the_places_predicts_all_places(real):
+def test_simulation_fitted_at_a_third_of_the_places_agrees_at_all_places(real):
     # Parameters are fitted to a third of the places (22 of 65 in each of three recordings). With them, the simulation
     # must agree with the presses at all places.
     third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
@@ -268,7 +268,7 @@ def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_of_recordings_is_recovered_and_that_of_the_simulation_is_the_set_one(real):
+def test_field_memory_is_5_to_8_percent_in_recordings_and_as_set_in_the_simulation(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
         fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]

@@ -69,7 +69,7 @@ def test_predicted_place_is_between_the_contacts_and_nearer_to_the_stronger_one(
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
-def test_disagreement_between_networks_is_undefined_for_one_network():
+def test_disagreement_of_networks_is_omitted_if_there_is_only_one_network():
     assert "networks disagree" not in NUMBERS["auc"]
     numbers, _ = evaluate_board(
         DATA, FOLD, SECTION, [nearest_neighbour(DATA), lambda db_uT: nearest_neighbour(DATA)(-db_uT)]

@@ -60,7 +60,7 @@ def test_superposition_error_falls_with_distance_and_rises_with_depth():
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]
 
 
-def test_field_of_two_contacts_is_caused_by_both():
+def test_field_of_two_distant_contacts_is_nearly_the_sum_of_both_fields():
     a_m, b_m = (-5e-3, 0, DEPTH_M), (5e-3, 1e-3, DEPTH_M)
     together_T = pressed_T(a_m, b_m)
     for one_m in (a_m, b_m):

@@ -75,7 +75,7 @@ def drift_section(scene: dict[str, Any]) -> Drift:
     return scene["settings"].section(Drift, "drift")
 
 
-def test_on_a_drifting_skin_the_no_load_reading_from_the_start_has_the_largest_errors(scene, tmp_path):
+def test_errors_are_largest_with_the_no_load_reading_from_the_start_if_the_skin_drifts(scene, tmp_path):
     drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
@@ -140,7 +140,7 @@ def test_captures_of_unknown_order_or_too_few_contacts_are_refused(scene, tmp_pa
     assert not (tmp_path / ".reskin").exists()
 
 
-def test_variation_recovers_the_drift_and_the_gain_of_a_skin(scene, tmp_path):
+def test_experiment_variation_recovers_the_known_drift_and_gain_of_skins(scene, tmp_path):
     wear = write(tmp_path / "wear", capture("s0-wear"))
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
@@ -179,7 +179,7 @@ def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
     return (further.noload_uT - line.noload_uT)[::2].astype(float)
 
 
-def test_added_random_walk_starts_after_the_training_contacts_and_grows_with_their_root():
+def test_added_random_walk_grows_with_the_root_of_the_contacts_after_training():
     walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
     assert np.abs(walk[:AFTER_N]).max() == 0
     for contacts_n in (1, 16, 256):

@@ -70,7 +70,7 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def test_coordinates_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
+def test_coordinates_of_places_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]

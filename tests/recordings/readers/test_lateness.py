@@ -55,7 +55,7 @@ def change_of(b_uT: np.ndarray, label: np.ndarray):
 
 @settings(max_examples=25)
 @given(st.integers(AT_END_ROWS_N, 1200 - AT_END_ROWS_N), st.booleans(), st.integers(0, 5))
-def test_missing_row_in_either_file_is_found(row, in_fields, seed):
+def test_missing_row_is_found_in_the_file_of_readings_and_in_that_of_labels(row, in_fields, seed):
     b_uT, label = synthetic_recording(seed)
     assert len(label) == 1200
     change = change_of(without_row(b_uT, row), label) if in_fields else change_of(b_uT, without_row(label, row))
@@ -71,7 +71,7 @@ def test_complete_recording_raises_no_alarm(seed, passes_n, further_late_n):
     assert change_of(np.roll(b_uT, further_late_n, axis=0), label) is None
 
 
-def test_recordings_that_cannot_show_a_missing_row_raise_no_alarm():
+def test_no_alarm_is_raised_if_fields_or_forces_do_not_depend_on_the_press():
     b_uT, label = synthetic_recording()
     assert change_of(np.zeros_like(b_uT), label) is None
     assert change_of(rng_for(0, "noise").normal(0, 5, b_uT.shape), label) is None

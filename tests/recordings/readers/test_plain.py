@@ -105,7 +105,7 @@ def test_quantities_of_empty_columns_are_unknown(tmp_path):
     assert account["ignored_columns_n"] == 0
 
 
-def test_no_load_rows_may_be_numbered(tmp_path):
+def test_no_load_rows_may_have_indentation_numbers_of_their_own(tmp_path):
     rows = table().assign(indentation=np.repeat(np.arange(12), [3, 4] * 6))
     readings, _ = read(tmp_path, rows)
     assert readings.indentation.tolist() == np.repeat(np.arange(6), 4).tolist()
@@ -117,7 +117,7 @@ def test_parquet_table_is_read_like_csv(tmp_path):
     np.testing.assert_array_equal(one.noload_uT, other.noload_uT)
 
 
-def test_no_load_rows_may_have_no_place(tmp_path):
+def test_no_load_rows_may_have_empty_places(tmp_path):
     rows = table().assign(operator="me", note="")
     rows.loc[rows.phase == "noload", ["x_mm", "y_mm", "Fz_N"]] = np.nan
     readings, account = read(tmp_path, rows)
@@ -184,7 +184,7 @@ def test_recording_converted_by_the_script_in_the_docs_equals_that_of_layout_efl
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
 
 
-def test_template_of_a_table_is_its_header_line(tmp_path):
+def test_command_template_writes_the_header_line_of_a_table(tmp_path):
     out = tmp_path / "mine.csv"
     done = CliRunner().invoke(app, ["template", str(out), "--chips", "3"])
     assert done.exit_code == 0, done.output
