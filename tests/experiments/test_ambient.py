@@ -36,7 +36,7 @@ SCENE = synthesis()
 PERFECT = draw_instrument(synthesis("spreads", **NO_SPREAD), "b0", seed=1)
 REAL = draw_instrument(SCENE, "b0", seed=1)
 fields_T = st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array)
-ROUNDING_uT = 1e-9  # The rounding error of fields of 100 uT.
+ROUNDING_uT = 1e-9  # This is an upper limit for the rounding error of fields of 100 uT.
 
 
 def uniform(b_T, chips_n=5):
@@ -153,10 +153,10 @@ def test_scores_are_averaged_over_boards():
         "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "values": [80.0, 60.0],
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
-    # These scores are those of a second seed.
+    # These scores belong to networks with a second seed.
     again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]
     variant_a = scores_by_field([*points, *again], "field_uT", ["b0", "b1"])[1]["a"]["accuracy_pct"]
-    assert (variant_a["mean"], variant_a["n"]) == (71.0, 2)  # There are two boards, and n counts boards.
+    assert (variant_a["mean"], variant_a["n"]) == (71.0, 2)  # The number n is that of boards, of which there are two.
     assert variant_a["sd_seeds"] == pytest.approx(np.sqrt(8) / 2)
     (iron,) = scores_by_field(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))

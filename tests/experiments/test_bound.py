@@ -1,6 +1,6 @@
 """Tests of the lower bound on the errors of any unbiased estimate.
 
-References are simulated chips, a linear estimate and the field of a dipole.
+The bound is compared with simulated chips, a linear estimate and the field of a dipole.
 """
 
 import math

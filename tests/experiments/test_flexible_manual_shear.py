@@ -36,7 +36,7 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 from tests.report.synthetic import card, texts_of
 
-SINGLE = 1e-4  # The rounding error of sums of forces of a few N in single precision.
+SINGLE = 1e-4  # This is an upper limit for the rounding error of sums of forces of a few N in single precision.
 
 
 BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}

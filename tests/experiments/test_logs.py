@@ -1,6 +1,6 @@
 """Tests of estimates from logs, which are long recordings without labels.
 
-Further tests are about a board that is tilted (pitched) in the earth's field.
+Other tests simulate a board that is tilted (pitched) in the earth's field.
 """
 
 import numpy as np
@@ -94,8 +94,8 @@ def test_number_of_contacts_forces_and_noise_are_recovered():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # The expected error is the variance of the mean of 15 noisy channels, in N^2. The no-load reading is a mean of many
-    # readings, and adds only 1 / 500 of this variance.
+    # The expected squared error in N^2 is the variance of the mean of 15 noisy channels. The no-load reading is a mean
+    # of many readings, so its noise adds only 1 / 500 of this variance.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 

@@ -1,6 +1,6 @@
 """Tests of experiment moving_hand, which studies touches while a hand moves in magnetic fields.
 
-Tested are the external fields, their compensation, thresholds for contacts, places, and the whole stage.
+The tests cover the external fields, their compensation, thresholds for contacts, places, and the whole stage.
 """
 
 from dataclasses import replace
@@ -64,7 +64,8 @@ def test_field_of_a_moved_magnet_has_the_stated_size_at_the_board():
     changes_uT = to_board(hand.move_magnet(140.0, (40.0, 40.0), 20_000, rng_for(0, "magnet"))).reshape(-1, 5, 3)
     # All changes start from the same field, so their standard deviation is that of the later fields.
     sd_uT = changes_uT.std(axis=0)
-    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # The chip at the centre. The standard error is below 1 %.
+    # The first chip is at the centre of the board. The standard error is below 1 %.
+    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)
     # Outer chips can be nearer to the magnet, so their fields are larger.
     assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()
 
@@ -77,7 +78,7 @@ def test_contact_threshold_equals_that_of_the_live_page(external_uT):
     readings_uT = NOISE_uT * rng_for(0, "live").standard_normal((4000, 15))
     matrix = load_universal(external_uT=external_uT).suppressor(NOISE_uT)
     live_uT = np.median(magnitudes_uT(readings_uT, matrix)) + CONTACT_SDS * NOISE_uT
-    # The live page takes a median, which is up to 1.5 % below the root mean square.
+    # The live page computes the noise from a median, which is up to 1.5 % below the root mean square.
     assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(live_uT, rel=0.02)
 
 
@@ -175,7 +176,8 @@ def test_whole_stage_runs_on_synthetic_recordings(tmp_path):
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [row["capture"] for row in numbers["recordings"]] == ["first", "second"]
     assert [row["rows_n"] for row in numbers["recordings"]] == [24, 24]
-    # The option has several values. There are two learners, each trained on two kinds of data.
+    # There is a row for each of two values of the option, and for each of two learners trained on each of two kinds of
+    # data.
     assert len(numbers["contacts"]) == 2 + 2 * 2
     by_field = {
         (row["field"], row["external_uT"], row["labels_n"]): row["mse_xy_mm2"]["mean"]

@@ -35,7 +35,7 @@ def rows(few_nodes):
 
 @pytest.fixture
 def not_inside(monkeypatch):
-    """Omit the effects inside the skin, which take most of the computing time."""
+    """Replace the computation of the effects inside the skin, which takes most of the time, by an empty result."""
     monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
@@ -137,7 +137,8 @@ def test_table_lists_the_protocols_of_each_effect():
         "the earth's field": "neglected",
         "temperature": "computed: grid, wear",
     }
-    # The effects that the main protocol neglects come first. It includes temperature, which is therefore last.
+    # The effects that the main protocol neglects come first. The main protocol includes temperature, so temperature is
+    # last.
     assert table.index[-1] == "temperature"
     assert table.loc["ageing"].tolist()[1:] == ["12", "–", "0.5", "so", "simulated"]
 

@@ -89,7 +89,7 @@ def test_resumed_run_draws_only_the_parts_that_are_missing(monkeypatch):
 
 def test_calibration_pool_has_one_press_per_place_and_no_test_press():
     places_n, depths_n, readings_n = 4, 3, 2
-    # Two passes. The number of the press of each row.
+    # There are two passes. `press` is the number of the press to which each row belongs.
     press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)
     target = np.stack([press % places_n, press % places_n, 1 + press], axis=1).astype(np.float32)
     names = (np.full(len(press), name) for name in ("c", "b0", "b0_s0"))
@@ -106,7 +106,7 @@ def test_calibration_pool_has_one_press_per_place_and_no_test_press():
 
 
 def test_known_weight_is_the_press_near_the_middle_with_the_nearest_force():
-    # The forces of five presses, each with two readings.
+    # There are five presses with two readings each. These are the forces of the readings.
     force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)
     x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
     target, press = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
@@ -152,7 +152,7 @@ def test_tables_and_figure_list_every_method():
     assert len(tables["population"]) == 3
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
-    # The intervals of three methods: map, map with network, and network.
+    # There is one column of intervals for each method: map, map with network, and network.
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]
     earlier = {name: value for name, value in numbers.items() if name != "fresh"}
     assert set(tables) - set(population.tables(earlier, "simulated")) == {"population_fresh"}

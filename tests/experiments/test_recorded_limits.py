@@ -1,6 +1,6 @@
 """Tests of experiment recorded_limits, which asks what limits the accuracy on recorded boards.
 
-Tested are the rigid registration of places, estimates of shear, thresholds of detection, and tables.
+The tests cover the rigid registration of places, estimates of shear, thresholds of detection, and tables.
 """
 
 from dataclasses import replace
@@ -174,7 +174,7 @@ def test_universal_model_has_scores_for_each_way_of_using_the_known_presses(scor
     def mean_mm2(known: str) -> float:
         return float(np.mean([row["mse_xy_mm2"] for row in scores if row["known"] == known and row["presses_n"]]))
 
-    # Labels help, because the synthetic skin follows the formula of the map.
+    # Labels reduce the errors, because the fields of the synthetic skin follow the formula of the map.
     assert mean_mm2(limits.LABELS) < mean_mm2(limits.UNCHANGED)
 
 
@@ -204,8 +204,8 @@ def test_explained_fraction_within_groups_equals_r2_of_centred_values():
 def make_rows(shear_in_field: bool) -> Rows:
     """Return rows of two boards with 30 places, two depths, two readings per press and 6 channels.
 
-    The field is linear in place and normal force. If `shear_in_field`, it is also linear in the sideways force, which
-    is random.
+    The field is linear in the place and in the normal force. If `shear_in_field` is true, the field is also linear in
+    the sideways force, which is random.
     """
     rng = np.random.default_rng(2)
     place_mm = 2.0 * np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=-1).reshape(-1, 2)
@@ -229,8 +229,8 @@ def test_shear_is_predicted_only_if_the_field_depends_on_shear():
     by_field = {}
     for shear_in_field in (True, False):
         rows = limits.evaluate_shear(make_rows(shear_in_field), SECTION, 2021)["rows"]
-        # Two kinds of training presses, with three kinds of inputs each: none, the field, and the place with the normal
-        # force.
+        # There are two kinds of training presses. For each of them, the shear force is predicted from no input, from
+        # the field, and from the place with the normal force.
         assert len(rows) == 2 * 3
         for row in rows:
             if row["inputs"] == limits.FIELD:
@@ -414,7 +414,8 @@ def test_tables_and_figure_contain_all_results(scores, detection):
         assert (table["source"] == "recorded").all()
         assert not any("|" in str(column) for column in table.columns)  # The character | separates columns in Markdown.
     registration = tables["limits_registration"]
-    # Three rows for the regressor. Four rows for each of two variants, with and without unlabelled presses.
+    # The regressor has three rows. Each of two variants of the model has four rows with unlabelled presses and four
+    # without.
     assert len(registration) == 3 + 2 * 2 * 4
     assert "20 unlabelled presses" in registration.attrs["meaning"]
     forces = tables["limits_detection"]["force by power law, N"]

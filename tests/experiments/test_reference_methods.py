@@ -79,8 +79,8 @@ FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 def test_presses_are_paired_with_those_of_equal_place_and_force_on_the_known_board():
     rows = make_rows()
-    rows.target[20:22, 2] = 2.0  # This force is between the two forces of board b0.
-    rows.target[22:24, 2] = 9.0  # This force is above the largest force of board b0.
+    rows.target[20:22, 2] = 2.0  # The force of this press is between the two forces of board b0.
+    rows.target[22:24, 2] = 9.0  # The force of this press is above the largest force of board b0.
     rows.target[24:26, :2] = 50.0  # Board b0 has no press at this place.
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]

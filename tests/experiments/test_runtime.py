@@ -1,7 +1,7 @@
 """Tests of experiment runtime, which compares errors and run times of numerical methods.
 
-These are quadratures (over the nodes of a skin) and integrators (of the relaxation over time). References are closed
-forms.
+The methods are quadratures (sums over the nodes of a skin) and integrators (of the relaxation over time). They are
+compared with closed forms.
 """
 
 from dataclasses import replace
@@ -188,7 +188,7 @@ def test_tabulated_paths_of_material_points_equal_the_computed_flow():
     # 1 mm.
     np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
     np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
-    # The horizontal components of the rotation from z towards r.
+    # These are the horizontal components of the axis about which z rotates towards r.
     turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
@@ -328,7 +328,7 @@ def test_methods_are_timed_in_alternating_order():
 
 
 def test_times_are_medians_divided_by_the_number_of_indentations(monkeypatch):
-    # Readings of the clock before and after each of three calls.
+    # The clock is read before and after each of three calls. Its readings are the running sums of these numbers.
     now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)

@@ -1,6 +1,6 @@
 """Tests of experiment sensitivity, which finds the smallest weight whose addition the readings show.
 
-References are loops, the normal distribution and SciPy.
+Results are compared with loops, the normal distribution and SciPy.
 """
 
 from itertools import pairwise
@@ -106,9 +106,10 @@ def test_no_step_is_resolved_if_the_noise_is_large():
 
 
 def two_fillings(values, spread):
-    """Return two fillings, whose mean field is `values` at levels 0.1 N apart.
+    """Return readings of two fillings with levels 0.1 N apart.
 
-    From one level to the next, the rises of the two fillings differ by `spread`.
+    The mean field of both fillings at each level is given by `values`. From one level to the next, the increases of the
+    field in the two fillings differ by `spread`.
     """
     wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
     return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
@@ -136,7 +137,7 @@ def test_number_of_falls_and_rank_correlation_equal_loops_and_scipy(values, spre
 
 
 def test_verdict_on_monotonicity_does_not_depend_on_the_size_of_filling_steps():
-    fine_N = 0.002 * np.arange(251)  # The same range of weights as WEIGHT_N, with steps a tenth as large.
+    fine_N = 0.002 * np.arange(251)  # These weights have the same range as WEIGHT_N, but a tenth of its step.
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
@@ -169,7 +170,8 @@ def test_number_of_falls_caused_by_noise_equals_the_expected_number():
 def test_readings_are_sorted_by_filling_and_weight():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
-    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # Two fillings, whose levels are mixed.
+    # There are two fillings, whose levels are not in order.
+    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)

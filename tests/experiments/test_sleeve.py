@@ -1,6 +1,6 @@
 """Tests of experiment sleeve, in which one large skin covers several boards.
 
-Tested are held-out indentations, borders between boards, the frame rate, scores and the map of errors.
+The tests cover held-out indentations, borders between boards, the frame rate, scores and the map of errors.
 """
 
 import re

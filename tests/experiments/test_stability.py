@@ -1,4 +1,4 @@
-"""Tests that all stability cases of experiment stability pass, and that the cases detect planted faults."""
+"""Tests that all cases of experiment stability pass, and that a fault planted in the library makes a case fail."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,8 @@ def failed(cases):
 @pytest.fixture(scope="module")
 def cases():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(physics, "POKES_N", 100)  # fewer pokes: array checks are slow while memory is traced
+        # Fewer pokes are used, because checks of arrays are slow while memory is traced.
+        patch.setattr(physics, "POKES_N", 100)
         return survey(DESIGN, SEED)
 
 
@@ -88,7 +89,7 @@ def extremes():
 
 
 def test_depth_table_that_ends_before_the_greatest_depth_is_detected(monkeypatch):
-    monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
+    monkeypatch.setattr(extremes_module, "FINER", 1)  # A less accurate reference is enough to detect this fault.
     at_depth = deformation.at_depth
     monkeypatch.setattr(
         deformation, "at_depth", lambda flow, depth_m: at_depth(flow, min(depth_m, 0.62 * flow.thickness_m))
@@ -115,7 +116,7 @@ def test_quadrature_with_cells_wider_than_the_gap_is_detected(monkeypatch):
 
 
 def test_stiffening_that_ignores_the_thickness_of_the_skin_is_detected(monkeypatch):
-    monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
+    monkeypatch.setattr(extremes_module, "FINER", 1)  # A less accurate reference is enough to detect this fault.
     monkeypatch.setattr(slide, "stiffening", lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3)
     assert failed(extremes()) == {"a skin of 0.2 mm", "a skin of 20 mm"}
 
@@ -126,7 +127,7 @@ def test_skin_without_springs_has_no_sliding_cases():
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
 def test_streams_of_other_boards_are_checked(monkeypatch, chips_n, gain_sel):
-    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # a single block is faster while memory is traced
+    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # A single block is used, because decoding is slow while memory is traced.
     assert failed(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
@@ -149,10 +150,11 @@ def test_peak_memory_counts_arrays_that_exist_at_once():
         for _ in range(3):
             np.ones(125_000)
 
-    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # 10 %: overhead of the array object
+    # The tolerance allows for the overhead of array objects.
+    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)
 
 
-# Each of the following tests disables one guard of the library. A stability case must detect the missing guard.
+# Each of the following tests disables one check or limit (guard) of the library. A stability case must then fail.
 
 
 def test_formula_that_loses_digits_in_small_time_steps_is_detected(monkeypatch):

@@ -1,4 +1,4 @@
-"""Tests that the training code passes extreme cases, and that these cases detect planted faults."""
+"""Tests that the training code passes extreme cases, and that a fault planted in the code makes one case fail."""
 
 from dataclasses import replace
 

@@ -37,8 +37,8 @@ NOISE_uT = 2.0
 def pad(rows_n=40):
     """Return recordings of touches at each place and at each pair of places.
 
-    The field change is the sum, over the touched places, of the force times a direction that belongs to the place.
-    Noise is added.
+    Each place has a direction in the space of channels. The field change is the sum over the touched places of the
+    force times the direction of the place, plus noise.
     """
     rng = rng_for(0, "touches", "pad")
     directions = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))

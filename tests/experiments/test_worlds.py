@@ -1,6 +1,6 @@
-"""Tests of experiment worlds, which varies the settings of scene decide to find those that determine table 2.
+"""Tests of experiment worlds, which finds the settings of scene decide on which the results of table 2 depend most.
 
-A world is one of these simulated variants.
+The experiment simulates variants of the scene, which are called worlds.
 """
 
 from pathlib import Path
@@ -35,7 +35,7 @@ def test_error_of_the_law_is_a_smooth_reproducible_field_of_the_given_size():
     ]
     assert np.sqrt(np.mean(np.square(relative_errors))) == pytest.approx(0.4, rel=0.1)
     relative_error = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    # Differences between places that are 0.5 mm apart.
+    # These are the differences between places that are 0.5 mm apart.
     step = np.linalg.norm(np.diff(relative_error.reshape(33, 33, 15), axis=1), axis=2)
     assert step.mean() < 0.25 * np.linalg.norm(relative_error, axis=1).mean()
     np.testing.assert_array_equal(law_error(), law_error())

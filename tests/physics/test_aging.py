@@ -1,4 +1,7 @@
-"""Tests of relaxation, hysteresis, wear and temperature against closed forms, 50-digit arithmetic, published values."""
+"""Tests of relaxation, hysteresis, wear and temperature.
+
+References are closed forms, 50-digit numbers and published values.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +29,7 @@ from reskin.physics.aging import (
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-14  # The relative rounding error of a few dozen operations in double precision.
+ROUNDING = 1e-14  # This is the relative rounding error of a few dozen operations in double precision.
 times_s = st.floats(0, 1e5)
 changes = st.floats(-10, 10)
 

@@ -8,8 +8,8 @@ from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
-DRAG_M = 0.9e-3  # The greatest depth of a dragged tip in the scenes.
-DEEPEST_RADIUS_H = 0.75  # An upper bound for the contact radius at this depth, divided by the thickness of the layer.
+DRAG_M = 0.9e-3  # This is the greatest depth of a dragged tip in the scenes.
+DEEPEST_RADIUS_H = 0.75  # At depth DRAG_M, the contact radius is at most this fraction of the thickness of the layer.
 DISPLACEMENT_M = np.array([4e-5, 7e-5])
 HELD = {
     # Beyond the outer edge of the elements, u_r falls as 1 / r. Springs of stiffness 2 / r at the edge have the same

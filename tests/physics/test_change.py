@@ -15,7 +15,7 @@ from reskin.physics.magnet import change_of_field
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-# The rounding error of a few thousand double-precision operations, relative to the sum of the magnitudes.
+# This is the rounding error of a few thousand double-precision operations, relative to the sum of the magnitudes.
 ROUNDING = 1e-12
 seeds = st.integers(0, 10**6)
 

@@ -69,7 +69,7 @@ def test_suppressor_removes_uniform_fields_and_keeps_fields_with_curl():
     uniform_uT = np.tile([50.0, -30.0, 80.0], 5)
     assert np.linalg.norm(uniform_uT @ matrix) < 0.05 * np.linalg.norm(uniform_uT)
     curl_uT = np.zeros((5, 3))
-    # The test field is a vortex around the centre. No magnet outside the skin can cause such a field.
+    # The field is a vortex around the centre, which no magnet outside the skin can cause.
     curl_uT[:, :2] = 10 * CHIPS @ [[0, 1], [-1, 0]]
     # A part of the vortex is removed, because external fields of high order resemble it.
     assert np.linalg.norm(curl_uT.ravel() @ matrix) > 0.8 * np.linalg.norm(curl_uT)

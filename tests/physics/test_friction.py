@@ -1,7 +1,7 @@
 """Tests of friction under a dragged tip, whose force is Q = min(k s, mu F).
 
-The tip sticks to the skin, which acts as a spring of stiffness k, until the force reaches the limit mu F. Tested are
-the energy, Coulomb's limit, and paths that are subdivided or rotated.
+The tip sticks to the skin, which acts as a spring of stiffness k, until the force reaches the limit mu F. The tests
+check the energy, Coulomb's limit, and paths that are subdivided or rotated.
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
-ROUNDING = 1e-12  # The relative rounding error of some hundred steps in double precision.
-K = 1000.0  # Stiffness of the spring in N/m, of the same order as that of the skin.
+ROUNDING = 1e-12  # This is the relative rounding error of some hundred steps in double precision.
+K = 1000.0  # The stiffness of the spring in N/m is of the same order as that of the skin.
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
 

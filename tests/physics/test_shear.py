@@ -146,7 +146,8 @@ def test_short_waves_satisfy_the_boundary_conditions():
 def test_shear_and_pressure_satisfy_bettis_reciprocity_theorem():
     """By Betti's theorem, two kinds of work are equal.
 
-    Pressure on the displacement by the traction does as much work as the traction on the displacement by the pressure.
+    They are the work of the pressure along the displacement that the traction causes, and the work of the traction
+    along the displacement that the pressure causes.
     """
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
@@ -265,7 +266,7 @@ def test_sticking_contact_moves_rigidly():
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
 def test_traction_of_a_sticking_contact_has_the_greatest_stiffness(a_h, square, fourth):
-    """Of all tractions with equal total force, that of a rigid contact stores the least energy (Thomson's theorem)."""
+    """Thomson's theorem: of all tractions with equal total force, that under a rigid contact stores the least energy."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)

@@ -23,9 +23,9 @@ from tests.physics.test_board import draw_board, no_spread, spreads
 EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
-PEAK_T = 1e-3  # The order of magnitude of the fields. Tolerances for rounding are relative to this value.
-# Two quadratures (grids of nodes). COARSE is for tests of laws that hold with any quadrature. SPARSE is for tests with
-# many skins, which need speed.
+PEAK_T = 1e-3  # Fields are of this order of magnitude. Tolerances for rounding are relative to this value.
+# Skins are represented by grids of nodes (quadratures). COARSE is used in tests of laws that hold with any quadrature.
+# SPARSE has fewer nodes and is used in tests with many skins, which would otherwise be slow.
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
 DEPTH_M = 0.6e-3  # The tested laws hold at any depth. All tests use the same depth, so that a single table is computed.
 places_m = st.floats(-8e-3, 8e-3)
@@ -233,9 +233,9 @@ def test_pokes_computed_together_equal_single_pokes():
     ],
 )
 def test_field_change_from_tables_equals_that_of_nodes_moved_in_steps(thickness_mm, at, error, base):
-    # A thickness of 1.82 mm is halfway between two tables. At the depths of the tables, the error is that of
+    # A thickness of 1.82 mm is halfway between two tables. At the depths of the tables, the error is due to
     # interpolation in R/h (radius of the tip divided by the thickness) and in r. Between these depths, the error is 0.6
-    # %: the reference then ends with half a step of `deformation.STEP`, which changes dB by this much.
+    # %, because the reference then ends with half a step of `deformation.STEP`, which changes dB by 0.6 %.
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):

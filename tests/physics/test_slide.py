@@ -98,7 +98,7 @@ def test_motion_on_uniform_springs_equals_force_over_stiffness(place_m, springs_
 
 
 @given(places_m, displacements_m, st.floats(1e-6, 20.0))
-@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # Dividing a force by this tiny displacement overflows.
+@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # This displacement is so small that dividing a force by it overflows.
 def test_friction_limits_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
     whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)

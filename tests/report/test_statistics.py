@@ -1,4 +1,4 @@
-"""Tests of the statistics over boards, against SciPy and loops. Further tests are about symmetries."""
+"""Tests of the statistics over boards. They are compared with SciPy and with loops, and must have their symmetries."""
 
 import io
 

@@ -1,6 +1,6 @@
-"""Tests of simulated captures, against the protocol and the simulated field.
+"""Tests that simulated captures agree with their protocol and with the simulated field.
 
-Further tests are about names, seeds and the terms of the physics.
+Other tests check the names of captures, random seeds, and optional terms of the physics such as ageing.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Tests of a universal model that is made for another board than the paper's.
 
-Tested are its file, its accuracy on simulated skins, and what is refused.
+The tests cover the file of the model, its accuracy on simulated skins, and errors for invalid input.
 """
 
 import re

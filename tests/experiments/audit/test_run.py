@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
-COPY = "b3_s0"  # A copy of skin b0_s0, which is labelled as a skin of another board.
+COPY = "b3_s0"  # This skin is a copy of skin b0_s0, but is labelled as a skin of another board.
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded_scene(
@@ -132,7 +132,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # Stages write their costs to the working folder.
+    monkeypatch.chdir(tmp_path)  # The stages write a file with their run times to the working folder.
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 

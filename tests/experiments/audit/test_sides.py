@@ -29,7 +29,7 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # The noise of x, y and z in the lab recordings.
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # These are the noise levels of x, y and z in the lab recordings.
 UNSEEN = ("lobo", "sensors", "transfer")
 
 
@@ -228,7 +228,7 @@ def test_audit_reports_that_skins_with_too_weak_fields_were_not_checked_for_copi
 def test_result_of_the_audit_does_not_depend_on_the_order_of_rows(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    new_index = np.argsort(order)  # Maps the old index of each row to its new index.
+    new_index = np.argsort(order)  # This array maps the old index of each row to its new index.
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=new_index[fold.train], test=new_index[fold.test])

@@ -76,7 +76,7 @@ def test_mirrored_labels_are_named_although_forces_are_unknown(real):
     assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
 
 
-# The layout of a square board with four chips, as the file of a scene states it.
+# This is the layout of a square board with four chips, as it is written in the file of a scene.
 SQUARE = read_yaml(FOLDER / "reskin.yaml") | {
     "name": "square",
     "centre_mm": [10.0, 12.0],

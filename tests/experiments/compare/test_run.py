@@ -1,6 +1,7 @@
 """Tests of experiment compare, which fits the simulation to recordings.
 
-It must recover parameters and axes, from simulated and from real recordings.
+The experiment must recover the parameters of the skin and the axes of chips and labels from simulated and real
+recordings.
 """
 
 import itertools
@@ -41,8 +42,8 @@ SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"]
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
-# The tolerances are the errors of a fit to 50 presses with 3 uT of noise. Those of gap and amplitude are large, because
-# an error of one compensates an error of the other.
+# The tolerances are the errors of a fit to 50 presses with 3 uT of noise. The tolerances of gap and amplitude are
+# large, because an error of the gap can be compensated by an error of the amplitude.
 TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 ROTATIONS = chip_rotations(SECTION)
 
@@ -165,7 +166,7 @@ def test_presses_deeper_than_the_greatest_depth_get_the_field_of_this_depth():
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    # The slide is switched off. Otherwise, the field would change with the force even at a constant depth.
+    # The skin does not slide here, because the slide would change the field with the force even at a constant depth.
     without_slide = replace(TRUE, away_um_mm=0.0)
     held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
     # A skin with half the modulus is indented as deeply by half the force.

@@ -1,6 +1,6 @@
 """Tests of readings of two contacts, which are made by adding the field changes of two presses.
 
-Further tests are about predictions for such readings, and about thresholds for detecting them.
+Other tests check predictions for such readings, and the thresholds above which a reading counts as two contacts.
 """
 
 from dataclasses import replace

@@ -13,7 +13,7 @@ LATE = {
     "network_board": ["b0", "b1", "b2", "b3"],
 }  # fmt: skip
 CONTACTS_N = [5000, 10_000, 15_000, 20_000]
-BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # Relative differences between the errors of four networks, one per board.
+BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # The errors of four networks, one per board, differ by these fractions.
 
 
 def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True) -> dict[str, np.ndarray]:
@@ -62,8 +62,8 @@ def test_finding_is_contradicted_by_significant_opposite_errors(finding, changed
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
 def test_finding_is_undecided_if_one_board_contradicts_the_others(finding):
-    # Factors of the difference between two policies, one per board. Their mean agrees with the paper, but one has the
-    # opposite sign.
+    # On each board, the difference between two policies is multiplied by one of these factors. The mean of the factors
+    # agrees with the finding of the paper, but one factor has the opposite sign.
     signs = (-1.0, 1.2, 0.3, 0.1)
     near = errors(0.2, 0.01)
     disagreeing = {
@@ -114,7 +114,8 @@ def test_no_load_policies_are_compared_by_the_mean_over_all_windows():
 
 
 def test_errors_that_two_policies_share_do_not_affect_their_paired_difference():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # Errors of each network that are equal under both policies.
+    # These errors are added to those of each network under both policies.
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]
     regular = {name: values + shared for name, values in PAPER["regular"].items()}
     each_contact = {name: values + shared for name, values in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE] == SUPPORTED
@@ -128,7 +129,7 @@ def test_errors_that_two_policies_share_do_not_affect_their_paired_difference():
     ("bias_N", "se_N", "networks_N", "verdict"),
     [
         (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], SUPPORTED),
-        # The bias is only two standard errors, where the standard error is that over indentations.
+        # The bias is less than two standard errors over indentations.
         (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),
         (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
         (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),

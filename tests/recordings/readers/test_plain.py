@@ -1,6 +1,6 @@
 """Tests of the reader of layout `table`, which reads CSV and Parquet tables.
 
-Tested are unknown quantities, and errors that name the line.
+The tests cover quantities that are unknown, and errors that name the wrong line.
 """
 
 import re
