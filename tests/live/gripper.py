@@ -19,8 +19,8 @@ from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1
-# PERIOD_S is the period with which the stiffness of the object changes. SETTLED_S is the time from which on the force
-# is evaluated.
+# PERIOD_S is the period with which the stiffness of the object changes. The force is evaluated only after the time
+# SETTLED_S.
 PERIOD_S, SETTLED_S = 6.0, 1.0
 SOFT_N_MM, HARD_N_MM = 0.3, 3.0
 NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
@@ -80,7 +80,10 @@ class Finger:
 
 
 class FingerReader:
-    """A reader that returns one frame at a time, for the force that is on the finger at this time."""
+    """A reader that returns one frame at a time.
+
+    Each frame has the field for the force that then acts on the finger.
+    """
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 

@@ -202,7 +202,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     true[np.linalg.norm(quiet.frames.b_uT - quiet.frames.b_uT[0], axis=1) < 100] = np.nan
 
     async def act(tab: Tab) -> None:
-        assert not await tab.value("boards[0].truthShown()")  # The true place is shown only on demand.
+        assert not await tab.value("boards[0].truthShown()")  # The true place is shown only if the user asks for it.
         await tab.value("boards[0].parts.truth.click()")
         await tab.until("boards[0].parts.off.innerText.includes('the estimate is off by')")
         await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
@@ -211,7 +211,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
         await tab.value(f"{CLICK}(3.5, 12)")
         typed = "[boards[0].parts.x.value, boards[0].parts.y.value].map(Number)"
         found_mm = await tab.until(typed, lambda values: values != [0, 0])
-        # The tolerance in mm: a pixel is 0.05 mm, and values have one decimal.
+        # The tolerance is in mm. A pixel is 0.05 mm wide, and values are shown with one decimal.
         assert np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
         await tab.value("boards[0].parts.label.click()")
         await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
@@ -257,7 +257,7 @@ def test_key_a_adapts_the_model_to_presses(tmp_path, random_pokes):  # noqa: F81
 
 def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
     quiet = make_poke_script(guided_pokes)
-    # A pause before the first place, in which the test presses the button.
+    # The script begins with a pause, in which the test presses the button.
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)
     script = replace(quiet, t_s=quiet.t_s + late_s)
 

@@ -55,7 +55,7 @@ def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
     rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
     assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
     assert rate.method == "arrivals"
-    assert rate.repeated_frames < 0.01  # When the script begins again, a whole frame may be repeated.
+    assert rate.repeated_frames < 0.01  # A frame may be repeated when the script begins again.
     assert rate.repeated_readings == pytest.approx(2 / 3, abs=0.01)
     output = capsys.readouterr().out
     assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output

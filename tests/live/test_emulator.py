@@ -49,7 +49,7 @@ class SimulatedClock:
         return False
 
     def wait(self, seconds):
-        self.s += max(seconds, 1e-9)  # A smaller step would vanish by rounding.
+        self.s += max(seconds, 1e-9)  # A smaller time step would be lost by rounding.
 
 
 class FakeReader:
@@ -155,7 +155,8 @@ def test_make_port_raises_if_the_link_is_in_use_and_keeps_the_link(tmp_path):
     assert link.readlink() == leads_to
     first.unplug()
     assert not link.is_symlink()
-    link.symlink_to(leads_to.with_name("999999"))  # A link that was left by an emulator that was killed.
+    # This link leads to no port. Such a link remains if an emulator is killed.
+    link.symlink_to(leads_to.with_name("999999"))
     second = make_port(str(link))
     assert link.exists()
     second.unplug()
@@ -260,7 +261,7 @@ def test_script_of_a_simulation_has_contacts(source):
     contact = np.isfinite(true[:, 0])
     np.testing.assert_array_equal(np.isfinite(true), np.repeat(contact[:, None], 3, axis=1))
     change_uT = np.linalg.norm(script.frames.b_uT - script.frames.b_uT[~contact].mean(axis=0), axis=1)
-    # In uT. The noise of 15 channels together is about 15 uT.
+    # The limit is 60 uT. The noise of 15 channels together is about 15 uT.
     assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])
     # The true forces belong to the same times as the field changes, so a shift by a frame or more reduces their
     # correlation.
@@ -332,7 +333,7 @@ class TestRobot:
         log.close()
         dwells = list(DwellBuilder().feed(SampleTable("log").feed((tmp_path / "robot.csv").read_bytes())))
         touches = [dwell for dwell in dwells if dwell.label.contact]
-        # The rows after the last touch are not ended by another phase, so they become no dwell.
+        # The rows after the last touch become no dwell, because no row of another phase ends them.
         assert len(dwells) == 2 * len(touches)
         for pass_i in range(2):
             places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
@@ -346,7 +347,7 @@ class TestRobot:
     def test_boards_with_different_names_have_different_skins(self, robot_script):
         other = read_script("nominal", board="b2", robot=True)
         untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
-        assert np.abs(untouched[0] - untouched[1]).max() > 50  # The difference is in uT.
+        assert np.abs(untouched[0] - untouched[1]).max() > 50  # The two skins differ by more than this number of uT.
 
     def test_options_for_the_nominal_board_raise_for_other_sources(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")

@@ -238,7 +238,7 @@ def test_board_opened_with_a_saved_calibration_uses_it(random_pokes, tmp_path):
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
     before, mean = calibrated.predict(b_uT), calibrated.skin.mean
-    # This is a user's file. It has the name of the card of model s3, but is not a card.
+    # This file has the name of the card of model s3, but is another file of the user.
     (tmp_path / "s3.json").write_text("{}")
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)

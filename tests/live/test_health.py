@@ -117,7 +117,7 @@ def test_chips_that_are_slower_than_the_frames_raise_an_alarm():
     health = feed(inject_fault("slow-chips"))
     assert set(health.alarms) == {READINGS_REPEAT}
     alarm = health.alarms[READINGS_REPEAT]
-    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # These are two thirds of the readings in 1.5 s.
+    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # This is two thirds of the number of readings in 1.5 s.
     assert 1.5 < alarm.first_s <= 1.5 + REPEATS_FRAMES_N / 400
     assert alarm.action == "flag"
 
@@ -154,7 +154,8 @@ def feed_once(frames: Frames):
 def test_alarm_for_external_fields_is_raised_if_all_chips_change_equally():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
-    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # This change is too weak to be judged.
+    # This change is too weak to be called an external field.
+    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)

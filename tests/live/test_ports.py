@@ -16,7 +16,7 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # The number of frames per chunk. Chunks start in the middle of a frame.
+CHUNK_N = 3  # Each chunk has the bytes of this number of frames, and starts in the middle of a frame.
 
 
 def chunks_of(script, cut_n=31):
@@ -146,7 +146,7 @@ class TestReplugging:
 
     def test_board_that_is_plugged_in_again_is_found_at_its_new_port(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
-        assert found == "c"  # The board may then have another port.
+        assert found == "c"  # A board that is plugged in again may have another port.
         assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]
 
     def test_waiting_for_a_board_ends_at_the_time_limit(self):

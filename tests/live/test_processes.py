@@ -29,7 +29,7 @@ from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 
-LONG_S = 120.0  # A time limit, which is enough to import PyTorch on a busy machine.
+LONG_S = 120.0  # This time limit is long enough to import PyTorch on a busy machine.
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 

@@ -1,4 +1,4 @@
-"""Tests that labelled recordings can be added to a scene, however the recording has ended."""
+"""Tests that labelled recordings can be added to a scene, even if the recorder was killed or the disk was full."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Tests that messages to the live page have a limited size, but contain the peaks of the force."""
+"""Tests that messages to the live page have a limited size and contain the peaks of the force."""
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def test_latency_is_measured_when_the_page_confirms_a_message():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
-    # A message that is confirmed a second time has no latency, and neither has one that is unknown.
+    # No latency is measured for a message that is confirmed a second time, or for a number that no message had.
     for seen in (number, number + 1, -1):
         traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])

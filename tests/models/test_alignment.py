@@ -1,6 +1,6 @@
 """Tests of methods that align the field changes of a new skin with those of known skins.
 
-References are SciPy's matrix square roots, a known linear map, and leave-one-out errors.
+The methods are compared with SciPy's matrix square roots, a known linear map, and leave-one-out errors.
 """
 
 import numpy as np

@@ -14,7 +14,10 @@ LOG_ATOL = 1e-5  # Tolerance for logarithms, which are at most 17: a few roundin
 
 
 def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
-    """Return field changes of about 120 uT. This is far above the limit below which lengths are not divided out."""
+    """Return field changes of about 120 uT.
+
+    Field changes below a limit, which is far smaller, are not normalised to unit length.
+    """
     return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
 
 

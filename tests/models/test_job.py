@@ -28,7 +28,7 @@ from tests.models.example_jobs import (
     without_triplets,
 )
 
-NEW = np.arange(24, ROWS_N)  # Rows of the skins that are not in the training data.
+NEW = np.arange(24, ROWS_N)  # These are the rows of skins that are not in the training data.
 KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
@@ -342,8 +342,8 @@ def test_augmented_copies_have_the_same_targets_and_count_as_new_skins():
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # Virtual boards without spread do not change the fields. Therefore each row appears three times (the original and
-    # two copies), with equal fields and targets.
+    # Virtual boards whose gains and tilts have no spread do not change the fields. Each row therefore appears three
+    # times (the original and two copies) with equal fields and targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()

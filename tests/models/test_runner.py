@@ -118,15 +118,15 @@ def test_jobs_that_finished_before_a_run_was_killed_are_kept(tmp_path):
     selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
         run(selected, tmp_path / "killed", InlineExecutor(die_after=1))
-    # In the second run, two of the three stacks are left to train.
+    # The second run trains the two of the three stacks that were not finished.
     assert trainings_n(selected, tmp_path / "killed") == 2
     done, fresh = run(selected, tmp_path / "killed"), run(selected, tmp_path / "fresh")
     assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
 def test_stack_killed_while_its_results_were_written_is_trained_again(tmp_path):
-    # The last bits of a result depend on the position of the network in its stack. Many steps with batches of one row
-    # amplify such differences.
+    # Networks at different positions of a stack have different rounding errors. Many training steps with batches of one
+    # row amplify these differences.
     selected = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
@@ -175,7 +175,7 @@ def test_finished_jobs_are_read_from_the_cache(tmp_path):
         (replace(jobs(1)[0], seed_i=1), 1),
         (jobs(1, steps_n=5)[0], 1),
         (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # A job of another fold, which changes the composition of the stack.
+        (jobs(3)[2], 3),  # This is a job of another fold. It changes which jobs are in the stack.
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )

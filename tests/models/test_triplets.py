@@ -8,7 +8,7 @@ from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
-ROW = np.arange(5, dtype=np.float64)[:, None]  # Five pokes of a line, whose places are the indices 0 to 4.
+ROW = np.arange(5, dtype=np.float64)[:, None]  # These are five pokes on a line. Their places are the indices 0 to 4.
 
 
 def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

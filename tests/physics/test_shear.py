@@ -266,7 +266,7 @@ def test_sticking_contact_moves_rigidly():
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
 def test_traction_of_a_sticking_contact_has_the_greatest_stiffness(a_h, square, fourth):
-    """Thomson's theorem: of all tractions with equal total force, that under a rigid contact stores the least energy."""
+    """Of all tractions with equal force, that under a rigid contact stores the least energy (Thomson's theorem)."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)

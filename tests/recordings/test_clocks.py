@@ -14,8 +14,8 @@ from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 
 FRAME_S = 1 / 400
-NOISE_UT = 4.0  # The typical noise of real boards.
-DRIFT_UT_PER_S = 10 / 60  # The drift of the no-load field of a board that warms up.
+NOISE_UT = 4.0  # This is the typical noise of real boards.
+DRIFT_UT_PER_S = 10 / 60  # The no-load field of a board that warms up drifts at this rate.
 UNIX_S = 1.7e9
 JITTER_S = (0.2, 0.5)
 
@@ -23,7 +23,7 @@ JITTER_S = (0.2, 0.5)
 def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = JITTER_S) -> ProbeLog:
     """Return a probe log with random travel times between dwells (stops of the tip).
 
-    If both bounds of `travel_s` are equal, the log is periodic.
+    If the least and the greatest travel time are equal, the log is periodic.
     """
     gap_s = rng_for(0, "travel").uniform(*travel_s, 2 * indentations_n)
     start_s = np.cumsum(gap_s + dwell_s)
@@ -85,7 +85,8 @@ def test_noisy_marks_give_the_least_squares_line() -> None:
     stream_s = np.linspace(0, 600, 12)
     probe_s = 5 + (1 + 50e-6) * stream_s + rng_for(0, "marks").normal(0, 2e-3, 12)
     found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
-    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # The reference is another solver, which has other parameters.
+    # The reference is another solver of least squares, which has other parameters.
+    slope, offset_s = np.polyfit(stream_s, probe_s, 1)
     assert found.rate == pytest.approx(slope, abs=1e-12)
     assert found.offset_s == pytest.approx(offset_s, abs=1e-9)
     assert found.residual_s == pytest.approx(np.abs(probe_s - offset_s - slope * stream_s).max(), abs=1e-9)
@@ -120,7 +121,8 @@ def test_contacts_determine_the_offset_of_the_clocks(offset_s: float, dwell_s: f
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
     assert worst_s(found, truth, t_s) < dwell_s / 4
-    assert worst_s(found, truth, t_s) < FRAME_S  # The estimate has no bias, because pressing and lifting are symmetric.
+    # The estimated offset has no bias, because a touch begins as long before its dwell as it ends after it.
+    assert worst_s(found, truth, t_s) < FRAME_S
     assert found.explained > 0.8
 
 
@@ -129,7 +131,7 @@ def test_contacts_determine_the_rate_of_a_drifting_clock() -> None:
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
     found = from_contacts(blocks, log, "c")
-    # If the rate were not estimated, times at the end would be wrong by more than a dwell.
+    # If the rate of the clock were not estimated, times at the end would be wrong by more than the length of a dwell.
     assert 200e-6 * np.ptp(t_s) > 0.1
     assert worst_s(found, truth, t_s) < 0.1 / 4
 

@@ -25,8 +25,8 @@ from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# Each case: an injected fault, the wire format, the name of the fault in the log, and the number of faulty frames. None
-# means that the fault is counted in bytes.
+# Each case consists of an injected fault, the wire format, the name of the fault in the log, and the number of faulty
+# frames. None instead of a number means that the fault is counted in bytes.
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -233,7 +233,8 @@ def test_chip_whose_steps_differ_from_those_of_the_other_chips_is_named(chip_i: 
 
 
 def test_fields_that_are_not_multiples_of_a_step_are_accepted() -> None:
-    # An example is a recorder that averages its readings. There is no step to compare.
+    # Such fields are written, for example, by a recorder that averages readings. They have no step that could be
+    # compared between chips.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
     assert check_rows(b_uT, unknown_degC, None, where="here", policy=DEFAULT_POLICY).keep.all()

@@ -179,7 +179,7 @@ def fake_gauge(monkeypatch):
 
 
 class GaugeContext(LabelContext):
-    """The context of a label. A label lasts until the gauge has sent data or is unplugged, instead of a fixed time."""
+    """The context of a label. Instead of a fixed time, a label lasts until the gauge has sent data or is unplugged."""
 
     gauge: FakeGauge
 
@@ -236,7 +236,7 @@ def test_touches_are_detected_by_the_force_if_a_gauge_is_the_only_label_source(c
 class PollCounter(threading.Event):
     """A stop event that counts how often a program waits for it.
 
-    The reader of a growing table waits for this event once per poll.
+    The reader of a growing table waits for this event each time it looks for new rows (polls).
     """
 
     def __init__(self):

@@ -1,4 +1,4 @@
-"""Tests that labels become the same dwells (stops of the tip) for chunks of any size, and the probe log is valid."""
+"""Tests that labels become a valid probe log, with equal dwells (stops of the tip) for chunks of any size."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_writer_skips_dwells_that_do_not_fit_and_writes_the_touch(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    # This dwell is skipped, because it is the late label of a program that hangs.
+    # This dwell is skipped, because it comes too late, from a program that hangs.
     writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))
 
 
@@ -161,7 +161,7 @@ def test_too_short_touches_are_counted():
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
     assert dwells.summary().startswith("2 touches left out: a touch needs 0.05 s")
-    # The touch lasts 0.52 s. This is one dwell, and a rest of 0.01 s that is too short for another dwell.
+    # The touch lasts 0.52 s. It becomes one dwell, and the remaining 0.01 s are too short for another dwell.
     long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
     assert dwells.short_n == 2

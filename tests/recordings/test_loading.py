@@ -1,4 +1,4 @@
-"""Tests of `reskin.load_recording`, which must return the same readings as the readers of each kind of recording."""
+"""Tests that `reskin.load_recording` returns the same readings as the reader of each kind of recording."""
 
 import sys
 
@@ -26,7 +26,7 @@ from tests.test_io import readings
 
 RATE_HZ, FRAMES_N, CHIPS_N = 100.0, 120, 2
 CHANNELS = ["bx0_uT", "by0_uT", "bz0_uT", "bx1_uT", "by1_uT", "bz1_uT"]
-# The x coordinates of three contacts. Each lasts 0.2 s, and comes after 0.2 s without contact.
+# These are the x coordinates of three contacts. Each contact lasts 0.2 s and begins after 0.2 s without contact.
 PLACES_MM = (2.0, 6.0, 10.0)
 
 

@@ -50,7 +50,7 @@ def test_no_alarm_is_raised_for_correct_labels_or_too_little_information():
 def test_each_wrong_orientation_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
     """The recordings at depth 2 are used.
 
-    Of all 18 pairs of recordings, one is inconclusive: board 2 at depth 3 compared with board 1 at depth 1.
+    Of all 18 pairs of recordings, only one is inconclusive: board 2 at depth 3 compared with board 1 at depth 1.
     """
     boards = {}
     for number in (1, 2):

@@ -1,4 +1,4 @@
-"""Tests of reading and writing the probe log, a CSV file with the labels. Errors name the row."""
+"""Tests of reading and writing the probe log, a CSV file with the labels. Errors must name the invalid row."""
 
 import dataclasses
 from pathlib import Path

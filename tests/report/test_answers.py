@@ -103,7 +103,7 @@ def test_answer_uses_experiment_random_presses_if_it_was_run():
     assert found.place.short.startswith("65.0 % (64.0; 66.0)")
     assert found.place.second == f"Universal model (ours), {WAYS[shipped]}: 43.0 % (42.0; 44.0) within 1 mm."
     assert "With 40 labelled presses: 87.0 % (86.0; 88.0) within 1 mm." in found.place.sentences
-    # This is the mean of the rms errors of the two boards.
+    # The rms error is the mean over the two boards.
     assert found.force.short.startswith("not usable; rms error 1.5 N")
     assert "needs of the new skin: 65 presses without labels." in found.tested
 

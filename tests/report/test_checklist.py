@@ -69,7 +69,7 @@ def test_every_number_of_the_paper_is_in_the_checklist():
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
     used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
     assert printed - used == set()
-    assert len(printed) > 30  # This shows that the set is not empty by mistake.
+    assert len(printed) > 30  # This checks that the set is not empty by mistake.
 
 
 def test_every_figure_and_table_of_the_paper_has_a_row():
@@ -327,8 +327,8 @@ def test_p_values_of_related_claims_are_corrected_by_holms_method():
     rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
-    # There are three claims. Their p-value of 0.01 becomes 0.03. Those of 0.03 and 0.04 become 0.06, which is not
-    # significant, although the intervals exclude 0.
+    # There are three claims with the p-values 0.01, 0.03 and 0.04. The corrected p-values are 0.03, 0.06 and 0.06. A
+    # value of 0.06 is not significant, although the interval excludes 0.
     assert table["verdict"].tolist() == [SUPPORTED, INCONCLUSIVE, INCONCLUSIVE, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 

@@ -48,7 +48,10 @@ INTEGRATORS = [
 
 
 def with_times(rows: list[Precision]) -> list[dict]:
-    """Return the rows of a study with run times. Failed rows and the row of the reference have none."""
+    """Return the rows of a study with run times.
+
+    Rows of failed methods and the row of the reference have no run time.
+    """
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
     return [asdict(row) | times.get(row.key, {}) for row in rows]
@@ -280,7 +283,7 @@ def test_figures_of_costs_have_units_and_name_their_source():
 def test_figure_of_training_times_has_one_mark_for_each_method(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
-    # Each point is a mark in the panel and has a mark in the legend. Ticks are marks too.
+    # Each method has one mark in the panel and one in the legend. Ticks are marks, too, and are subtracted.
     assert count_marks(all_) - ticks["all"] - (count_marks(few) - ticks["few"]) == 2
 
 

@@ -1,4 +1,4 @@
-"""Tests of the titles of marks in figures (SVG). Browsers show them as tooltips with the values of the mark."""
+"""Tests of the titles of marks in figures (SVG). Browsers show a title as a tooltip with the values of its mark."""
 
 import re
 import xml.etree.ElementTree as ET

@@ -52,8 +52,8 @@ def test_each_place_is_drawn_once():
 
 def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # On the paper's grid, there are more elements: five chips, the skin and two entries of the legend. There are fewer
-    # spines of the axes, by two.
+    # The figure on the paper's grid has more elements: five chips, the skin and two entries of the legend. Its axes
+    # have two spines fewer.
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere

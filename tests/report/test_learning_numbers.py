@@ -1,6 +1,7 @@
-"""Tests of the numbers of experiments on many skins, against values calculated by hand.
+"""Tests of the numbers of experiments on many skins.
 
-Contrasts, which are also tested, are differences between points of a sweep.
+They are compared with values calculated by hand. Some of the numbers are contrasts, which are differences between
+points of a sweep.
 """
 
 import json
@@ -18,7 +19,8 @@ from pipeline.statistics import tidy
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # The gain by adaptation on each skin, in percentage points.
+# On each skin, adaptation increases the accuracy by this number of percentage points.
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
@@ -163,7 +165,7 @@ def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    # There is one board, with two draws of skins, and n counts boards.
+    # The number n is that of boards. There is one board, with two draws of skins.
     assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
@@ -190,7 +192,7 @@ def test_training_times_are_medians_over_networks():
         "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    # These are median times. The last method was not timed.
+    # These are the medians of the times of each method. The last method was not timed.
     assert [row.get("train_s") for row in timed] == [2, 100, 35, None]
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 

@@ -1,6 +1,5 @@
-"""Tests of the files with the results of a scene.
-
-These are numbers.json (equal for equal runs), provenance.json, and the scores that `dvc metrics` shows.
+"""Tests of the files with the results of a scene: numbers.json, which is equal for equal runs, provenance.json, and the
+scores that `dvc metrics` shows.
 """
 
 import copy

@@ -77,7 +77,7 @@ class Reader(HTMLParser):
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_experiments() if numbers is None else numbers
-    # The synthetic numbers lack values that the tables of these experiments need, so these experiments are omitted.
+    # These experiments are omitted, because the synthetic numbers lack values that their tables need.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
@@ -403,7 +403,8 @@ def test_recorded_scenes_come_first_in_the_index():
 
 
 def test_scenes_without_held_out_boards_come_last_in_the_index():
-    # In the alphabet, scene `a` comes before scene `here`. But it has no held-out boards, so it comes last.
+    # In alphabetical order, scene `a` would come before scene `here`. Scene `a` comes last, because it has no held-out
+    # boards.
     alone = {name: value for name, value in scene_numbers("a", "simulated").items() if name != "table2"}
     both = index([alone, scene_numbers("here", "simulated")], {})
     assert both.index("Scene here") < both.index("Scene a")

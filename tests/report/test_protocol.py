@@ -10,7 +10,7 @@ def test_numbers_of_the_papers_protocol_are_beside_ours():
     assert "7,020 readings of one skin for training, 780 for testing" in single.ours
     many = ran["table 2, many training skins"]
     assert "6 boards, 18 skins, about 10,000 indentations of each" in many.paper
-    assert "2 boards, 4 skins, 250 readings of each" in many.ours  # These are 1,000 readings in total.
+    assert "2 boards, 4 skins, 250 readings of each" in many.ours  # The four skins have 1,000 readings in total.
     assert "390 unlabelled" in ran["table 2, adaptation"].paper
     assert "0, 390 and 780" in ran["figure 6a"].ours
 

@@ -49,7 +49,8 @@ from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
 from tests.report.synthetic import SKINS, adapted_cards, card
 
-FEW = settings(max_examples=25, deadline=None)  # Fewer examples than usual, because building tables takes milliseconds.
+# Hypothesis tries fewer examples than usual, because building each table takes milliseconds.
+FEW = settings(max_examples=25, deadline=None)
 DOUBLE = 1e-9  # The relative rounding error of sums of numbers of about 10.
 VALUES = st.lists(st.floats(-50, 50), min_size=4, max_size=9).filter(lambda values: np.std(values) > 1e-3)
 PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=4, max_size=9).filter(
@@ -85,7 +86,7 @@ def board_scores(values: list[float]) -> pd.DataFrame:
 
 
 def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
-    # The squared errors of fold b0 are 0 and 4 for its two seeds. That of fold b1 is 16.
+    # The squared errors of fold b0 are 0 and 4 for its two seeds. The squared error of fold b1 is 16.
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
@@ -135,7 +136,8 @@ def test_score_table_written_as_csv_is_read_again():
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
     table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    # The numbers of rows of the three parts of the table. In each part, rows are as labelled, registered, or per skin.
+    # The table has three parts. These are their numbers of rows, which have scores as labelled, registered, or per
+    # skin.
     assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
@@ -275,7 +277,7 @@ def test_difference_on_a_single_board_has_no_verdict():
 
 
 def test_repeats_on_one_skin_do_not_count_as_boards():
-    # Here, n counts repeats on one skin, so there is no interval over boards.
+    # The number n is that of repeats on one skin, so there is no interval over boards.
     assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
 
 

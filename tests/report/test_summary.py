@@ -38,7 +38,7 @@ def test_scores_of_recorded_scenes_are_shown_without_those_of_the_paper():
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}, "mse_f_N2": {"mean": 1.0, "n": 2}}
     lines = summarise({"provenance": {"source": "recorded"}, "table2": {"multi": row}})
     assert "(" not in "".join(lines)
-    assert any("50" in line and "–" in line for line in lines)  # A score that is unknown is shown as a dash.
+    assert any("50" in line and "–" in line for line in lines)  # An unknown score is shown as a dash.
 
 
 def test_final_model_of_recorded_boards_is_named():

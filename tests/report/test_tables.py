@@ -143,7 +143,7 @@ def test_lost_bytes_and_rows_are_counted_for_each_protocol():
 def test_every_row_names_its_source():
     for source in ("simulated", "recorded"):
         tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # This is the paper's table, with one column for our skin.
+        ours = tables.pop("table1")[OURS]  # This table is table 1 of the paper, with one more column for our skin.
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
         for table in tables.values():
@@ -199,9 +199,9 @@ def test_number_of_digits_of_a_score_follows_from_its_uncertainty(mean, half, as
     ends = zip((shown, low, high), (mean, *value["ci95"]), strict=True)
     # All numbers have the same number of decimals.
     assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)
-    digits = np.floor(np.log10(half / unit)) + 1  # The number of digits of half the interval.
+    digits = np.floor(np.log10(half / unit)) + 1  # This is the number of digits with which half the interval is shown.
     assert digits <= 3  # There are two digits, or three if an end of the interval would otherwise be rounded to 0.
-    # There are fewer digits only if the mean already has four.
+    # There are fewer digits only if the mean already has four digits.
     assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10
 
 

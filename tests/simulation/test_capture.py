@@ -88,7 +88,7 @@ def test_position_errors_of_the_robot_change_fields_and_not_labels():
     exact, loose = capture_of(noiseless_scene()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
     moved_uT = (frames_by_indentation(exact) - frames_by_indentation(loose))[:, READ].std()
-    assert moved_uT > 2 * 5.0  # This is twice the noise of a reading.
+    assert moved_uT > 2 * 5.0  # This limit is twice the noise of a reading.
 
 
 def test_labels_have_the_commanded_place_and_the_measured_force(capture):

@@ -1,4 +1,7 @@
-"""Tests of the contact response against the formulas of its terms; without terms, all contacts are equal."""
+"""Tests of the contact response against the formulas of its optional terms, such as ageing.
+
+Without optional terms, all contacts must be equal.
+"""
 
 import numpy as np
 import pytest

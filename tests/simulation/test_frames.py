@@ -55,12 +55,13 @@ def test_chip_reads_the_field_of_an_earlier_time_because_conversion_takes_time()
     ramp = one.change_T[:, 0].copy()
     frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))
     found_uT = read(QUIET).b_uT.reshape(N, frames_n, CHIPS_N, 3)
-    # The first frame while the tip moves down, in which the field change is a third of the whole.
+    # Frame 5 is the first one while the tip moves down. At its time, the field change is a third of the whole change.
     share = (found_uT[:, 5] / 1e6 - one.rest_T) / ramp
     large = np.abs(ramp) > 1e-4  # One step of 0.15 uT is less than 0.002 of this change.
     assert (share[large] < 1 / 3 + 0.002).all()
     assert (share[large] > -0.01).all()
-    # The age of conversions differs between chips and between indentations.
+    # The field changes differ, because the time since the last conversion differs between chips and between
+    # indentations.
     assert share[large].max() - share[large].min() > 0.2
 
 

@@ -33,7 +33,7 @@ def test_grid_pass_has_390_indentations():
 
 def test_lines_of_a_drag_are_2_mm_apart():
     plan = plan_of(DRAG)
-    assert plan.x_mm.shape == (2 * 18, 17)  # Lines along 9 rows and 9 columns, at two depths.
+    assert plan.x_mm.shape == (2 * 18, 17)  # There are lines along 9 rows and 9 columns, at two depths.
     rows, columns = slice(0, 9), slice(9, 18)
     np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
     np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])

@@ -1,4 +1,6 @@
-"""Tests of the simulated rig: timeline, clocks, chunks of bytes, dwells; noise and range of its force sensor."""
+"""Tests of the simulated rig: its timeline, clocks, chunks of bytes and dwells, and the noise and range of its force
+sensor.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,8 @@
-"""Tests of dragged tips: tangential forces against Coulomb's law and a spring, no friction, mirrored drags."""
+"""Tests of dragged tips.
+
+Tangential forces are compared with Coulomb's law and a spring. Other tests drag without friction, or along mirrored
+lines.
+"""
 
 from dataclasses import replace
 
@@ -42,7 +46,7 @@ def test_tip_sticks_in_a_short_drag_and_slides_in_a_long_one():
     stiffness = SKIN.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     limit_N = 0.8 * forces(SKIN, np.array([DEPTH_M]))[0]
     np.testing.assert_allclose(found, [[0, 0], [stiffness * 0.1e-3, 0], [limit_N, 0]], rtol=1e-6)
-    assert found[1, 0] < limit_N  # The tip still sticks at the first stop.
+    assert found[1, 0] < limit_N  # At the first stop, the tip does not slide yet.
 
 
 def test_drag_without_friction_equals_a_press():

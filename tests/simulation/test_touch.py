@@ -26,12 +26,12 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # The number of stops of a path. The finer path has twice as many.
+STOPS_N = 48  # A path has this number of stops. The finer path has twice as many.
 # Limit on a ratio: the largest change of dB between two stops on the finer path, divided by the largest change on the
 # coarse path. The ratio is 0.5 if dB is smooth, and 1 if dB jumps.
 HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-# These drags are so short that the tip sticks.
+# These drags are so short that the tip does not begin to slide.
 short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))
 FEW = settings(max_examples=8, deadline=None)
 

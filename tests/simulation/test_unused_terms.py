@@ -31,7 +31,7 @@ def functions_run(scene):
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
     simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # The first run computes the deformation tables.
-    shear.tabulate_depth.cache_clear()  # Otherwise, a cached result would hide a call.
+    shear.tabulate_depth.cache_clear()  # Without this, a result from the cache would hide a call.
     sys.setprofile(note)
     try:
         simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)

@@ -1,6 +1,7 @@
 """Tests of predicting places from readings before contact.
 
-If such predictions succeed, the order of a scan or the memory of earlier presses reveals the place.
+Such predictions can succeed only if the order of a scan, the memory of earlier presses, or a magnetic tip reveals the
+place.
 """
 
 from pathlib import Path
@@ -20,7 +21,8 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
-CHANCE_MAX_PCT = 15.0  # The chance level is 1 in 64. Predictions between neighbouring places score a little more.
+# A random guess is right in 1 of 64 cases. Predictions between neighbouring places are right a little more often.
+CHANCE_MAX_PCT = 15.0
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:

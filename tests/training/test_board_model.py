@@ -1,4 +1,4 @@
-"""Tests of a universal model that is made for another board than the paper's.
+"""Tests of a universal model that is made for a board other than the paper's.
 
 The tests cover the file of the model, its accuracy on simulated skins, and errors for invalid input.
 """

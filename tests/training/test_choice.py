@@ -17,8 +17,8 @@ Card = dict[str, Any]
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
     """Return a model card with one skin per board.
 
-    All scores follow from the place error, so that settings with a smaller place error have the worse accuracy and
-    force error.
+    All scores are computed from the place error, such that settings with a smaller place error have a worse accuracy
+    and a larger force error.
     """
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
@@ -102,7 +102,8 @@ def test_settings_are_compared_by_the_mean_over_boards():
 
 
 def test_scores_of_adapted_skins_are_averaged_over_boards():
-    # Board b0 has two skins (0.2, 0.4), b1 has one (0.9). The mean is (0.3 + 0.9) / 2, not the mean over three skins.
+    # Board b0 has two skins with the errors 0.2 and 0.4, and board b1 has one skin with the error 0.9. The expected
+    # mean is (0.3 + 0.9) / 2, and not the mean over three skins.
     skins = [
         adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))

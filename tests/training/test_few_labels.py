@@ -216,7 +216,7 @@ def test_scaler_ignores_labels_of_the_new_board():
         for name, values in pooled[entry.method.removesuffix(", adapted"), entry.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        # The labels themselves are used for training.
+        # Although the scaler ignores the labels, they are used for training.
         assert (other.few_labels.inputs != prepared.few_labels.inputs).any()
         assert len(prepared.few_labels.inputs) == READINGS_N * entry.labels_n
 

@@ -52,7 +52,7 @@ def test_places_and_fields_are_converted_to_the_axes_of_the_model():
 
 
 def test_recorded_readings_are_grouped_by_press():
-    # The readings of four presses. The third press has no force, and the last one is on another board.
+    # These are the readings of four presses. The third press has no force, and the last press is on another board.
     counts = [2, 150, 1, 3]
     press = np.repeat(np.arange(4), counts)
     board = np.where(press == 3, "other", "own")

@@ -81,8 +81,8 @@ def test_shift_that_moves_places_back_onto_the_grid_area_is_found():
             moved_mm = shift_onto_area(Estimate(place_mm, np.full((65, 2), 0.5), nan, nan, nan), sd_mm=1.0)
             errors.append(moved_mm + shift_mm)
     rms_mm = np.sqrt(np.mean(np.square(errors)))
-    # For comparison: the standard error of the mean of 65 random places in the octagon, by which a shift to the mean
-    # would be wrong.
+    # For comparison, this is the standard error of the mean of 65 random places in the octagon. A shift that moves the
+    # mean place to the middle would be wrong by this distance.
     mean_mm = 4.4 / np.sqrt(65)
     assert rms_mm < 0.8 * mean_mm
 

@@ -279,7 +279,7 @@ def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
     for shift in ({}, OTHER_SLIDE):
         pressed_uT = pokes(skin, shift)[[0, 3, 6, 9, 12]] + rest_uT
         later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(pokes(skin, shift) + rest_uT)
-        assert later.label_frame is None  # There is no label of the later day yet.
+        assert later.label_frame is None  # Labels of the later day have not been passed yet.
         assert later.label(place_mm, None, pressed_uT).label_frame.log_odds < 0
         assert later.slide.same == (not shift)
         assert later.label(place_mm * [1, -1] + [0, 16], None, pressed_uT).label_frame.log_odds > 5

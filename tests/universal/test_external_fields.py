@@ -14,8 +14,8 @@ from tests.universal.test_shipped import PLACES_MM, pokes
 
 UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
 
-# Index of the force of all pokes. Their field changes then have norms of 220 to 410 uT; the norm of each uniform field,
-# over all channels, is 224 uT.
+# This is the index of the force of all pokes. At this force, field changes have norms of 220 to 410 uT over all
+# channels. The norm of each uniform field is 224 uT.
 FORCE_I = 4
 
 

@@ -23,7 +23,7 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 @pytest.fixture(autouse=True)
 def small_lattice(monkeypatch):
-    # For speed, the search covers only places within 2.8 mm of the middle.
+    # To save time, the search covers only places within 2.8 mm of the middle.
     monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])
 
 

@@ -1,4 +1,7 @@
-"""Tests of the compiled loops over hypotheses (place, force) against NumPy and, for Gaussians, closed forms."""
+"""Tests of the compiled loops over hypotheses.
+
+A hypothesis is a place with a force. References are NumPy and, for Gaussian distributions, closed forms.
+"""
 
 import numpy as np
 import pytest

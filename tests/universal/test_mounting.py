@@ -1,4 +1,4 @@
-"""Tests of how the model finds the orientation of a skin on its board, and of the axes of the labels' places."""
+"""Tests of how the model finds the orientation of a skin on its board, and whether the axes of labels are wrong."""
 
 from functools import cache, partial
 
@@ -27,7 +27,7 @@ PLACES_MM = np.array([[5.0, 1.0], [-2.0, 6.0], [-4.0, -3.0], [1.0, -5.0]])
 
 @cache
 def skins() -> Population:
-    """Draw simulated skins on the first call. At import, every test worker would draw them."""
+    """Draw simulated skins on the first call. If they were drawn at import, every test worker would draw them."""
     return draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, SKINS_N, rng_for(0, "mounted"))
 
 

@@ -1,4 +1,7 @@
-"""Tests of the network, whose estimates depend on a set of presses: any number of presses (also none), in any order."""
+"""Tests of the network, whose estimates depend on a set of presses.
+
+The set may have any number of presses, or none, in any order.
+"""
 
 import numpy as np
 import pytest

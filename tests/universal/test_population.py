@@ -39,7 +39,7 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     weighed = draw_population(
         NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(DEFAULT_FORCES, weight_N=5.0)
     )
-    # If a press with a known weight is added, the other presses stay the same.
+    # The other presses must stay the same if a press with a known weight is added.
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 

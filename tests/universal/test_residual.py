@@ -9,7 +9,7 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal.map import NOISE, SHARED, fit_residual, kernel, no_residual
 
-# The places are so far apart that errors at them are not correlated.
+# The places are so far apart that errors at different places are not correlated.
 APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])
 FORCE_N = np.ones(3)
 ERRORS = rng_for(0, "missed").standard_normal((3, 15))

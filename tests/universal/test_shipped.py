@@ -85,7 +85,7 @@ def test_readings_with_a_wrong_number_of_channels_are_refused(skin):
     for b_uT, got in ((np.zeros((2, 12)), r"shape \(2, 12\)"), (np.zeros(14), "14 numbers")):
         with pytest.raises(SchemaError, match=f"b_uT has {got}.* 15 numbers per reading"):
             skin.predict(b_uT)
-    # The types of these arguments are wrong. Without type checks, a user's program can pass them.
+    # These arguments have wrong types, which a program without type checks can pass.
     for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):
         with pytest.raises(SchemaError, match="b_uT: .* is not an array of numbers"):
             inspect.unwrap(check_shape)(b_uT)

@@ -20,8 +20,9 @@ def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
         np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
         moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
         np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
-    # Expected slope of the amplitude. Fields are proportional to the amplitude, and the spread is that of its
-    # logarithm. Therefore the relative finite difference for a step is exp(STEP * spread) - 1, divided by STEP.
+    # This is the expected slope with respect to the amplitude. Fields are proportional to the amplitude, and its spread
+    # is that of the logarithm. Therefore the relative finite difference for a step is exp(STEP * spread) - 1, divided
+    # by STEP.
     grown = (np.exp(STEP * 0.2) - 1) / STEP
     np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)

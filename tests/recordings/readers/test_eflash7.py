@@ -12,13 +12,13 @@ from reskin.recordings.readers import eflash7
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 2
-STEP_uT = 2.4  # The smallest step (LSB) of the recorded chips along x and y.
+STEP_uT = 2.4  # The readings of the recorded chips along x and y are multiples of this step (LSB).
 FIELDS = [f"mag{chip}_{axis}" for chip in range(CHIPS_N) for axis in "xyz"]
 NAMES = ["timestamp", "position", "x_pos", "y_pos", "fx", "fy", "fz", "tx", *FIELDS]
 NAMES_OF_TWO = ["timestamp", "fz", "ty", "pos1_x", "pos1_y", "pos2_x", "pos2_y", *FIELDS]
 HEADER = make_header(layout="eflash7", chips_n=CHIPS_N, contacts_before_n=7)
-# The field of each row, in steps. The rows are: no touch, a touch, no touch, and a touch that begins with a row of
-# zeros (None).
+# These are the fields of the rows, in steps. In order of the rows, there is no touch, a touch, no touch, and a touch
+# that begins with a row of zeros (None).
 LEVELS = [0, 1, 0, 1, 0, 1, 40, 80, 41, 2, 1, None, 90]
 GAUGE_N = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, -0.9, -1.9, -0.9, 0.1, 0.1, -0.4, -2.4]
 

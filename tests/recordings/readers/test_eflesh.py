@@ -47,9 +47,10 @@ def scan(folder: Path, passes_n: int = 3) -> Path:
 
 
 def strokes(folder: Path, strokes_n: int = 3) -> Path:
-    """Return strokes at one place, each after a new baseline.
+    """Return strokes at one place.
 
-    A stroke goes down and up in five rows. In the top rows, the gauge has no new weight.
+    Each stroke follows a new baseline, and goes down and up in five rows. In the rows at the top, the gauge has no new
+    weight.
     """
     stroke = [(288.0, -1.0), (284.0, 100.0), (280.0, 1000.0), (284.0, 150.0), (288.0, -1.0)]
     places = [[315.0, -100.0, z, weight] for z, weight in stroke] * strokes_n

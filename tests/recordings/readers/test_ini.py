@@ -19,8 +19,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# Labels of one pass: two rows at the corner without contact (one still has the label of the last place), then presses.
-# One press is too weak for the gauge.
+# These are the labels of one pass. It begins with two rows without contact at the corner, one of which still has the
+# label of the last place. Then follow the presses. One press is too weak for the gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
@@ -35,7 +35,10 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """Return the text X, Y, Z, T of a chip. From one row to the next, the field rises by one step (LSB)."""
+    """Return the text X, Y, Z, T of a chip.
+
+    The field of each row is one step (LSB) larger than that of the row before.
+    """
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 

@@ -1,6 +1,7 @@
-"""Tests that a row which is missing in one of the two files of layout `ini` is detected, without false alarms.
+"""Tests that a row which is missing in one of the two files of layout `ini` is detected, and that complete files raise
+no alarm.
 
-After the missing row, each field is paired with the label of a neighbouring row.
+After the missing row, each field would be paired with the label of a neighbouring row.
 """
 
 import re
@@ -18,8 +19,9 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
-AT_END_ROWS_N = 100  # A row that is lost less than this number of rows from the start or the end may remain undetected.
-ROW_OFF_MAX = 15  # The tolerance of the reported row number. In 60 cases of public recordings, it is off by at most 5.
+AT_END_ROWS_N = 100  # A missing row may remain undetected if it is nearer to the start or the end than this.
+# The reported row number may be wrong by this much. In 60 cases of public recordings, it is wrong by at most 5.
+ROW_OFF_MAX = 15
 LATE_N = 1
 
 
@@ -30,13 +32,14 @@ def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, 
     """
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    # The number of rows at each place. The first row is without contact, and the depth increases in the following ones.
+    # Each place has this number of rows. The first row is without contact, and the depth increases in the following
+    # rows.
     presses_n = rng.integers(3, 8, len(places_mm))
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
     label = np.column_stack([places_mm[of_place], force_N])
-    label[force_N == 0, :2] = 10  # In rows without contact, the recorder writes this place.
+    label[force_N == 0, :2] = 10  # The recorder writes this place in rows without contact.
     one_pass_uT = rng.normal(0, 18, (len(places_mm), 15))[of_place] * np.sqrt(force_N)[:, None]
     label, b_uT = (np.tile(one, (passes_n, 1))[: 100 * passes_n] for one in (label, one_pass_uT))
     drift_uT = np.linspace(0, 60, len(label))[:, None]

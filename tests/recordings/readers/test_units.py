@@ -17,7 +17,8 @@ from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
-# The step (LSB) and the typical field in uT of real boards: two with ReSkin skins, eFlesh, and eFlesh at another gain.
+# For each real board, these are the step (LSB) and the typical field in uT. Two boards have ReSkin skins, one has
+# eFlesh, and one has eFlesh at another gain of the chips.
 BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
 
 
