@@ -126,7 +126,7 @@ def test_skin_without_springs_has_no_sliding_cases():
 
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
-def test_streams_of_other_boards_are_checked(monkeypatch, chips_n, gain_sel):
+def test_all_cases_of_byte_streams_pass_for_other_boards(monkeypatch, chips_n, gain_sel):
     monkeypatch.setattr(wire, "BLOCKS_N", 1)  # A single block is used, because decoding is slow while memory is traced.
     assert failed(wire_cases(gain_sel, chips_n, SEED)) == set()
 
@@ -140,7 +140,7 @@ def test_case_fails_if_the_expected_error_is_not_raised_or_its_value_is_nan():
     assert not error_case("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
 
 
-def test_errors_of_another_type_are_not_caught():
+def test_rejection_case_does_not_catch_errors_of_unexpected_types():
     with pytest.raises(ZeroDivisionError):
         rejection_case("wire", "a", should="b", attempt=lambda: 1 / 0)
 

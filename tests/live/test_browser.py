@@ -142,7 +142,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
     return act_in_browser
 
 
-def test_page_draws_contacts_and_its_buttons_zero_and_record_work(tmp_path, monkeypatch):
+def test_page_draws_contacts_and_its_buttons_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
 
@@ -194,7 +194,7 @@ CLICK = """((x, y) => { const {frame, parts: {board}} = boards[0], [px, py] = fr
   board.dispatchEvent(new MouseEvent("click", {clientX: at.left + px, clientY: at.top + py, bubbles: true})); })"""
 
 
-def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path, random_pokes):  # noqa: F811
+def test_calibrations_can_be_saved_loaded_and_undone_on_the_page(tmp_path, random_pokes):  # noqa: F811
     quiet = make_poke_script(random_pokes)
     place_mm, force_N = random_pokes[2:]
     poke_i = np.minimum(np.maximum(np.arange(len(quiet)) - QUIET_N, 0) // (2 * POKED_N), len(place_mm) - 1)
@@ -255,7 +255,7 @@ def test_key_a_adapts_the_model_to_presses(tmp_path, random_pokes):  # noqa: F81
         serve(name, load_universal(), in_browser(tmp_path, act))
 
 
-def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
+def test_page_shows_errors_before_and_after_adapting_to_guided_presses(tmp_path, guided_pokes):  # noqa: F811
     quiet = make_poke_script(guided_pokes)
     # The script begins with a pause, in which the test presses the button.
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)

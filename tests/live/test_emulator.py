@@ -217,7 +217,7 @@ class TestFaults:
         assert frames_n("repeated") == len(SCRIPT) + 100
         assert frames_n("torn") == len(SCRIPT) - 2 * 10  # Each torn frame also costs the frame after it.
 
-    def test_clock_jump_needs_frames_with_a_clock(self):
+    def test_fault_clock_jump_raises_if_frames_have_no_clock(self):
         with pytest.raises(ParamsError, match="needs a capture with a clock"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),

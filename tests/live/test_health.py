@@ -51,7 +51,7 @@ def test_healthy_board_raises_no_alarm():
 
 
 @pytest.mark.parametrize("name", ALARMS)
-def test_fault_is_named_and_counted(name):
+def test_alarm_names_the_fault_and_counts_its_frames(name):
     health = feed(inject_fault(name))
     assert set(health.alarms) == {ALARMS[name]}
     alarm = health.alarms[ALARMS[name]]
@@ -101,7 +101,7 @@ def test_reset_chip_is_found_on_a_board_without_contact():
     assert ALARMS["chip-reset"] in alarms
 
 
-def test_chip_that_reads_zeros_is_named():
+def test_alarm_names_a_chip_that_reads_zeros():
     health = feed(inject_fault("zeros"))
     assert {name: alarm.count_n for name, alarm in health.alarms.items()} == {
         f"chip {chip_i}: zeros in place of a reading": 600 for chip_i in range(5)

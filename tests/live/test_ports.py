@@ -32,7 +32,7 @@ def chunks_of(script, cut_n=31):
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
 @pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
-def test_wire_format_number_of_chips_rate_and_steps_are_detected(wire, chips_n, rate_hz):
+def test_properties_of_a_board_are_detected_from_its_bytes(wire, chips_n, rate_hz):
     script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
     found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)

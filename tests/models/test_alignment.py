@@ -47,7 +47,7 @@ def test_coral_equals_a_product_of_square_roots_of_covariances():
 
 
 @pytest.mark.parametrize("align", [match_channels, coral])
-def test_aligning_a_skin_with_itself_changes_nothing(align):
+def test_aligning_a_skin_with_itself_does_not_change_its_inputs(align):
     np.testing.assert_allclose(align(SOURCE, SOURCE)(SOURCE), SOURCE)
 
 

@@ -169,7 +169,7 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
     ],
     ids=["another name", "another schedule", "no triplets"],
 )
-def test_recipes_have_equal_initial_weights_and_batches(other):
+def test_jobs_with_other_recipes_have_equal_initial_weights_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))

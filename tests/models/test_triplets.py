@@ -125,7 +125,7 @@ def test_equal_generators_give_equal_triplets():
     assert any((a != b).any() for a, b in zip(one, other, strict=True))
 
 
-def test_every_ordered_pair_is_equally_likely():
+def test_every_pair_of_positive_and_negative_is_equally_likely():
     # From index 0, the four other points have different distances, so they form six ordered pairs (positive, negative).
     n = 6000
     positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))

@@ -56,23 +56,23 @@ def test_compiled_sum_equals_naive_sum(seed):
 
 
 @given(seeds, st.floats(-5, 5).filter(lambda factor: abs(factor) > 1e-6))
-def test_change_is_linear_in_the_moments_and_equals_that_of_magpylib(seed, factor):
+def test_field_change_equals_that_of_magpylib_and_is_linear_in_the_moments(seed, factor):
     assert not broken(dipoles(seed, factor))
 
 
 @given(seeds)
-def test_dipoles_that_do_not_move_change_nothing(seed):
+def test_dipoles_that_do_not_move_do_not_change_the_field(seed):
     rest, _, observers_m = scene(seed)
     assert not change_of_field(rest, rest, observers_m).any()
 
 
-def test_dipoles_without_moment_change_nothing():
+def test_dipoles_without_moment_do_not_change_the_field():
     (nodes_m, moments), (moved_m, _), observers_m = scene(2)
     nothing = np.zeros_like(moments)
     assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
 
 
-def test_empty_set_of_dipoles_changes_nothing():
+def test_empty_set_of_dipoles_does_not_change_the_field():
     nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
     assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
 

@@ -60,7 +60,7 @@ def test_suppressor_whitens_the_sum_of_external_field_and_noise(noise_uT):
     np.testing.assert_allclose(matrix @ total @ matrix, noise_uT**2 * np.eye(15), atol=1e-8 * 100**2)
 
 
-def test_suppressor_without_external_field_changes_nothing():
+def test_suppressor_is_the_identity_if_there_is_no_external_field():
     np.testing.assert_allclose(suppressor(np.zeros((15, 15)), 4.0), np.eye(15), atol=1e-12)
 
 

@@ -68,7 +68,7 @@ def test_tangential_force_is_never_above_the_friction_limit(path_m, mu, data):
 
 
 @given(st.lists(st.floats(0, 1), max_size=20), st.floats(1e-4, 5e-3), frictions)
-def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
+def test_subdividing_a_straight_path_does_not_change_the_force(cuts, end_m, mu):
     ahead = np.array([0.6, -0.8])
     fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
     ends = [

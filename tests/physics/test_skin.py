@@ -171,12 +171,12 @@ def test_field_change_has_the_symmetries_of_board_and_skin(x_m, y_m, polarity, b
 
 @patient
 @given(places_m, places_m, st.floats(0.01, 5))
-def test_change_is_proportional_to_magnetisation(x_m, y_m, factor):
+def test_field_change_is_proportional_to_the_magnetisation(x_m, y_m, factor):
     skins, pokes_m = (skin(saturation_T=size_T) for size_T in (0.1, 0.1 * factor)), np.array([[x_m, y_m, DEPTH_M]])
     assert mechanics.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
 
 
-def test_tip_above_a_thin_skin_changes_nothing():
+def test_tip_above_a_thin_skin_does_not_change_the_field():
     high = next(s for s in (skin(UNEVEN, f"s{i}", SPARSE) for i in range(50)) if s.depth_zero_m < -0.05e-3)
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 

@@ -66,7 +66,9 @@ def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
     begin_s=st.sampled_from([0.0, UNIX_S]),
     marks_n=st.integers(2, 6),
 )
-def test_exact_marks_recover_offset_and_rate(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
+def test_exact_marks_recover_offset_and_rate_of_the_clock(
+    offset_s: float, drift_ppm: float, begin_s: float, marks_n: int
+) -> None:
     stream_s = begin_s + np.linspace(3, 3600, marks_n)
     # Tolerance: at Unix times, double precision has a resolution of 2e-7 s. The map between the clocks is evaluated
     # between its marks.
@@ -116,7 +118,7 @@ def test_invalid_marks_are_refused(marks: np.ndarray, message: str) -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 12.345, -250.06, UNIX_S])
 @pytest.mark.parametrize("dwell_s", [0.1, 0.4])
-def test_contacts_determine_the_offset_of_the_clocks(offset_s: float, dwell_s: float) -> None:
+def test_offset_of_the_clocks_is_found_from_contacts(offset_s: float, dwell_s: float) -> None:
     log, truth = log_of(100, dwell_s), clock_map(offset_s)
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
@@ -126,7 +128,7 @@ def test_contacts_determine_the_offset_of_the_clocks(offset_s: float, dwell_s: f
     assert found.explained > 0.8
 
 
-def test_contacts_determine_the_rate_of_a_drifting_clock() -> None:
+def test_rate_of_a_drifting_clock_is_found_from_contacts() -> None:
     log, truth = log_of(2000, 0.1), clock_map(8.0, 1 + 200e-6)
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
@@ -136,7 +138,7 @@ def test_contacts_determine_the_rate_of_a_drifting_clock() -> None:
     assert worst_s(found, truth, t_s) < 0.1 / 4
 
 
-def test_contacts_that_are_longer_than_the_pauses_determine_the_offset() -> None:
+def test_offset_is_found_from_contacts_that_are_longer_than_the_pauses() -> None:
     log, truth = log_of(60, 0.5, (0.13, 0.4)), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4

@@ -224,7 +224,7 @@ def test_row_in_which_a_chip_reads_zeros_is_invalid():
 
 
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
-def test_chip_whose_steps_differ_from_those_of_the_other_chips_is_named(chip_i: int) -> None:
+def test_error_names_a_chip_whose_steps_differ_from_those_of_the_other_chips(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread

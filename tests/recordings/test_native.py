@@ -176,7 +176,7 @@ def test_frames_with_a_stuck_chip_are_dropped(tmp_path: Path, marks: tuple[tuple
     assert account["frames_n"] == used + sum(account[key] for key in dropped)
 
 
-def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_has_power_on_settings(tmp_path: Path) -> None:
     b_uT = FRAMES.b_uT.copy()
     steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
     b_uT = np.round(b_uT / steps_uT) * steps_uT

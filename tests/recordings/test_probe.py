@@ -38,7 +38,7 @@ def test_written_log_is_read_unchanged() -> None:
     assert log.Fz_N[3] == 2.5
 
 
-def test_order_of_columns_does_not_matter() -> None:
+def test_columns_may_be_in_any_order() -> None:
     swapped = "\n".join(",".join(reversed(row.split(","))) for row in GOOD.splitlines()) + "\n"
     assert_same(probe.parse(swapped, "probe.csv"), probe.parse(GOOD, "probe.csv"))
 

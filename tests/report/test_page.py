@@ -94,7 +94,7 @@ def read() -> Reader:
     return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
 
 
-def test_page_loads_nothing_and_contains_no_script(read):
+def test_page_loads_only_files_of_the_report_and_has_no_script(read):
     assert [one for one in ("script", "link", "svg") if read.all(one)] == []
     names = ("src", "href", "data")
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
@@ -117,7 +117,7 @@ def test_links_lead_to_ids_that_exist_once(read):
     assert labels <= set(ids)
 
 
-def test_tables_have_names_of_columns(read):
+def test_tables_have_captions_and_header_cells(read):
     tables = read.all("table")
     assert len(tables) > 8
     assert all(above[-1].startswith("div.box") for _, above in tables)
@@ -242,7 +242,7 @@ def test_figure_that_states_no_size_is_refused():
         ("rms error 0.6 N, 78 % of 3 Names", "rms error 0.6_N, 78_% of 3 Names"),
     ],
 )
-def test_numbers_are_not_broken_at_the_end_of_a_line(text, kept):
+def test_no_line_is_broken_within_a_number_and_its_unit(text, kept):
     assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
@@ -444,7 +444,7 @@ def test_description_of_each_scene_begins_with_a_short_sentence(file):
     assert 20 < len(about) < 250
 
 
-def test_index_loads_nothing_and_contains_no_script():
+def test_index_loads_only_files_of_the_report_and_has_no_script():
     text = index([scene_numbers("here", "simulated")], {"here": HEADLINE_SVG})
     addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
     assert addresses

@@ -113,7 +113,7 @@ def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
             cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
             for name in METRICS[
                 :3
-            ]:  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
+            ]:  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
                 total = 0.0
                 for one in cards:
                     total += one["scores"][part][name]
@@ -121,7 +121,7 @@ def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
                 assert row[name] == pytest.approx(total / 2, rel=1e-12)
 
 
-def test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows():
+def test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins():
     predicted = TRUE + RNG.normal(0, 1, TRUE.shape)
     board = np.repeat("b0", 30)
     parts = [slice(0, 10), slice(10, 30)]
@@ -242,7 +242,7 @@ def test_swapping_the_methods_negates_the_difference(values):
 
 @FEW
 @given(VALUES, st.floats(-50, 50))
-def test_comparison_with_a_threshold_equals_comparison_of_shifted_values_with_zero(values, above):
+def test_comparing_values_with_a_threshold_equals_comparing_shifted_values_with_zero(values, above):
     stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
@@ -392,7 +392,7 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
         ]
         if (
             name != "r2_f"
-        ):  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
+        ):  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
             assert stat["values"] == pytest.approx(means)
 
 

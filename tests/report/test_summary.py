@@ -41,7 +41,7 @@ def test_scores_of_recorded_scenes_are_shown_without_those_of_the_paper():
     assert any("50" in line and "–" in line for line in lines)  # An unknown score is shown as a dash.
 
 
-def test_final_model_of_recorded_boards_is_named():
+def test_summary_names_the_final_model_of_recorded_boards():
     model = {"file": "data/models/mine/final/final.safetensors", "boards_n": 3}
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}}
     for source, named in (("recorded", True), ("simulated", False)):
@@ -102,7 +102,7 @@ def test_differences_from_the_commit_are_counted_with_probable_reasons(checkout)
     assert "package torch 2 (committed: 1)" in output
 
 
-def test_reports_that_are_not_committed_or_missing_are_named(checkout):
+def test_summary_lists_reports_that_are_missing_or_not_committed(checkout):
     (checkout / "reports/quick").rename(checkout / "reports/mine")
     assert "Scene mine: its report is not committed" in run("mine")
     assert "Scene other: no results yet. Run: dvc repro report@other" in run("other")

@@ -253,7 +253,7 @@ def test_skin_without_magnetisation_has_no_signal():
 
 
 @pytest.mark.parametrize(("section", "name"), [("rig", "rate"), ("skin", "stickiness"), ("spreads", "chip_gian")])
-def test_unknown_parameter_is_named(section, name):
+def test_error_names_an_unknown_parameter(section, name):
     with pytest.raises(ParamsError, match=name):
         synthesis(section, **{name: 1.0})
 

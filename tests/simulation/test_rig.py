@@ -65,7 +65,7 @@ def test_chunks_contain_every_frame_once_and_never_arrive_early(chunk_frames_max
 
 
 @pytest.mark.parametrize("protocol", [None, DRAG])
-def test_dwells_contain_their_frames(protocol):
+def test_dwells_in_the_log_contain_the_frames_of_their_stops(protocol):
     settings_of_rig, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
     frames = timeline(settings_of_rig, stops_n)

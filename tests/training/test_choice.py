@@ -155,7 +155,7 @@ def test_choice_without_candidates_is_refused(cards, stage):
         choose(cards)
 
 
-def test_record_lists_boards_skins_and_settings():
+def test_record_of_the_choice_lists_boards_skins_and_settings():
     cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
     record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
     assert record["physics"] == "abc"

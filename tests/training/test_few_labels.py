@@ -181,7 +181,7 @@ def test_labelled_pokes_are_drawn_for_each_fold():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
-def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
+def test_smaller_set_of_labels_is_part_of_each_larger_set(seed, labels_n):
     tested_study = study(seed, labels_n=labels_n)
     tasks = few.classical_jobs(tested_study)
     rows = {(entry.fold.name, entry.labels_n): {*task.few_labels} for entry, task in tasks if "ridge" in task.name}

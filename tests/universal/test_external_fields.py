@@ -33,13 +33,13 @@ def moved_mm(model: Universal, b_uT: np.ndarray) -> np.ndarray:
     return np.linalg.norm(after_mm - before_mm, axis=2)
 
 
-def test_with_the_option_a_uniform_field_of_100_uT_does_not_move_estimates():
+def test_uniform_field_of_100_uT_does_not_move_estimates_with_option_external_uT():
     with_mm, without_mm = moved_mm(*nominal(100.0)), moved_mm(*nominal(0.0))
     assert with_mm.max() < 0.2
     assert without_mm.max() > 1.0
 
 
-def test_with_the_option_estimates_in_changing_fields_are_more_accurate():
+def test_estimates_in_changing_fields_are_more_accurate_with_option_external_uT():
     places = np.column_stack([np.random.default_rng(0).uniform(3, 13, (40, 2)), np.full(40, 1.0)])
     noload_uT, b_uT, _ = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     uniform_uT = 100 * np.random.default_rng(1).standard_normal((40, 3))
@@ -83,7 +83,7 @@ def test_estimated_external_field_is_close_to_the_true_one():
     assert np.linalg.norm(cleaned_uT[1] - cleaned_uT[0], axis=1).max() < 0.1 * np.linalg.norm(uniform_uT)
 
 
-def test_model_without_the_option_makes_no_allowance_for_external_fields():
+def test_model_makes_no_allowance_for_external_fields_without_option_external_uT():
     skin = new_map(make_tables())
     db_uT = np.random.default_rng(0).normal(0, 300, (3, 15))
     assert skin.evaluator.without_external(db_uT, skin.evaluator.evaluate(db_uT)) is db_uT
@@ -92,7 +92,7 @@ def test_model_without_the_option_makes_no_allowance_for_external_fields():
     assert "external" not in repr(load_universal())
 
 
-def test_calibration_file_can_be_used_with_the_option(tmp_path):
+def test_calibration_file_can_be_used_with_option_external_uT(tmp_path):
     """The calibration is saved without the option, and loaded with it."""
     model, b_uT = nominal(0.0)
     model.see(b_uT).save(tmp_path / "skin.safetensors")

@@ -60,7 +60,7 @@ def test_network_can_be_built_for_any_number_of_chips(chips_n):
 
 
 @pytest.mark.parametrize("presses_n", [0, 20])
-def test_numpy_equals_pytorch(presses_n):
+def test_network_in_numpy_equals_that_in_pytorch(presses_n):
     weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
     found = predict([weights], READ_uT, REST_uT, PRESSES_uT[:presses_n])
     read, rest, presses = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, PRESSES_uT))

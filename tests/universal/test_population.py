@@ -26,7 +26,7 @@ from tests.universal.skins import SETUP
 COARSE = replace(SETUP, rule=COARSE_RULE)
 
 
-def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
+def test_drawn_skins_do_not_depend_on_how_many_are_drawn(monkeypatch):
     # Only one thickness and one tip are simulated, because the tables for each combination take seconds.
     monkeypatch.setattr(population, "THICKNESSES", {1.0: 1.0})
     monkeypatch.setattr(population, "TIPS", {1.0: 1.0})

@@ -25,7 +25,7 @@ def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
 
 
 @pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])
-def test_every_label_is_held_out_once(labels_n):
+def test_cross_validation_holds_out_every_label_once(labels_n):
     parts = folds_of_labels(labels_n)
     assert sorted(i for _, held_out in parts for i in held_out) == list(range(labels_n))
     assert all(sorted([*kept, *held_out]) == list(range(labels_n)) for kept, held_out in parts)

@@ -165,7 +165,7 @@ def test_repr_of_models_is_one_line(skin):
     assert "chips_m=[5, 3]" in repr(board)
 
 
-def test_presses_one_by_one_calibrate_nearly_as_presses_together(skin):
+def test_calibration_with_presses_one_by_one_is_close_to_that_with_all_at_once(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
     at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean

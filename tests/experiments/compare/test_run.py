@@ -93,20 +93,20 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(recorded):
     assert sentence(recorded) == "Labels, chips and skin are oriented as the scene states."
 
 
-def test_exchanged_chips_are_named(recorded):
+def test_exchanged_chips_are_reported(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
     assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_axis_along_which_all_chips_are_mirrored_is_named(recorded, axis):
+def test_axis_along_which_all_chips_are_mirrored_is_reported(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
         f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
-def test_rotated_chip_is_named(recorded):
+def test_rotated_chip_is_reported(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
@@ -115,7 +115,7 @@ def test_rotated_chip_is_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
+def test_axis_along_which_labels_are_mirrored_is_reported(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
@@ -123,7 +123,7 @@ def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
     )
 
 
-def test_skin_with_exchanged_poles_is_named(recorded):
+def test_skin_with_exchanged_poles_is_reported(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
     assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
 

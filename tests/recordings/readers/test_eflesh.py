@@ -157,7 +157,7 @@ def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", eflesh.FILES)
 @pytest.mark.parametrize("cell", ["nan", "-inf", "", "1,5", "x"])
-def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_error_names_the_line_of_a_cell_that_is_not_a_number(tmp_path: Path, name: str, cell: str) -> None:
     edit(scan(tmp_path) / name, 3, 2, cell)
     message = error_of(tmp_path)
     assert name in message
@@ -192,7 +192,7 @@ def test_clock_that_runs_backwards_is_refused(tmp_path: Path) -> None:
     assert "time does not increase in line 3" in error_of(tmp_path)
 
 
-def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_number_of_chips_than_its_header_is_refused(tmp_path: Path) -> None:
     message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 16" in message
     assert ": 7 columns" in message

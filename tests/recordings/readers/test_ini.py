@@ -278,7 +278,7 @@ def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: 
     return folder
 
 
-def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_has_power_on_settings(tmp_path: Path) -> None:
     message = error_of(recording_with_resets(tmp_path, {1}, range(24)))
     assert "chip 1 must be that of the other chips" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
@@ -290,7 +290,7 @@ def test_recording_in_which_all_chips_have_power_on_settings_is_refused(tmp_path
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_chip_that_loses_its_settings_during_the_recording_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_loses_its_settings_during_the_recording(tmp_path: Path) -> None:
     # There are 2400 rows, which the reader checks in two blocks.
     message = error_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
     assert "from row 1201: the LSB of chip 1 must" in message
@@ -318,7 +318,7 @@ def test_file_of_labels_is_found_by_its_name(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("cell", ["nan", "-inf", "1e30", "1,5", "x"])
 @pytest.mark.parametrize("name", ini.FILES)
-def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_error_names_the_line_of_a_cell_that_is_not_a_number(tmp_path: Path, name: str, cell: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     edit(path, 3, f"{cell} {path.read_text().splitlines()[2].partition(' ')[2]}")
     message = error_of(tmp_path)
@@ -327,7 +327,7 @@ def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str
 
 
 @pytest.mark.parametrize("name", ini.FILES)
-def test_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
+def test_error_names_the_line_of_a_missing_or_extra_cell(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     line = path.read_text().splitlines()[2]
     for broken in (f"{line} 1", line.rpartition(" ")[0]):
@@ -343,7 +343,7 @@ def test_files_with_different_numbers_of_rows_are_refused(tmp_path: Path) -> Non
     assert f"8 in {ini.READINGS} and 7 in {ini.TRUTHS}" in error_of(tmp_path)
 
 
-def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_number_of_chips_than_its_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 20" in message
     assert ": 12 columns" in message
