@@ -24,7 +24,7 @@ RATE_HZ = 400.0
 
 
 def linear_presses(durations_n=(40, 100, 300), noise_uT=0.0, delay_s=0.0):
-    """Return presses on a skin whose channels are 100 uT per mm or per N of x, y and F.
+    """Return presses on a skin with three channels, which are 100 uT per mm of x, per mm of y and per N of force.
 
     The field is that of the force `delay_s` ago, so it lags behind the force labels.
     """

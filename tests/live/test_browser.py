@@ -58,7 +58,7 @@ COMPARE_TRACES = """((board, i) => {
     .map((values) => values.filter((_, at) => at % 4 === 3));
   return [old.filter((alpha, at) => Math.abs(alpha - fresh[at]) > 64).length, fresh.filter(Boolean).length]; })"""
 pytestmark = [
-    pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}"),
+    pytest.mark.skipif(BROWSER is None, reason=f"RESKIN_BROWSER is not set, and PATH has none of {NAMES}"),
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.timeout(300),
@@ -93,7 +93,7 @@ class Tab:
             if accept(found := await self.value(expression)):
                 return found
             await asyncio.sleep(0.02)
-        raise AssertionError(f"never: {expression}; last {found}")
+        raise AssertionError(f"{expression} was never as expected; its last value is {found}")
 
     async def press_key(self, key: str) -> None:
         for kind in ("keyDown", "keyUp"):

@@ -124,7 +124,7 @@ async def watch_page(address: str) -> None:
                 near_n += int(np.abs(found - PLACES).max(axis=1).min() < 1.0)
             if near_n >= 10 and "no data" in alarms and "unplugged" in alarms:
                 return
-        raise AssertionError(f"{near_n} messages of pokes near their place; alarms: {alarms[:500]}")
+        raise AssertionError(f"{near_n} messages had a poke near its place; alarms: {alarms[:500]}")
 
 
 class connect:

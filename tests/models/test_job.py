@@ -167,7 +167,7 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
         pooled(weight_decay=0.5, rate_max=1e-4),
         without_triplets(),
     ],
-    ids=["another name", "another schedule", "no triplets"],
+    ids=["other names", "other schedule", "no triplet loss"],
 )
 def test_jobs_with_other_recipes_have_equal_initial_weights_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
@@ -206,21 +206,21 @@ def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
 
 
 INFLUENTIAL_ROWS = {
-    "a trained field": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
-    "a trained place": ("pooled", with_row("target", TRAIN[3], 1.0)),
-    "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
-    "a tested field": ("pooled", with_row("db_uT", TEST[3], 1.0)),
-    "a poked field": ("adapting", with_row("db_uT", POKED[3], 1.0)),
-    "an own field": ("few labels", with_row("db_uT", LABELLED[1], 1.0)),
-    "an own label": ("few labels", with_row("target", LABELLED[1], 1.0)),
+    "field of a training row": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
+    "target of a training row": ("pooled", with_row("target", TRAIN[3], 1.0)),
+    "skin of a training row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
+    "field of a test row": ("pooled", with_row("db_uT", TEST[3], 1.0)),
+    "field of an unlabelled poke": ("adapting", with_row("db_uT", POKED[3], 1.0)),
+    "field of a labelled row": ("few labels", with_row("db_uT", LABELLED[1], 1.0)),
+    "target of a labelled row": ("few labels", with_row("target", LABELLED[1], 1.0)),
 }
 OTHER_ROWS = {
-    "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
-    "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
-    "the name of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
-    "the skin of a tested row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
-    "a poked place": ("adapting", with_row("target", POKED[3], np.nan)),
-    "a label that is not its own": ("few labels", with_row("target", POKED[5], 1.0)),
+    "target of a test row": ("pooled", with_row("target", TEST[3], 1.0)),
+    "field of a row that is not used": ("pooled", with_row("db_uT", 30, 1.0)),
+    "names of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
+    "skin of a test row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
+    "target of an unlabelled poke": ("adapting", with_row("target", POKED[3], np.nan)),
+    "target of a row whose label is not used": ("few labels", with_row("target", POKED[5], 1.0)),
 }
 
 

@@ -93,7 +93,7 @@ def test_title_of_a_line_without_marks_is_its_label():
 @pytest.mark.parametrize(
     "values",
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
-    ids=["too many", "one not drawn"],
+    ids=["too many marks", "one mark not drawn"],
 )
 def test_marks_have_no_titles_if_there_are_too_many_or_one_is_not_drawn(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []

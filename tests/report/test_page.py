@@ -474,7 +474,7 @@ for (const px of [400, 1400]) {{
 </script></body>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}")
+@pytest.mark.skipif(BROWSER is None, reason=f"RESKIN_BROWSER is not set, and PATH has none of {NAMES}")
 @pytest.mark.parametrize("one", ["scene", "all scenes"])
 def test_nothing_is_wider_than_the_page_on_phones_and_desktops(one, tmp_path):
     wide = pd.DataFrame(

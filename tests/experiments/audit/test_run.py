@@ -300,7 +300,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
             "train_triplet", "not chosen by the study: it chose no recipe for this stage",
         ),
     ],
-    ids=["another rate", "no choice"],
+    ids=["recipe with another rate", "no chosen recipe"],
 )  # fmt: skip
 def test_recipe_that_differs_from_the_chosen_settings_is_reported(scene, chosen, stage, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})

@@ -143,18 +143,21 @@ def with_cell(rows: pd.DataFrame, row_i: int, column: str, value: object) -> pd.
 
 
 MISTAKES = {
-    "a word for a number": (lambda t: with_cell(t, 9, "Bx1", "high"), "Bx1 in line 11"),
-    "an empty field": (lambda t: with_cell(t, 4, "By0", ""), "By0 in line 6"),
-    "an unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
-    "no place": (lambda t: t.drop(columns="x_mm"), "x_mm"),
-    "a chip without z": (lambda t: t.drop(columns="Bz1"), "Bz1"),
+    "text instead of a number": (lambda t: with_cell(t, 9, "Bx1", "high"), "Bx1 in line 11"),
+    "empty field": (lambda t: with_cell(t, 4, "By0", ""), "By0 in line 6"),
+    "unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
+    "no column of places": (lambda t: t.drop(columns="x_mm"), "x_mm"),
+    "no z column of a chip": (lambda t: t.drop(columns="Bz1"), "Bz1"),
     "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
-    "no contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
-    "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
-    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse its sign"),
-    "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
-    "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
-    "a press twice": (
+    "no row in contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
+    "fields in millitesla": (
+        lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}),
+        "Convert mT or G",
+    ),
+    "wrong sign of forces": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse its sign"),
+    "misspelt column name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
+    "missing force in one row": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
+    "number of an indentation used twice": (
         lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)),
         "indentation 0 begins again in line 19",
     ),
