@@ -134,7 +134,7 @@ def test_one_random_row_of_each_press_is_kept():
     kept = one_row_per_poke(indentation, candidates, rng_for(0, "kept"))
     assert indentation[kept].tolist() == [1, 2, 3, 4, 5, 6]
     assert np.isin(kept, candidates).all()
-    assert len(set(kept % 5)) > 1  # The kept reading of a press is random.
+    assert len(set(kept % 5)) > 1  # Which reading of a press is kept must be random.
 
 
 def test_scores_are_averaged_over_boards():

@@ -123,7 +123,7 @@ def test_each_combination_of_settings_is_scored(rows):
     assert {name[:2] for name in names if name[2] == NEAREST} == {(CHECKERBOARD, 65), (HALVES, 65)}
 
 
-def test_labels_improve_place_and_force(rows):
+def test_labels_reduce_errors_of_places_and_forces(rows):
     def mean(labels: str, metric: str) -> float:
         values = [row[metric] for row in rows if row["labels"] == labels and row["tested"] == CHECKERBOARD
                   and row["method"] != NEAREST and row["presses_n"] == 65]  # fmt: skip

@@ -182,7 +182,7 @@ def test_universal_model_has_scores_for_each_way_of_using_the_known_presses(scor
 
 
 @given(arrays(float, (12, 2), elements=st.floats(-100, 100)), st.lists(st.integers(0, 3), min_size=8, max_size=8))
-def test_mean_by_group_equals_the_mean_of_the_rows_of_each_group(values, numbers):
+def test_mean_by_equals_the_mean_of_the_rows_of_each_group(values, numbers):
     group = np.array([0, 1, 2, 3, *numbers])
     expected = [values[group == i].mean(axis=0) for i in range(4)]
     np.testing.assert_allclose(limits.mean_by(group, values), expected, atol=1e-9)
@@ -391,8 +391,8 @@ def test_older_no_load_readings_raise_the_threshold_and_the_smallest_detected_fo
             assert better["power_law_N"] < worse["power_law_N"]
         assert by_rate[0]["detected_pct"] == 100
         assert by_rate[0]["smallest_N"] == pytest.approx(0.7, rel=0.11)  # Even the smallest of all forces is detected.
-        # Extrapolating in proportion to the force gives larger forces than extrapolating by a power law with an
-        # exponent below 1.
+        # If the field change is assumed to be proportional to the force, the extrapolated force is larger than by a
+        # power law with an exponent below 1.
         assert by_rate[0]["power_law_N"] < by_rate[0]["proportional_N"] < 0.7
         live = next(row for row in numbers["rows"] if row["board"] == board and row["rule"] == limits.BY_LIVE)
         assert live["false_alarm_pct"] == 0

@@ -245,8 +245,8 @@ def test_fields_of_magpylib_equal_those_of_our_kernel(quadratures):
 def test_field_computed_by_the_flow_equals_that_computed_by_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
-    # The tolerance is 0.5 %, because the two methods interpolate between different nodes. If moments were not rotated,
-    # the error would be larger than dB itself.
+    # The tolerance is 0.5 %, because the two methods interpolate between different nodes. If the moments were not
+    # rotated, the error would be larger than the field change dB itself.
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 

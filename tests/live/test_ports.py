@@ -114,7 +114,7 @@ def test_opening_a_device_that_is_not_a_serial_port_raises():
         find.open_port(os.devnull, find.BAUD)
 
 
-def test_single_board_is_found_and_two_boards_are_ambiguous(monkeypatch):
+def test_find_board_raises_unless_exactly_one_board_is_connected(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}

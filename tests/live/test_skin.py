@@ -87,7 +87,7 @@ def test_slow_caller_receives_the_latest_reading(tmp_path):
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
-def test_pauses_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
+def test_readings_continue_after_alarms_for_pauses_and_unplugging(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, seen = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -194,7 +194,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
 
 
-def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
+def test_places_and_forces_are_estimated_on_a_sleeve_of_forty_chips(tmp_path):
     model = read_network(write_model(tmp_path, chips_n=40))
     skin, readings = play_to_skin(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
@@ -221,7 +221,7 @@ def test_eight_boards_are_read_at_once():
         assert list(pool.map(look, names)) == list(chips_n)
 
 
-def test_wrong_number_of_chips_and_missing_ports_are_refused(tmp_path):
+def test_open_raises_for_a_wrong_number_of_chips_or_a_missing_port(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model has 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()

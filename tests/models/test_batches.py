@@ -61,9 +61,9 @@ def test_positive_is_nearer_than_the_negative_in_labelled_triplets():
 
 
 def test_triplets_of_unlabelled_pokes_are_ordered_along_one_line():
-    """Rows can be on two lines.
+    """In a triplet, the positive poke must be nearer to the anchor than the negative poke.
 
-    On one of these lines, the positive poke must be nearer to the anchor than the negative.
+    As rows can be on two lines, this must hold on one of the lines.
     """
     job = some_job(terms=True)
     points, row = job.unlabelled.points, job.unlabelled.row
@@ -97,9 +97,9 @@ def test_batches_of_a_network_do_not_depend_on_other_networks_of_the_stack():
 
 
 def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
-    """Methods are compared on equal batches, so a loss term must not change the random draws for other terms.
+    """Methods are compared on equal batches.
 
-    This must hold in every block of steps.
+    Therefore, in every block of training steps, adding a loss term must not change the random draws for other terms.
     """
     full = some_job(terms=True)
     without = {

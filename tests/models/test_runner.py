@@ -80,7 +80,7 @@ def test_result_says_whether_it_was_read_from_the_cache(tmp_path):
     both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
-    # Also for a result from the cache, the seconds are those of the training.
+    # For a result from the cache, `seconds` is the time that its training took.
     assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])
 
 

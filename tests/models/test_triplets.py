@@ -70,7 +70,7 @@ def test_names_of_groups_do_not_change_triplets(case):
 
 
 def test_distances_of_places_use_both_axes():
-    # Seen from (0, 0), the point (3, 0) is nearer than the point (2, 3), although its x is larger.
+    # The point (3, 0) is nearer to (0, 0) than the point (2, 3) is, although its x is larger.
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
     positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
     assert set(positive) == {1}

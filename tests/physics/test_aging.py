@@ -176,7 +176,7 @@ def test_softening_is_the_sum_of_settling_and_ageing():
 
 
 def test_softening_from_contact_1000_to_1030_is_below_1_percent():
-    # Therefore a scene with few contacts on a skin that was cycled 1000 times may neglect softening.
+    # Therefore softening may be neglected in a scene with few contacts on a skin that has had 1000 contacts before.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 
@@ -246,7 +246,7 @@ def test_oscillation_of_the_room_temperature_is_added_to_the_warming(time_s):
     room = TEMPERATURE.model_copy(update={"swing_K": 2.0})
     # The temperature is given as the rise since the start, so it is zero at the start.
     assert temperature_rise_K(np.zeros(1), room) == 0
-    # The first half of the oscillation is warm.
+    # In the first half of the oscillation, the room is warmer.
     assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), TEMPERATURE)
     # The two times are half a period apart, so the oscillation has opposite signs.
     time = np.array([time_s, time_s + 300.0])

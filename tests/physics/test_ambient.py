@@ -71,7 +71,7 @@ def test_ball_of_permeability_one_has_no_field():
     assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
 
 
-def test_field_of_dipoles_near_iron_is_perpendicular_to_its_surface():
+def test_field_of_dipoles_and_their_images_is_perpendicular_to_the_surface_of_iron():
     observers_m = on_sphere(RADIUS_M)
     together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))

@@ -78,13 +78,13 @@ def test_empty_set_of_dipoles_does_not_change_the_field():
 
 
 @given(seeds)
-def test_changes_of_a_move_and_of_its_reverse_sum_to_zero(seed):
+def test_field_changes_of_a_move_and_of_the_opposite_move_sum_to_zero(seed):
     rest, moved, observers_m = scene(seed)
     back_T = change_of_field(moved, rest, observers_m)
     np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)
 
 
-def test_change_by_a_tiny_move_is_precise():
+def test_field_change_by_a_tiny_move_is_precise():
     # Reference: the derivative of the field along the move. For a move of 1e-9 m, the change is only 1e-6 of the field,
     # so a difference of two fields would lose six digits.
     (nodes_m, moments), _, observers_m = scene(3)

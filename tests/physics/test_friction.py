@@ -96,7 +96,7 @@ def test_loop_dissipates_friction_force_times_sliding_length():
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
-    # From rest, the work done equals the dissipated energy plus the energy that is stored in the spring.
+    # If the tip starts at rest, the work equals the dissipated energy plus the energy that is stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
 

@@ -71,7 +71,7 @@ def test_base_does_not_move_and_surface_has_no_shear_stress():
     assert np.isfinite(top).all()
 
 
-@settings(max_examples=30)  # Fewer examples than usual, because each takes 50 ms.
+@settings(max_examples=30)  # Hypothesis tries fewer examples than usual, because each example takes 50 ms.
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
 def test_force_of_small_tips_equals_the_series_of_dimitriadis(thickness_m, tip_radius_m, relative_depth):
     # The published series in chi = sqrt(R d) / h is wrong from its term in chi^2 on. The force is too low by 8 % at chi

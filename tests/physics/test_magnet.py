@@ -74,8 +74,8 @@ def test_reflected_array_of_magnets_has_the_reflected_field(point_m, polarity):
 
 
 def test_field_of_the_array_equals_the_specification():
-    # The specified field in the slab is 0.38 to 0.65 T. It is weaker where seams cross, and stronger at the faces of
-    # the magnets.
+    # The specified field in the slab is 0.38 to 0.65 T. The field is weaker at places where seams between magnets
+    # cross, and stronger at the faces of the magnets.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 

@@ -143,7 +143,7 @@ def test_short_waves_satisfy_the_boundary_conditions():
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
 
 
-def test_shear_and_pressure_satisfy_bettis_reciprocity_theorem():
+def test_work_of_shear_and_pressure_satisfies_bettis_reciprocity_theorem():
     """By Betti's theorem, two kinds of work are equal.
 
     They are the work of the pressure along the displacement that the traction causes, and the work of the traction
@@ -320,7 +320,7 @@ def test_displacement_is_symmetric_under_reflection_along_the_force():
     nodes_m, mirror = random_places_m(), np.array([1, -1, 1])
     here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
-    # The curl is an axial vector, so its components along the reflected plane change sign.
+    # The curl is an axial vector, so its components in the plane of reflection change sign.
     np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)
     back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
@@ -337,7 +337,7 @@ def test_skin_moves_with_the_tip_and_rotates_forward():
 def test_nodes_at_the_base_and_far_from_the_contact_do_not_move():
     base = displace([0.5, 0.3], random_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
-    assert base.half_curl.any()  # The material at the base shears, and therefore rotates, although it does not move.
+    assert base.half_curl.any()  # The material at the base is sheared and therefore rotates, although it does not move.
     away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
     assert not away.displacement_m.any()
     assert not away.half_curl.any()
@@ -349,7 +349,8 @@ def test_displacement_beyond_the_range_of_the_table_is_below_half_a_percent():
         assert np.abs(table.parts[-1, :, :3]).max() < 0.005 * table.parts[..., 0].max()
 
 
-@settings(max_examples=10, deadline=None)  # Fewer examples than usual, because each computes a table in 20 ms.
+# Hypothesis tries fewer examples than usual, because each example computes a table, which takes 20 ms.
+@settings(max_examples=10, deadline=None)
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
 def test_displacement_scales_with_the_size_and_the_inverse_stiffness(size, hardness):
     nodes_m = random_places_m(30)
@@ -422,7 +423,7 @@ def test_midpoint_steps_equal_many_small_steps_of_force():
     assert over[1] < over[0] / 3
 
 
-def test_small_force_needs_no_midpoint():
+def test_midpoint_steps_equal_a_single_step_for_a_small_force():
     nodes_m = random_places_m()
     once, half_way = (
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)

@@ -29,7 +29,7 @@ PEAK_T = 1e-3  # Fields are of this order of magnitude. Tolerances for rounding 
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
 DEPTH_M = 0.6e-3  # The tested laws hold at any depth. All tests use the same depth, so that a single table is computed.
 places_m = st.floats(-8e-3, 8e-3)
-# There is no deadline, because the first example computes the tables for all examples.
+# Hypothesis has no time limit for an example, because the first example computes the tables for all examples.
 patient = settings(max_examples=20, deadline=None)
 
 
@@ -283,7 +283,7 @@ def test_field_at_rest_has_the_magnitude_of_recorded_fields():
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
 
 
-def test_slipping_skin_is_softer_and_reaches_farther():
+def test_slipping_skin_is_softer_and_changes_the_field_of_distant_chips_more():
     bonded, slipping = skin(), skin(base="slipping")
     # At a depth of 1.2 mm, the bonded skin is 1.8 times as stiff as the slipping one.
     assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))

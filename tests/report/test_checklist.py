@@ -58,7 +58,7 @@ def judge_value(
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
-def test_every_row_refers_to_an_existing_number(one):
+def test_every_row_of_the_checklist_refers_to_an_existing_number(one):
     assert one.ours is None or resolve(all_experiments(), one.ours) is not None
     assert one.stage is None or one.stage in STAGES
     assert (one.paper is None) != (one.says is None)

@@ -118,7 +118,7 @@ def test_rows_without_an_error_or_a_time_are_not_drawn():
     assert count_marks(untimed) == count_marks(without)
 
 
-def test_pages_contain_the_studies_of_the_scene():
+def test_cost_pages_contain_only_the_studies_that_were_run():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
     assert set(cost_pages(stages | {"integrators": with_times(INTEGRATORS)}, "simulated")) == {

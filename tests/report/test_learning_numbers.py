@@ -100,7 +100,7 @@ def test_paired_differences_are_averaged_over_the_skins_of_each_board():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_difference_of_multi_and_single_uses_the_skins_that_both_were_tested_on():
+def test_methods_multi_and_single_are_compared_on_skins_on_which_both_were_tested():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
     assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}

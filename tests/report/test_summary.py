@@ -92,7 +92,7 @@ def test_report_is_called_reproduced_only_if_it_was_computed_again(checkout):
     assert "Scene quick is reproduced: all " in run("quick")
 
 
-def test_differences_from_the_commit_are_counted_with_probable_reasons(checkout):
+def test_summary_counts_differences_from_the_committed_report_and_gives_reasons(checkout):
     scores = numbers_of("quick")["table2"]
     scores["multi"]["accuracy_pct"]["mean"] *= 0.5
     change(checkout, "numbers.json", table2=scores)

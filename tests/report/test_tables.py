@@ -170,7 +170,7 @@ def test_tables_of_scores_explain_their_metric():
     assert "within 1 mm" not in to_markdown(tables["captures"])
 
 
-def test_unknown_number_is_a_dash():
+def test_table_shows_a_dash_for_an_unknown_number():
     unknown = card("single_temporal", "s0", 99.0)
     del unknown["scores"]["all"]["mse_f_N2"]
     table = make_tables(numbers([unknown]))["single_sensor"]

@@ -198,15 +198,15 @@ def test_ageing_softens_the_skin_and_moves_its_no_load_field(capture):
     early_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         0
     ]
-    # The limit is three standard deviations of noise alone: of a difference of two means of two readings with 5 uT
-    # each.
+    # Without drift, there would only be the noise of a difference of two means, each of two readings with 5 uT of
+    # noise. The limit is three standard deviations of this noise.
     assert np.abs(early_uT).max() < 12
 
 
 def test_relaxation_lowers_only_the_force(capture):
     slack = capture_of(aged_capture(relaxation=RELAXATION))
     ratio = np.median(labels_in_contact(slack, "Fz_N")[65:130] / labels_in_contact(capture, "Fz_N")[65:130])
-    # After 1 s, the two fastest terms (0.05 each) have relaxed, and at most a tenth of the third.
+    # After 1 s, the two fastest terms of the relaxation (0.05 each) and at most a tenth of the third term have relaxed.
     assert 0.88 < ratio < 0.91
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
@@ -216,7 +216,8 @@ def test_warming_raises_chip_temperatures_and_weakens_the_field(capture):
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
-    # The constant offset of the chips, of 200 uT, summed over 15 channels. The mean of |normal| is 0.8.
+    # Chips have constant offsets with a standard deviation of 200 uT. This is the expected sum of their magnitudes over
+    # 15 channels, because the mean of |normal| is 0.8.
     offset = 5 * 3 * 200 * 0.8
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 

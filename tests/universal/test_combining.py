@@ -50,7 +50,9 @@ def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
 
 
 def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
-    """Without a field change, all places are equally likely for the map, so the place comes from the network."""
+    """If there is no field change, all places are equally likely according to the map, so the network determines the
+    place.
+    """
     place_mm = np.array([[3.0, 2.0], [-4.0, 1.0]])
     db_uT = fields_uT(place_mm, np.array([2.0, 3.0]))
     right = evaluation(skin, db_uT, place_mm).combined(1.0)

@@ -257,7 +257,7 @@ def test_files_with_too_many_or_invalid_days_raise(first_day, monkeypatch):
     assert later.presses_n == 22
 
 
-def test_file_holds_as_many_days_and_labels_as_are_allowed_for_64_chips(tmp_path):
+def test_file_can_hold_the_greatest_number_of_days_and_labels_for_64_chips(tmp_path):
     channels_n, file = 3 * 64, tmp_path / "full.safetensors"
     full = CalibrationData.at_rest(np.zeros(channels_n))
     pressed_uT = np.ones((FULL_SET_N, channels_n))
@@ -310,8 +310,8 @@ def test_middle_of_the_skin_found_on_the_first_day_is_kept_on_a_new_day(skin, tm
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
     found_mm = []
-    # All presses of the first day are on one side of the skin. With `even`, their mean place is nevertheless taken as
-    # the middle of the skin, which shifts the estimates. The new day must keep this shift.
+    # All presses of the first day are on one side of the skin. Argument `even` nevertheless takes their mean place as the
+    # middle of the skin, which shifts the estimates. The model must keep this shift on the new day.
     for even in (
         False,
         True,

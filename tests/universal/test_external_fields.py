@@ -50,7 +50,8 @@ def test_estimates_in_changing_fields_are_more_accurate_with_option_external_uT(
         return float(np.median(np.linalg.norm(found[:, :2] - places[:, :2], axis=1)))
 
     assert error_mm(100.0, moving_uT) < error_mm(0.0, moving_uT)
-    # If there are no external fields, the option makes estimates less accurate, because it discards information.
+    # If there are no external fields, the option makes estimates less accurate, because a part of each field change is
+    # attributed to external fields.
     assert error_mm(0.0, b_uT) < error_mm(100.0, b_uT)
 
 

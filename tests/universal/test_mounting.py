@@ -124,10 +124,11 @@ def test_each_no_load_reading_determines_the_orientation_unless_the_user_states_
     assert load_universal().zero(-rest_uT, turned=True).zero(rest_uT, keep=True).mounting.turned
 
 
-def test_skin_is_not_assumed_turned_on_weak_evidence():
+def test_skin_is_assumed_turned_only_if_the_evidence_is_strong():
     weak_uT = -0.1 * skins().rest_uT[0].astype(float)
     found = find_mounting(TABLES, weak_uT)
-    assert 0 < -found.log_odds < LOG_ODDS_MIN  # The turned orientation is more probable, but not by enough.
+    # The turned orientation is more probable, but the log odds are below the limit at which a skin is assumed turned.
+    assert 0 < -found.log_odds < LOG_ODDS_MIN
     assert not found.turned
 
 

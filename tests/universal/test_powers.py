@@ -1,6 +1,6 @@
 """Tests of likelihood powers and of the variance inflation from cross-validated labels.
 
-A likelihood is raised to a power below 1 if the model's errors are correlated, so that intervals are not too narrow.
+A likelihood is raised to a power below 1, so that intervals are not too narrow if errors of the model are correlated.
 """
 
 import numpy as np
