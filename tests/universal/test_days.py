@@ -310,8 +310,8 @@ def test_middle_of_the_skin_found_on_the_first_day_is_kept_on_a_new_day(skin, tm
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
     found_mm = []
-    # All presses of the first day are on one side of the skin. Argument `even` nevertheless takes their mean place as the
-    # middle of the skin, which shifts the estimates. The model must keep this shift on the new day.
+    # All presses of the first day are on one side of the skin. Argument `even` nevertheless takes their mean place as
+    # the middle of the skin, which shifts the estimates. The model must keep this shift on the new day.
     for even in (
         False,
         True,
