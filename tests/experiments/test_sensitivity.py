@@ -61,7 +61,7 @@ def test_fractions_of_correctly_ordered_pairs_follow_the_normal_distribution():
     np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)
 
 
-def test_gain_and_noise_are_recovered():
+def test_gain_and_noise_of_simulated_fillings_are_recovered():
     numbers, figure_data = analyse_levels(fillings(), WEIGHT_N)
     # The tolerance is about three standard errors: 0.5 uT in 150 uT.
     assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)

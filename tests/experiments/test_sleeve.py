@@ -177,7 +177,7 @@ def numbers_and_figure_data(n=40):
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
 
-def test_table_lists_methods_and_source_and_has_no_number_of_the_paper():
+def test_table_lists_methods_without_a_number_of_the_paper():
     numbers, _ = numbers_and_figure_data()
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]

@@ -167,7 +167,7 @@ def test_missing_check_for_infinite_time_steps_is_detected(monkeypatch):
     assert "a time step of inf s" in failed(time_cases())
 
 
-def test_missing_force_limit_and_flag_are_detected(monkeypatch):
+def test_missing_range_of_the_force_sensor_and_wrong_verified_depth_are_detected(monkeypatch):
     monkeypatch.setattr(rig, "FORCE_RANGE_N", (np.inf,) * 3)
     monkeypatch.setattr(layer, "VERIFIED_DEPTH", 0.99)
     monkeypatch.setattr(physics, "POKES_N", 10)

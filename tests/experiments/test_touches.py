@@ -95,7 +95,7 @@ def test_touch_of_a_place_that_was_not_in_training_is_taken_for_two_touches(spli
     assert result["sums_called_two_pct"]["direction above noise"] > 90
 
 
-def test_places_and_forces_are_predicted(split_pad):
+def test_touched_places_and_forces_are_predicted(split_pad):
     blocks, double = split_pad
     place, force = evaluate_places(blocks, double), evaluate_forces(blocks, rng_for(0, "touches", "force"))
     assert place["by_time"]["mean"] == 100

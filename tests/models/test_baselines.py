@@ -157,7 +157,7 @@ def test_thinning_keeps_the_given_number_of_rows(fits):
         assert (one["target"] == ROWS.target[numbers]).all()
 
 
-def test_thinning_draws_the_same_rows_for_equal_seed_and_name_only(fits):
+def test_thinning_draws_equal_rows_only_if_seed_and_name_are_equal(fits):
     others = {"seed": 4}, {"name": "other"}
     results_of(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
     results_of(*(task(rows_max_n=12, **other) for other in others))

@@ -118,7 +118,7 @@ def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
                 assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_each_block_and_each_network_draws_other_rows():
+def test_different_blocks_and_networks_draw_different_rows():
     same_rows = some_job(0)
     other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
     feed = BatchSampler([same_rows, other], BATCH_N, "cpu")

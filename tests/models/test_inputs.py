@@ -26,7 +26,7 @@ def test_input_raw_is_the_unchanged_field_change():
     assert (VIEW["raw"](db_uT) == db_uT).all()
 
 
-def test_input_shape_is_the_direction_and_the_log_length():
+def test_input_shape_consists_of_the_direction_and_the_log_length_of_the_field():
     db_uT = rows()
     seen = VIEW["shape"](db_uT)
     assert seen.shape == (20, 16)

@@ -78,7 +78,7 @@ def test_network_can_overfit_thirty_two_rows():
 
 
 @pytest.mark.parametrize("terms", [NO_TERMS, ALL_TERMS])
-def test_equal_seeds_give_equal_weights_and_other_seeds_do_not(terms):
+def test_only_equal_seeds_give_equal_weights(terms):
     one, again, other = (
         run([replace(some_job(terms=True), rng=some_job(draws=draws).rng)], recipe(steps_n=60), terms)[0]
         for draws in ("a", "a", "b")

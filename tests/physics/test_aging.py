@@ -93,7 +93,7 @@ def test_invalid_relaxation_is_refused(tau_s, share):
         Prony(np.array([tau_s]), np.array([share]))
 
 
-def test_force_at_a_reading_is_relaxed_during_approach_and_hold():
+def test_force_at_a_reading_has_relaxed_during_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
@@ -123,7 +123,7 @@ def test_field_memory_equals_the_differential_equation_solved_in_small_steps():
                 np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
-def test_memory_of_a_press_is_5_to_8_percent_and_decays():
+def test_field_memory_of_a_press_is_5_to_8_percent_and_decays():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = field_memory(once_T, MEMORY)

@@ -25,7 +25,7 @@ polarities = st.sampled_from(["checkerboard", "same"])
 
 
 @given(seeds, st.floats(1e-4, 1e-2))
-def test_field_of_a_cube_equals_magpylib_and_far_away_a_dipole(seed, side_m):
+def test_field_of_a_cube_equals_magpylib_and_that_of_a_distant_dipole(seed, side_m):
     assert not broken([*laws.boxes(seed, side_m), laws.octupole()])
 
 
@@ -40,7 +40,7 @@ def test_field_of_a_cuboid_equals_magpylib():
 
 @settings(max_examples=10)
 @given(polarities, seeds)
-def test_field_of_the_array_equals_magpylib_and_obeys_maxwell(polarity, seed):
+def test_field_of_the_array_equals_magpylib_and_satisfies_maxwells_equations(polarity, seed):
     assert not broken(laws.array(polarity, THICKNESS_M, seed))
 
 

@@ -326,7 +326,7 @@ def test_displacement_is_symmetric_under_reflection_along_the_force():
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
 
-def test_skin_moves_with_the_tip_and_rotates_forward():
+def test_skin_moves_and_rotates_in_the_direction_of_the_drag():
     middle = displace([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()

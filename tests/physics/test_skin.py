@@ -208,7 +208,7 @@ def test_field_change_far_from_the_edges_does_not_depend_on_the_width_of_the_ski
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
 
-def test_poke_inside_the_edges_is_accepted_and_outside_raises():
+def test_poke_is_accepted_only_inside_the_edges_of_the_skin():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):

@@ -52,7 +52,7 @@ def test_rigid_motion_minimises_the_drag(sides_m):
     np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
 
 
-def test_pull_at_the_edge_of_a_square_moves_and_rotates_it_as_in_the_closed_form():
+def test_motion_of_a_square_pulled_at_its_edge_equals_the_closed_form():
     # A square of side L is displaced by D along y at the place (L/2, 0). Expected: displacement of its middle
     # f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, and rotation theta = 6 f (L/2) / L^2 = 3 f / L.
     move_m, spin_rad = motion_of((SIDE_M / 2, 0.0), (0.0, 1e-4))

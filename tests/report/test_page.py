@@ -212,7 +212,7 @@ def test_figures_have_texts_for_screen_readers(read):
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_figures_results_and_tables_of_a_section_are_in_this_order():
+def test_section_shows_figures_then_the_comparison_with_the_paper_then_tables():
     for part in render().split("<section id=")[1:]:
         places = [part.index(mark) for mark in ("<figure", "Comparison with the paper", "<details") if mark in part]
         assert places == sorted(places)

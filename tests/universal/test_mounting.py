@@ -225,7 +225,7 @@ def test_axes_of_too_few_labels_are_not_checked():
     assert load_universal().zero(rest_uT).label(place_mm[few], force_N[few], b_uT[few]).label_frame is None
 
 
-def test_mirrored_labels_raise_a_warning_in_the_model_and_live():
+def test_mirrored_labels_raise_a_warning_in_python_and_on_the_live_page():
     rest_uT, b_uT, place_mm, force_N = skin(2)
     mirrored_mm = place_mm[:6] * (-1, 1) + (16, 0)
     model = load_universal().zero(rest_uT).label(mirrored_mm, force_N[:6], b_uT[:6])

@@ -32,7 +32,7 @@ def test_cross_validation_holds_out_every_label_once(labels_n):
     assert all(len(held_out) for _, held_out in parts)
 
 
-def test_variance_inflation_of_normal_residuals_is_one_and_of_doubled_residuals_four():
+def test_variance_inflation_is_1_for_normal_residuals_and_4_for_doubled_ones():
     off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
     assert variance_inflation(off) == pytest.approx(1, abs=0.01)
     assert variance_inflation(2 * off) == pytest.approx(4, rel=0.01)

@@ -24,7 +24,7 @@ def test_errors_that_all_boards_share_are_predicted_for_a_new_board(boards_n):
     np.testing.assert_allclose(found, part * ERRORS, rtol=1e-9)
 
 
-def test_predicted_error_is_zero_far_from_presses_and_without_boards():
+def test_predicted_error_is_zero_far_from_presses_or_without_boards():
     far_mm = np.array([[100.0, 100.0]])
     assert np.abs(fit_residual([APART_MM], [FORCE_N], [ERRORS]).at(far_mm, np.zeros(1))).max() < 1e-9
     assert (no_residual(15).at(far_mm, np.zeros(1)) == 0).all()

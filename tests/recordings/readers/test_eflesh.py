@@ -104,7 +104,7 @@ def test_new_stroke_begins_at_a_new_baseline(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
-def test_weights_in_grams_become_newtons_and_missing_ones_nan(tmp_path: Path) -> None:
+def test_weights_in_grams_are_converted_to_newtons(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, DEFAULT_POLICY)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
     # The tolerance is that of single precision, which has seven digits.

@@ -81,7 +81,7 @@ def test_every_row_becomes_a_press_of_its_pass(tmp_path: Path) -> None:
     assert readings.temperature_degC[0].tolist() == [28.5, 29.5, 30.5]
 
 
-def test_rows_with_a_force_are_in_contact_and_others_have_no_place(tmp_path: Path) -> None:
+def test_rows_without_a_force_have_no_contact_and_no_place(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()

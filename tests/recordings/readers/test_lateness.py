@@ -100,7 +100,7 @@ def test_ini_recording_with_a_missing_row_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_public_recordings_have_no_missing_row_and_deleted_rows_are_found(shared_data: Path, name):
+def test_public_recordings_raise_no_alarm_unless_a_row_is_deleted(shared_data: Path, name):
     folder = shared_data / "ini"
     label = np.loadtxt(folder / f"truths_{name}.txt")
     values = np.loadtxt(folder / f"b20_{name}.txt").reshape(len(label), -1, 4)
