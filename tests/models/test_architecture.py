@@ -1,3 +1,5 @@
+"""Tests of the layers and the initial weights of the networks."""
+
 import numpy as np
 import pytest
 from torch import nn

@@ -1,3 +1,5 @@
+"""Tests of virtual boards: copies of training rows as chips with other gains, tilts and noise would read them."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,3 +1,5 @@
+"""Tests of jobs that fit classical regression methods, with which the networks are compared."""
+
 import pickle
 from collections.abc import Callable
 from concurrent.futures import Executor, Future

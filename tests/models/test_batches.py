@@ -1,3 +1,8 @@
+"""Tests of the batches of networks that are trained together as a stack.
+
+The loss of a network can have several terms. Each term has a batch of its own in each training step.
+"""
+
 import numpy as np
 import pytest
 import torch

@@ -1,3 +1,5 @@
+"""Tests of the classical regression methods, with which the networks are compared."""
+
 import math
 
 import numpy as np

@@ -1,3 +1,8 @@
+"""Tests of the inputs of networks, which are computed from field changes.
+
+Input `raw` is the field change itself. Input `shape` is its direction and the logarithm of its length.
+"""
+
 import math
 
 import numpy as np

@@ -1,3 +1,9 @@
+"""Tests of training jobs, and of the keys under which their results are stored in the cache.
+
+A job trains a network on one fold, or adapts a trained network to unlabelled pokes of a new skin, or fine-tunes it to
+few labels. A control is trained like an adapted network, but without the unlabelled pokes.
+"""
+
 from collections.abc import Callable
 from dataclasses import fields, replace
 

@@ -1,3 +1,8 @@
+"""Tests of the loss functions: the squared error and the triplet loss.
+
+The triplet loss is positive if the anchor (a) is nearer to the negative (n) than to the positive (p).
+"""
+
 import math
 
 import numpy as np

@@ -1,3 +1,5 @@
+"""Tests of the scores of predictions."""
+
 import numpy as np
 import pytest
 from hypothesis import example, given

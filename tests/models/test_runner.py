@@ -1,3 +1,8 @@
+"""Tests of the runner, which runs training jobs in worker processes and stores their results in a cache.
+
+Jobs with equal settings are trained together as a stack.
+"""
+
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace

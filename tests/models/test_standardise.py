@@ -1,3 +1,5 @@
+"""Tests of scalers, which shift and scale inputs and targets of networks."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,3 +1,5 @@
+"""Tests of the training loop for a stack, which consists of several networks that are trained together."""
+
 from dataclasses import replace
 from itertools import chain, pairwise
 

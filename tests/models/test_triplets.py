@@ -1,3 +1,9 @@
+"""Tests of drawing triplets for the triplet loss.
+
+A triplet consists of an anchor, a positive that is nearer to the anchor, and a negative that is farther away. All
+three are points of one group.
+"""
+
 import numpy as np
 import pytest
 from hypothesis import assume, given

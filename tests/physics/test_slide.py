@@ -28,7 +28,7 @@ def motion_of(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
 def drag_matrix(pieces_n, sides_m):
     """Return the matrix of the drag of a rigid motion (f_x, f_y, theta), which is quadratic in the motion.
 
-    It is summed over small pieces of the skin.
+    The drag is summed over small pieces of the skin.
     """
     drag = np.zeros((3, 3))
     for i in range(pieces_n):

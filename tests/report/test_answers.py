@@ -1,3 +1,5 @@
+"""Tests of the answers to the question whether models work on a skin that was not in training."""
+
 import pytest
 
 from pipeline.report.answers import NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms

@@ -1,3 +1,5 @@
+"""Tests of the checklist, which compares each result of the paper with ours and gives a verdict on each claim."""
+
 from pathlib import Path
 from typing import Any
 

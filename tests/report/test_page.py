@@ -1,3 +1,5 @@
+"""Tests of the report page of a scene, and of the index page of all scenes."""
+
 import html
 import json
 import os

@@ -1,3 +1,5 @@
+"""Tests of the table that shows our protocol beside that of the paper."""
+
 from pipeline.report.page import read_sections
 from pipeline.report.protocol import protocols
 from tests.report.synthetic import all_experiments

@@ -1,3 +1,5 @@
+"""Tests of model cards, which describe trained networks and their scores."""
+
 import json
 
 import numpy as np

@@ -81,7 +81,8 @@ def test_estimator_with_the_smaller_residuals_is_selected(noise, expected):
 
 @pytest.fixture(scope="module")
 def calibrated() -> list[tuple]:
-    """Calibrate the shipped model to simulated skins whose errors of the law are large.
+    """Calibrate the shipped model to simulated skins with large errors of the law, which gives the field change of a
+    press.
 
     Each skin is calibrated with 0, 1 and 20 labels. Returns, for each skin and number of labels: this number, the
     errors of the log forces, and their estimated standard deviations.

@@ -74,7 +74,8 @@ def test_presses_on_the_tabulated_skin_are_located_within_1_mm(skin):
 
 def test_labelled_places_are_estimated_even_if_they_contradict_the_law(skin):
     place_mm, force_N, db_uT = presses()
-    # The labels contradict the law: each place is labelled with the field of the opposite place.
+    # The labels contradict the law (the simulated field changes), because each place is labelled with the field of the
+    # opposite place.
     wrong_uT = db_uT[::-1] * 0.9
     labelled = [12, 32, 50]
     found = condition_on_labels(skin, place_mm[labelled], force_N[labelled], wrong_uT[labelled]).evaluator.estimate(

@@ -1,3 +1,8 @@
+"""Tests of the verdicts on the paper's findings about drift.
+
+A policy says when no-load readings are taken: once at the start (initial), regularly, or before each contact.
+"""
+
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,3 +1,5 @@
+"""Tests of the tables and figures of experiment drift."""
+
 import re
 import xml.etree.ElementTree as ET
 

@@ -1,3 +1,5 @@
+"""Tests of the scores of experiment drift in windows, which are groups of successive contacts of a skin."""
+
 from dataclasses import replace
 
 import numpy as np
