@@ -52,7 +52,7 @@ def make_script(
 def changes_uT(chips_n: int) -> np.ndarray:
     """Return the field changes of the two pokes [2 ch].
 
-    They differ from chip to chip, unlike those of a distant magnet.
+    The field changes differ from chip to chip, unlike field changes by a distant magnet.
     """
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 

@@ -56,9 +56,9 @@ def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
 
 
 class Finger:
-    """A skin that is pressed at the place `at_mm`. Its readings depend on the force.
+    """A skin that is pressed at the place `at_mm`.
 
-    They are interpolated between readings at simulated forces.
+    Readings at some forces are simulated. The reading at any other force is interpolated between these readings.
     """
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
@@ -121,7 +121,7 @@ def grip(
             continue
         estimate_N = float(estimates.target[-1, 2])
         forces_N.append((wire.force_N, estimate_N))
-        # The controller is proportional: it closes in proportion to the missing force.
+        # This is a proportional controller: the gripper closes in proportion to the missing force.
         closed_mm += GAIN_MM_N * (aim_N - estimate_N)
         share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)

@@ -100,7 +100,10 @@ class Tab:
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
-        """Check that nothing is cut off at the widths of a phone and of a desktop. Save screenshots if requested."""
+        """Check that nothing is cut off on screens with the widths of a phone and of a desktop.
+
+        Save screenshots if requested.
+        """
         for wide in WIDTHS_PX:
             await self.call(
                 "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False

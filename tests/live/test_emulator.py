@@ -215,7 +215,7 @@ class TestFaults:
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
-        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # Each torn frame also costs the frame after it.
+        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # The frame after each torn frame is lost, too.
 
     def test_fault_clock_jump_raises_if_frames_have_no_clock(self):
         with pytest.raises(ParamsError, match="needs a capture with a clock"):
@@ -338,7 +338,7 @@ class TestRobot:
         for pass_i in range(2):
             places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
             assert sorted(places) == sorted(map(tuple, points_mm().tolist()))
-        for touch in touches:  # At any time of a dwell, its label is the true contact.
+        for touch in touches:  # At any time during a dwell, the true contact equals the label of the dwell.
             inside = (robot_script.t_s >= touch.t_start_s - 1e9) & (robot_script.t_s <= touch.t_end_s - 1e9)
             true = robot_script.true_contacts[inside]
             assert np.isfinite(true).all()

@@ -133,7 +133,8 @@ class TestReplugging:
     def find(self, *port_lists):
         """Find the port of a board that was plugged in again.
 
-        Each poll sees the next list of ports, and polls after the last list see the last list again.
+        Each time the function looks for ports, it sees the next of the given lists. After the last list, it sees the
+        last list again.
         """
         polls, printed = iter(port_lists), []
         last = [set(port_lists[-1])]

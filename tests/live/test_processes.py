@@ -42,7 +42,7 @@ def restore_ctrl_c() -> None:
 
 
 class Shell:
-    """An object that runs `reskin` commands in a folder. `close` stops those that still run."""
+    """An object that runs `reskin` commands in a folder. `close` stops the commands that still run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []

@@ -134,7 +134,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
 
     def append(file, data):
         taken.append(data)
-        if len(taken) > 2:  # After the header of the log and one touch, the disk is full.
+        if len(taken) > 2:  # The disk becomes full after the header of the log and one touch are written.
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 

@@ -59,7 +59,7 @@ def test_estimates_of_several_models_are_averaged_with_a_standard_deviation(tmp_
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # The first touch that is detected may be either of the two pokes, because a busy machine may miss the first one.
+    # The first touch that is detected may be either of the two pokes, because a busy machine may miss the first poke.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)

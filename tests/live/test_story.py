@@ -68,7 +68,7 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     """Replace the recorded arrival times by those of a machine that causes no delays."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
-    assert first >= 0  # The recorded bytes are the last ones that were sent.
+    assert first >= 0  # The recorded bytes are the last bytes that were sent.
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
     received = (ends > 0) & (ends <= len(data))
     times = clocks.Arrivals(ends[received], 1e9 + sent.t_s[received])

@@ -148,7 +148,7 @@ def header_with_lateness(rows_late: str) -> Header:
 def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: int) -> Path:
     """Write a recording whose fields grow with the force.
 
-    The fields are `late_n` rows late: they belong to the label of an earlier row.
+    The fields are `late_n` rows late, which means that the field in a row belongs to the label of an earlier row.
     """
     write(folder, truths)
     force = [truths[max(i - late_n, 0)][2] for i in range(len(truths))]

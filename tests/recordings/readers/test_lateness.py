@@ -19,7 +19,7 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
-AT_END_ROWS_N = 100  # A missing row may remain undetected if it is nearer to the start or the end than this.
+AT_END_ROWS_N = 100  # A missing row that is nearer to the start or the end than this may remain undetected.
 # The reported row number may be wrong by this much. In 60 cases of public recordings, it is wrong by at most 5.
 ROW_OFF_MAX = 15
 LATE_N = 1
