@@ -36,7 +36,7 @@ SCENE = synthesis()
 PERFECT = draw_instrument(synthesis("spreads", **NO_SPREAD), "b0", seed=1)
 REAL = draw_instrument(SCENE, "b0", seed=1)
 fields_T = st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array)
-ROUNDING_uT = 1e-9  # The rounding error of fields of 100 uT.
+ROUNDING_uT = 1e-9  # This is an upper limit for the rounding error of fields of 100 uT.
 
 
 def uniform(b_T, chips_n=5):
@@ -44,7 +44,7 @@ def uniform(b_T, chips_n=5):
 
 
 @given(fields_T)
-def test_change_of_readings_by_an_ambient_field_equals_that_of_simulated_chips(b_T):
+def test_ambient_field_changes_readings_as_it_changes_those_of_simulated_chips(b_T):
     chip = ChipDesign(gain_sel=6, noise_temperature_degC=0.0, **QUIET)
     at_rest, with_field = (
         read_field(uniform(field), REAL.board, design=chip, rng=rng_for(0, "x"))[0] for field in (0 * b_T, b_T)
@@ -64,7 +64,7 @@ def test_compensation_on_a_perfect_board_removes_a_uniform_field(b_T):
     np.testing.assert_allclose(guess, added_uT, rtol=0, atol=ROUNDING_uT)
 
 
-def test_compensation_with_unknown_gains_and_tilts_leaves_a_residual():
+def test_compensation_leaves_a_residual_if_gains_and_tilts_of_chips_are_unknown():
     added_uT = readings_uT(REAL.board, uniform(np.array([0, 0, 5e-5])))
     residual_uT = added_uT @ remove_common_part(REAL.turn).T
     # Gain errors of 2.5 % and tilts of 2 degrees in a field of 50 uT leave a few uT.
@@ -108,7 +108,7 @@ def test_disturbance_by_an_iron_ball_falls_with_its_distance():
     assert 0.4 * dipole_uT < chips_uT[-1] < 1.1 * dipole_uT
 
 
-def test_ambient_field_of_a_row_has_the_same_direction_at_all_strengths():
+def test_row_has_an_ambient_field_of_the_same_direction_at_all_strengths():
     cases = list(uniform_fields(REAL, [10.0, 50.0], rows_n=60, rng=rng_for(0, "cases")))
     assert [case.keys["field_uT"] for case in cases] == [0.0, 10.0, 50.0]
     assert not cases[0].added_uT.any()
@@ -134,7 +134,7 @@ def test_one_random_row_of_each_press_is_kept():
     kept = one_row_per_poke(indentation, candidates, rng_for(0, "kept"))
     assert indentation[kept].tolist() == [1, 2, 3, 4, 5, 6]
     assert np.isin(kept, candidates).all()
-    assert len(set(kept % 5)) > 1  # The kept reading of a press is random.
+    assert len(set(kept % 5)) > 1  # Which reading of a press is kept must be random.
 
 
 def test_scores_are_averaged_over_boards():
@@ -153,10 +153,10 @@ def test_scores_are_averaged_over_boards():
         "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "values": [80.0, 60.0],
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
-    # These scores are those of a second seed.
+    # These scores belong to networks with a second seed.
     again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]
     variant_a = scores_by_field([*points, *again], "field_uT", ["b0", "b1"])[1]["a"]["accuracy_pct"]
-    assert (variant_a["mean"], variant_a["n"]) == (71.0, 2)  # There are two boards, and n counts boards.
+    assert (variant_a["mean"], variant_a["n"]) == (71.0, 2)  # The number n is that of boards, of which there are two.
     assert variant_a["sd_seeds"] == pytest.approx(np.sqrt(8) / 2)
     (iron,) = scores_by_field(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))
@@ -184,7 +184,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_variant_scored_on_one_board_is_compared_on_that_board():
+def test_variant_that_was_scored_on_one_board_is_listed_only_for_that_board():
     table = tables(NUMBERS, "simulated")["ambient"]
     assert set(table[table["boards"] == "all held out"]["method"]) == {"a", "b"}
     assert table[table["boards"] == "b2"]["method"].tolist() == ["a", "b", "c"] * 3

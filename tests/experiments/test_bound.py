@@ -1,6 +1,6 @@
 """Tests of the lower bound on the errors of any unbiased estimate.
 
-References are simulated chips, a linear estimate and the field of a dipole.
+The bound is compared with simulated chips, a linear estimate and the field of a dipole.
 """
 
 import math
@@ -72,7 +72,7 @@ def test_errors_of_the_best_linear_estimate_equal_the_bound():
 
 
 @given(st.floats(0.05, 5.0), st.floats(0.05, 5.0))
-def test_probability_that_uncorrelated_errors_are_within_limits_is_a_product(h, k):
+def test_probability_that_uncorrelated_errors_are_within_limits_is_the_product_of_two(h, k):
     expected = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
     assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(expected, abs=1e-12)
 
@@ -114,7 +114,7 @@ def test_slopes_of_a_dipole_field_equal_the_closed_form():
 
 
 @given(st.floats(0.1, 10.0))
-def test_bound_scales_with_noise_and_falls_with_the_number_of_readings(factor):
+def test_bound_is_proportional_to_the_noise_and_halves_for_four_times_the_readings(factor):
     db_slopes, force_slopes = linear_sensor(rng_for(2, "linear sensor"))
     one, four = (noise_var_uT2(CHIP, 5, readings_n=n, noload_frames_n=10 * n) for n in (1, 4))
     least = least_covariance(db_slopes, force_slopes, one)
@@ -125,7 +125,7 @@ def test_bound_scales_with_noise_and_falls_with_the_number_of_readings(factor):
     np.testing.assert_allclose(2 * sds[0], sds[1], rtol=1e-9)
 
 
-def test_bound_falls_with_depth_and_grows_with_label_errors():
+def test_bound_is_smaller_for_deeper_presses_and_larger_with_label_errors():
     numbers = bound_errors(SCENE, seed=1)
     assert [row["depth_mm"] for row in numbers["by_depth"]] == sorted(SCENE.main.depths_mm)
     assert (numbers["places_n"], numbers["above_the_skin_n"]) == (65, 0)

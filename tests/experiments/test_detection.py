@@ -54,7 +54,7 @@ def linear_skin(n):
     return target, target @ rng.normal(0, 30, (3, 15))
 
 
-def test_residual_is_zero_for_known_contacts_and_large_for_negated_ones():
+def test_residual_is_zero_for_known_fields_and_large_for_fields_of_opposite_sign():
     target, db_uT = linear_skin(200)
     # The residual is zero, except for rounding.
     np.testing.assert_allclose(residual((target, db_uT), target[:9], db_uT[:9]), 0, atol=1e-9)
@@ -62,7 +62,7 @@ def test_residual_is_zero_for_known_contacts_and_large_for_negated_ones():
     assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5
 
 
-def test_residual_without_forces_is_zero_between_known_places():
+def test_residual_of_known_contacts_is_zero_although_forces_are_unknown():
     target, db_uT = linear_skin(200)
     unknown = np.column_stack([target[:, :2], np.full(200, np.nan)])
     ours = residual((unknown, db_uT), target[:9], db_uT[:9])
@@ -87,5 +87,5 @@ def test_roc_area_equals_scikit_learn(single, double):
 
 
 @given(SCORES, SCORES)
-def test_roc_areas_of_both_orders_sum_to_one(single, double):
+def test_swapping_both_classes_changes_the_roc_area_to_one_minus_its_value(single, double):
     assert roc_area(single, double) + roc_area(double, single) == pytest.approx(1, abs=1e-12)

@@ -24,7 +24,7 @@ RATE_HZ = 400.0
 
 
 def linear_presses(durations_n=(40, 100, 300), noise_uT=0.0, delay_s=0.0):
-    """Return presses on a skin whose channels are 100 uT per mm or per N of x, y and F.
+    """Return presses on a skin with three channels, which are 100 uT per mm of x, per mm of y and per N of force.
 
     The field is that of the force `delay_s` ago, so it lags behind the force labels.
     """
@@ -72,7 +72,7 @@ def test_only_readings_whose_averaging_window_is_within_the_press_are_scored():
     assert (presses.true[presses.scored, 2] >= 0.2).all()
 
 
-def test_running_means_are_delayed_and_single_readings_are_not():
+def test_running_mean_is_delayed_and_a_single_reading_is_not():
     numbers = score_presses(linear_presses(), [inverse], board="b0")
     # The error is zero, except for rounding to single precision.
     assert numbers["all"]["one"]["mse_f_N2"]["mean"] < 1e-12
@@ -109,7 +109,7 @@ def test_delay_is_estimated_for_any_scale_of_the_force(delay_ms, factor):
     assert lag_ms(t_s[inner], late_N[inner], t_s, force_N) == pytest.approx(delay_ms, abs=0.16)
 
 
-def test_field_that_lags_behind_the_force_labels_gives_a_delay():
+def test_delay_is_found_if_the_field_lags_behind_the_force_labels():
     assert score_presses(linear_presses(delay_s=1e-3), [inverse], board="b0")["lag_ms"]["one"]["mean"] == pytest.approx(
         1.0, abs=0.15
     )

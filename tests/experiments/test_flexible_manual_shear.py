@@ -36,7 +36,7 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 from tests.report.synthetic import card, texts_of
 
-SINGLE = 1e-4  # The rounding error of sums of forces of a few N in single precision.
+SINGLE = 1e-4  # This is an upper limit for the rounding error of sums of forces of a few N in single precision.
 
 
 BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}
@@ -138,14 +138,14 @@ def test_summary_of_hand_pokes_has_counts_and_differences():
         assert difference == pytest.approx(after - before)
 
 
-def test_without_a_control_there_is_no_difference_from_it():
+def test_summary_has_no_difference_from_the_control_if_there_is_no_control():
     summary = summarise_manual([one for one in PREDICTIONS if one.variant != CONTROL], pokes_n=[3], lines_n=[1])
     assert CONTROL not in summary
     assert "after_minus_control" not in summary["paired"]
 
 
 @given(st.floats(0.5, 3))
-def test_strength_ratio_is_the_ratio_of_the_field_changes(ratio):
+def test_strength_ratio_equals_the_factor_between_two_sets_of_field_changes(ratio):
     rng = rng_for(1, "fields")
     depth_mm = np.tile(np.array([0.2, 0.8, 1.2], np.float32), 20)
     db_uT = rng.normal(0, 50, (60, 15)).astype(np.float32)
@@ -160,7 +160,7 @@ def test_strength_ratio_is_the_ratio_of_the_field_changes(ratio):
     assert result["n"] == 3
 
 
-def test_depths_that_only_one_variant_has_are_ignored():
+def test_strength_ratio_ignores_depths_that_only_one_variant_has():
     one, other = ({d: np.array([float(i + d)]) for d in depths} for i, depths in ((1, (0.2, 0.4)), (3, (0.4, 0.6))))
     assert strength_ratio([one], [other]) == {"mean": pytest.approx(1.4 / 3.4), "n": 1}
 
@@ -326,7 +326,7 @@ def test_flexible_table_has_biases_and_differences():
     assert "bias -0.83 ± 0.10 ± 0.02 (seeds) N" in text
 
 
-def test_networks_with_input_shape_are_additional_rows():
+def test_table_has_additional_rows_for_networks_with_input_shape():
     shape = {name: FLEXIBLE_NUMBERS[name] for name in ("before", "after", "bias_f_N", "bias_f_pct")}
     table = flexible.tables(FLEXIBLE_NUMBERS | {"shape": shape}, "simulated")["flexible"]
     assert table["networks"].str.startswith("direction and length").tolist() == [False] * 3 + [True] * 2

@@ -1,6 +1,6 @@
 """Tests of estimates from logs, which are long recordings without labels.
 
-Further tests are about a board that is tilted (pitched) in the earth's field.
+Other tests simulate a board that is tilted (pitched) in the earth's field.
 """
 
 import numpy as np
@@ -94,12 +94,12 @@ def test_number_of_contacts_forces_and_noise_are_recovered():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # The expected error is the variance of the mean of 15 noisy channels, in N^2. The no-load reading is a mean of many
-    # readings, and adds only 1 / 500 of this variance.
+    # The expected squared error in N^2 is the variance of the mean of 15 noisy channels. The no-load reading is a mean
+    # of many readings, so its noise adds only 1 / 500 of this variance.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
-def test_scores_are_averaged_over_networks_instead_of_predictions():
+def test_score_is_the_mean_score_of_networks_and_not_that_of_their_mean_prediction():
     t_s, b_uT, force_N = make_log()
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
     found = estimate(t_s, b_uT, networks, where="log")
@@ -171,7 +171,7 @@ def test_pitched_board_reads_the_earth_field_in_rotated_axes():
 
 
 @given(st.floats(-1.5, 1.5))
-def test_change_of_the_earth_field_is_the_chord_of_the_rotation(pitch_rad):
+def test_length_of_the_change_of_the_earth_field_equals_the_chord_of_the_rotation(pitch_rad):
     rotated_T = earth_in_board_T(np.array([pitch_rad]))[0]
     assert np.linalg.norm(rotated_T) == pytest.approx(EARTH_SIZE_T)
     chord_T = 2 * EARTH_SIZE_T * np.sin(abs(pitch_rad) / 2)
@@ -184,14 +184,14 @@ def test_pitch_is_zero_at_the_start_and_then_oscillates():
     np.testing.assert_allclose(swing(t_s, start_s=1.0, period_s=0.5), [0, 0, 1, 0, -1, 0], atol=1e-12)
 
 
-def test_period_of_the_swing_is_the_median_time_between_contacts():
+def test_step_period_is_the_median_time_between_the_starts_of_contacts():
     t_s = np.arange(12) / 10
     assert step_period_s(t_s, np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1, 1], bool)) == pytest.approx(0.45)
     assert step_period_s(t_s, np.arange(12) == 3) == PERIOD_S
     assert step_period_s(t_s, np.zeros(12, bool)) == PERIOD_S
 
 
-def test_board_that_is_not_pitched_has_the_scores_of_the_log():
+def test_scores_at_pitch_zero_equal_the_scores_of_the_log():
     log, rows = pitched_log()
     found = estimate(log.t_s, log.b_uT, [predict], where="log")
     level = rows[0]

@@ -39,7 +39,7 @@ def board() -> BoardPresses:
     return BoardPresses("b1", rest_uT, presses, presses, np.arange(len(place_mm)))
 
 
-def test_turned_and_swapped_skins_have_the_stated_changes_of_fields():
+def test_turning_negates_the_no_load_field_and_swapping_exchanges_two_chips():
     skin = SKINS[0]
     np.testing.assert_array_equal(skin.changed(AS_RECORDED).db_uT, skin.db_uT)
     np.testing.assert_array_equal(skin.changed(TURNED).rest_uT, -skin.rest_uT)
@@ -66,7 +66,7 @@ def test_labels_with_wrong_axes_raise_a_warning():
     assert np.mean([*warned.values()]) > 60  # Most trials raise a warning. By chance alone, few would.
 
 
-def test_model_keeps_its_accuracy_on_a_turned_skin_only_with_the_check(board):
+def test_accuracy_on_a_turned_skin_is_kept_only_if_the_orientation_is_checked(board):
     rows = accuracy_rows(board, SECTION, 0)
     scores = {(row["change"], row["check"]): row["accuracy_pct"] for row in rows if not row["labels_n"]}
     assert scores[TURNED, WITH_CHECK] == scores[AS_RECORDED, WITH_CHECK] == scores[AS_RECORDED, WITHOUT_CHECK]

@@ -42,14 +42,14 @@ def pad_of(db_uT: np.ndarray, joint_counts: np.ndarray | None = None) -> Pad:
 # --- External fields ---
 
 
-def test_distance_of_the_magnet_and_size_of_its_field_are_estimated():
+def test_estimated_distance_and_field_of_the_magnet_equal_the_simulated_ones():
     cov = external.covariance(np.array(CHIPS_MM), 100.0, 60.0)
     rng = rng_for(0, "moving hand", "source")
     db_uT = rng.multivariate_normal(np.zeros(15), cov, 2000, method="eigh") + NOISE_uT * rng.standard_normal((2000, 15))
     assert hand.find_source(db_uT, NOISE_uT) == (60.0, 100.0)
 
 
-def test_uniform_field_in_a_turned_board_keeps_its_length():
+def test_uniform_field_has_the_same_length_after_the_board_is_turned():
     changes_uT = to_board(hand.turn(50.0, 3000, rng_for(0, "turn"))).reshape(-1, 5, 3)
     np.testing.assert_allclose(changes_uT, np.repeat(changes_uT[:, :1], 5, axis=1), atol=1e-9)
     # After the turn, the fields have random directions, so their mean is 0 and the mean change is minus the first
@@ -64,7 +64,8 @@ def test_field_of_a_moved_magnet_has_the_stated_size_at_the_board():
     changes_uT = to_board(hand.move_magnet(140.0, (40.0, 40.0), 20_000, rng_for(0, "magnet"))).reshape(-1, 5, 3)
     # All changes start from the same field, so their standard deviation is that of the later fields.
     sd_uT = changes_uT.std(axis=0)
-    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)  # The chip at the centre. The standard error is below 1 %.
+    # The first chip is at the centre of the board. The standard error is below 1 %.
+    np.testing.assert_allclose(sd_uT[0], 140, rtol=0.03)
     # Outer chips can be nearer to the magnet, so their fields are larger.
     assert (sd_uT[1:].mean(axis=1) > sd_uT[0].mean()).all()
 
@@ -77,13 +78,13 @@ def test_contact_threshold_equals_that_of_the_live_page(external_uT):
     readings_uT = NOISE_uT * rng_for(0, "live").standard_normal((4000, 15))
     matrix = load_universal(external_uT=external_uT).suppressor(NOISE_uT)
     live_uT = np.median(magnitudes_uT(readings_uT, matrix)) + CONTACT_SDS * NOISE_uT
-    # The live page takes a median, which is up to 1.5 % below the root mean square.
+    # The live page computes the noise from a median, which is up to 1.5 % below the root mean square.
     assert hand.live_threshold(NOISE_uT, matrix) == pytest.approx(live_uT, rel=0.02)
 
 
 @pytest.mark.parametrize("learner", ["ridge", "boosting"])
 @pytest.mark.parametrize("trained_on", [OTHER, FIRST_HALF])
-def test_compensation_removes_fields_that_depend_on_joint_angles(learner, trained_on):
+def test_compensation_by_joint_angles_removes_fields_that_depend_on_them(learner, trained_on):
     rng = rng_for(0, "moving hand", learner)
     slopes = rng.normal(size=15)
     pads = []
@@ -116,7 +117,7 @@ def test_option_for_external_fields_removes_false_contacts_and_keeps_true_ones()
     assert hand.count_contacts(still, touches_uT, 0.0, SECTION, rng_for(0, "draws"))["live_false_pct"] == 0
 
 
-def test_groups_that_name_unknown_captures_are_refused():
+def test_groups_with_unknown_captures_or_unequal_numbers_of_them_are_refused():
     pads = {"a": pad_of(np.zeros((10, 15)))}
     group = hand.Group(name="one", threshold=("a",), tested=("b",))
     with pytest.raises(ParamsError, match=r"groups: one: no capture b of layout leaphand in the scene \(it has: a\)"):
@@ -178,7 +179,8 @@ def test_whole_stage_runs_on_synthetic_recordings(tmp_path):
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [row["capture"] for row in numbers["recordings"]] == ["first", "second"]
     assert [row["rows_n"] for row in numbers["recordings"]] == [24, 24]
-    # The option has several values. There are two learners, each trained on two kinds of data.
+    # There is a row for each of two values of the option, and for each of two learners trained on each of two kinds of
+    # data.
     assert len(numbers["contacts"]) == 2 + 2 * 2
     by_field = {
         (row["field"], row["external_uT"], row["labels_n"]): row["mse_xy_mm2"]["mean"]

@@ -35,7 +35,7 @@ def rows(few_nodes):
 
 @pytest.fixture
 def not_inside(monkeypatch):
-    """Omit the effects inside the skin, which take most of the computing time."""
+    """Replace the computation of the effects inside the skin, which takes most of the time, by an empty result."""
     monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
@@ -67,7 +67,7 @@ def test_force_errors_of_neglected_ageing_and_relaxation_equal_closed_forms(rows
     assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0
 
 
-def test_one_kelvin_changes_the_field_by_0_12_percent(rows):
+def test_neglecting_one_kelvin_changes_the_field_by_0_12_percent(rows):
     scene = synthesis()
     board = draw_board(scene.main_boards.design, scene.spreads, seed=1, name="b0")
     skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0", rule=scene.main_boards.quadrature.in_si())
@@ -81,7 +81,7 @@ def test_constant_external_field_is_removed_by_the_no_load_reading(rows):
     assert rows["the earth's field"].rest_uT == pytest.approx(45)
 
 
-def test_neglecting_an_effect_that_is_included_would_change_the_field(rows):
+def test_table_states_how_much_neglecting_an_included_effect_would_change_the_field(rows):
     # Computing the deformation in increments changes the field of a bonded skin at 1.2 mm by 16-23 %. On a sliding
     # skin, the change is smaller, because most of the field change is due to the distant motion, which is linear in the
     # depth.
@@ -91,7 +91,7 @@ def test_neglecting_an_effect_that_is_included_would_change_the_field(rows):
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_holding_of_a_skin_on_its_base_is_an_included_effect(rows, not_inside):
+def test_springs_that_hold_the_skin_on_its_base_are_listed_as_an_included_effect(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -105,7 +105,7 @@ def test_holding_of_a_skin_on_its_base_is_an_included_effect(rows, not_inside):
     assert found["the base's hold"].field_pct > 10
 
 
-def test_error_of_the_neglected_self_field_is_proportional_to_the_powder(rows, not_inside):
+def test_error_of_the_neglected_field_of_the_powder_is_proportional_to_its_amount(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
     # The tolerance is 10 %, because the magnetisation is not quite linear in the magnetising field, which is half as
     # strong.
@@ -137,7 +137,8 @@ def test_table_lists_the_protocols_of_each_effect():
         "the earth's field": "neglected",
         "temperature": "computed: grid, wear",
     }
-    # The effects that the main protocol neglects come first. It includes temperature, which is therefore last.
+    # The effects that the main protocol neglects come first. The main protocol includes temperature, so temperature is
+    # last.
     assert table.index[-1] == "temperature"
     assert table.loc["ageing"].tolist()[1:] == ["12", "–", "0.5", "so", "simulated"]
 

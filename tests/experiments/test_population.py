@@ -54,7 +54,7 @@ def skins():
     return simulated_skins(make_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
 
 
-def test_prior_of_the_skins_is_centred_on_the_simulated_skin():
+def test_mean_of_the_prior_of_skins_is_the_simulated_skin():
     designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
     law = designed.prior.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
@@ -89,7 +89,7 @@ def test_resumed_run_draws_only_the_parts_that_are_missing(monkeypatch):
 
 def test_calibration_pool_has_one_press_per_place_and_no_test_press():
     places_n, depths_n, readings_n = 4, 3, 2
-    # Two passes. The number of the press of each row.
+    # There are two passes. `press` is the number of the press to which each row belongs.
     press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)
     target = np.stack([press % places_n, press % places_n, 1 + press], axis=1).astype(np.float32)
     names = (np.full(len(press), name) for name in ("c", "b0", "b0_s0"))
@@ -106,7 +106,7 @@ def test_calibration_pool_has_one_press_per_place_and_no_test_press():
 
 
 def test_known_weight_is_the_press_near_the_middle_with_the_nearest_force():
-    # The forces of five presses, each with two readings.
+    # There are five presses with two readings each. These are the forces of the readings.
     force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)
     x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
     target, press = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
@@ -152,7 +152,7 @@ def test_tables_and_figure_list_every_method():
     assert len(tables["population"]) == 3
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
-    # The intervals of three methods: map, map with network, and network.
+    # There is one column of intervals for each method: map, map with network, and network.
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]
     earlier = {name: value for name, value in numbers.items() if name != "fresh"}
     assert set(tables) - set(population.tables(earlier, "simulated")) == {"population_fresh"}
@@ -182,7 +182,7 @@ def test_presses_for_calibration_and_for_tests_are_different(skins):
         assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)
 
 
-def test_labels_improve_the_map_which_is_better_than_an_untrained_network(model, skins):
+def test_force_errors_of_the_map_fall_with_labels_and_are_below_an_untrained_network(model, skins):
     sizes = CalibrationSize(0, 0), CalibrationSize(65, 40)
     calibration = calibrate_ways(model, skins, sizes[0])
     rows = [row for size in sizes for skin in skins for row in score_skin(model, skin, size, calibration)]
@@ -197,7 +197,7 @@ def test_labels_improve_the_map_which_is_better_than_an_untrained_network(model,
         assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9
 
 
-def test_known_weight_is_the_last_estimate_and_does_not_change_the_others(model, skins):
+def test_known_weight_is_appended_to_the_estimates_without_changing_the_others(model, skins):
     skin, once = skins[0], dict.fromkeys(WAYS, 1.0)
     (found,) = estimate(model, skin, CalibrationSize(16, 0), [once])
     assert all(len(one.force_N) == len(skin.true) + 1 for one in found.values())
@@ -210,7 +210,7 @@ def test_known_weight_is_the_last_estimate_and_does_not_change_the_others(model,
     assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
-def test_share_of_the_known_weight_is_computed_at_the_calibrated_likelihood_power(skins, monkeypatch):
+def test_weight_share_is_computed_at_the_calibrated_likelihood_power(skins, monkeypatch):
     # The estimates of this test are made up: force errors grow with the likelihood power, and only one power has
     # intervals that cover 90 %.
     def fake_estimate(model, skin, size, powers):

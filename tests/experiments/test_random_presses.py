@@ -96,7 +96,7 @@ def test_more_labels_than_presses_are_refused(board):
         label_sets(board, draw, (0, 500))
 
 
-def test_nearest_label_predicts_its_own_reading_exactly(board):
+def test_nearest_label_method_is_exact_for_the_labelled_presses(board):
     scores = score_nearest(board.presses, board.presses)
     assert scores["accuracy_pct"] == 100
     assert scores["r2_f"] == 1
@@ -117,12 +117,13 @@ def test_each_combination_of_settings_is_scored(rows):
     names = {(row["tested"], row["presses_n"], row["method"], row["labels"]) for row in rows}
     universal = {name for name in names if name[2] != NEAREST}
     assert {name[3] for name in universal} == {"0", WEIGHT, "10"}
-    # For each of the two variants: three numbers of labels with 65 presses, two with 12 presses, and three for halves.
+    # Each of the two variants has scores for three numbers of labels with 65 presses, for two with 12 presses, and for
+    # three if labels and tested presses are on different halves of the skin.
     assert len(universal) == 2 * (3 + 2 + 3)
     assert {name[:2] for name in names if name[2] == NEAREST} == {(CHECKERBOARD, 65), (HALVES, 65)}
 
 
-def test_labels_improve_place_and_force(rows):
+def test_labels_reduce_errors_of_places_and_forces(rows):
     def mean(labels: str, metric: str) -> float:
         values = [row[metric] for row in rows if row["labels"] == labels and row["tested"] == CHECKERBOARD
                   and row["method"] != NEAREST and row["presses_n"] == 65]  # fmt: skip
@@ -139,4 +140,4 @@ def test_table_has_a_row_for_each_setting_and_names_its_source(rows):
     assert len(table) == len(summary)
     assert (table["source"] == "recorded").all()
     best = next(row for row in summary if row["labels"] == "10" and row["method"] != NEAREST)
-    assert best["accuracy_pct"]["n"] == 1  # There is one board, and n counts boards.
+    assert best["accuracy_pct"]["n"] == 1  # The number n is that of boards, of which there is one.

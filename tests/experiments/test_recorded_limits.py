@@ -100,7 +100,7 @@ def test_fitted_shift_is_the_mean_difference():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 99))
-def test_tested_readings_are_neither_at_known_places_nor_of_unlabelled_presses(draw_i):
+def test_tested_readings_exclude_known_places_and_unlabelled_presses(draw_i):
     board = make_board()
     draw = limits.draw_presses(board, SECTION, 2021, draw_i)
     tested = np.unique(board.press_i[draw.tested])
@@ -155,7 +155,7 @@ def test_registration_removes_an_error_that_is_a_rigid_motion(scores):
         assert row["shift_mm"] == pytest.approx(np.sqrt(5))
 
 
-def test_registration_fitted_to_the_tested_readings_has_the_smallest_error(scores):
+def test_no_registration_has_a_smaller_error_than_one_fitted_to_the_tested_readings(scores):
     """A rigid motion that is fitted to the tested readings themselves gives a lower bound for the squared error."""
     for row in scores:
         if row["known"] in (limits.SHIFT, limits.RIGID):
@@ -164,7 +164,7 @@ def test_registration_fitted_to_the_tested_readings_has_the_smallest_error(score
             assert bound["rigid_limit_mm2"] <= row["mse_xy_mm2"] + 1e-12
 
 
-def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
+def test_universal_model_has_scores_for_each_way_of_using_the_known_presses(scores):
     uses = {limits.UNCHANGED, limits.SHIFT, limits.RIGID, limits.LABELS}
     for presses_n in (0, 20):
         for method in ("universal, boards of the rig", "universal, simulated alone"):
@@ -174,7 +174,7 @@ def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
     def mean_mm2(known: str) -> float:
         return float(np.mean([row["mse_xy_mm2"] for row in scores if row["known"] == known and row["presses_n"]]))
 
-    # Labels help, because the synthetic skin follows the formula of the map.
+    # Labels reduce the errors, because the fields of the synthetic skin follow the formula of the map.
     assert mean_mm2(limits.LABELS) < mean_mm2(limits.UNCHANGED)
 
 
@@ -182,7 +182,7 @@ def test_universal_model_is_scored_for_every_use_of_the_known_presses(scores):
 
 
 @given(arrays(float, (12, 2), elements=st.floats(-100, 100)), st.lists(st.integers(0, 3), min_size=8, max_size=8))
-def test_mean_by_group_equals_the_mean_of_the_rows_of_each_group(values, numbers):
+def test_mean_by_equals_the_mean_of_the_rows_of_each_group(values, numbers):
     group = np.array([0, 1, 2, 3, *numbers])
     expected = [values[group == i].mean(axis=0) for i in range(4)]
     np.testing.assert_allclose(limits.mean_by(group, values), expected, atol=1e-9)
@@ -204,8 +204,8 @@ def test_explained_fraction_within_groups_equals_r2_of_centred_values():
 def make_rows(shear_in_field: bool) -> Rows:
     """Return rows of two boards with 30 places, two depths, two readings per press and 6 channels.
 
-    The field is linear in place and normal force. If `shear_in_field`, it is also linear in the sideways force, which
-    is random.
+    The field is linear in the place and in the normal force. If `shear_in_field` is true, the field is also linear in
+    the sideways force, which is random.
     """
     rng = np.random.default_rng(2)
     place_mm = 2.0 * np.stack(np.meshgrid(np.arange(6), np.arange(5)), axis=-1).reshape(-1, 2)
@@ -229,8 +229,8 @@ def test_shear_is_predicted_only_if_the_field_depends_on_shear():
     by_field = {}
     for shear_in_field in (True, False):
         rows = limits.evaluate_shear(make_rows(shear_in_field), SECTION, 2021)["rows"]
-        # Two kinds of training presses, with three kinds of inputs each: none, the field, and the place with the normal
-        # force.
+        # There are two kinds of training presses. For each of them, the shear force is predicted from no input, from
+        # the field, and from the place with the normal force.
         assert len(rows) == 2 * 3
         for row in rows:
             if row["inputs"] == limits.FIELD:
@@ -278,7 +278,7 @@ def test_presses_at_one_place_are_in_the_same_fold():
 
 @settings(deadline=None)
 @given(st.integers(0, 99), st.floats(5, 60))
-def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold_uT):
+def test_reading_exceeds_the_threshold_if_the_needed_field_change_is_exceeded(seed, threshold_uT):
     rng = np.random.default_rng(seed)
     direction = rng.standard_normal((4, 15))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -291,7 +291,7 @@ def test_readings_cross_the_threshold_at_the_needed_field_change(seed, threshold
     assert (np.linalg.norm(just_below, axis=2)[needed_uT > 0] <= threshold_uT).all()
 
 
-def test_needed_field_change_without_noise_equals_the_threshold():
+def test_needed_field_change_equals_the_threshold_if_there_is_no_noise():
     needed_uT = limits.needed_changes_uT(np.eye(15)[:2], np.zeros((1, 15)), 24.0)
     np.testing.assert_allclose(needed_uT, 24.0)
 
@@ -391,8 +391,8 @@ def test_older_no_load_readings_raise_the_threshold_and_the_smallest_detected_fo
             assert better["power_law_N"] < worse["power_law_N"]
         assert by_rate[0]["detected_pct"] == 100
         assert by_rate[0]["smallest_N"] == pytest.approx(0.7, rel=0.11)  # Even the smallest of all forces is detected.
-        # Extrapolating in proportion to the force gives larger forces than extrapolating by a power law with an
-        # exponent below 1.
+        # If the field change is assumed to be proportional to the force, the extrapolated force is larger than by a
+        # power law with an exponent below 1.
         assert by_rate[0]["power_law_N"] < by_rate[0]["proportional_N"] < 0.7
         live = next(row for row in numbers["rows"] if row["board"] == board and row["rule"] == limits.BY_LIVE)
         assert live["false_alarm_pct"] == 0
@@ -414,7 +414,8 @@ def test_tables_and_figure_contain_all_results(scores, detection):
         assert (table["source"] == "recorded").all()
         assert not any("|" in str(column) for column in table.columns)  # The character | separates columns in Markdown.
     registration = tables["limits_registration"]
-    # Three rows for the regressor. Four rows for each of two variants, with and without unlabelled presses.
+    # The regressor has three rows. Each of two variants of the model has four rows with unlabelled presses and four
+    # without.
     assert len(registration) == 3 + 2 * 2 * 4
     assert "20 unlabelled presses" in registration.attrs["meaning"]
     forces = tables["limits_detection"]["force by power law, N"]

@@ -79,8 +79,8 @@ FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 def test_presses_are_paired_with_fields_of_the_known_board_at_equal_place_and_force():
     rows = make_rows()
-    rows.target[20:22, 2] = 2.0  # This force is between the two forces of board b0.
-    rows.target[22:24, 2] = 9.0  # This force is above the largest force of board b0.
+    rows.target[20:22, 2] = 2.0  # The force of this press is between the two forces of board b0.
+    rows.target[22:24, 2] = 9.0  # The force of this press is above the largest force of board b0.
     rows.target[24:26, :2] = 50.0  # Board b0 has no press at this place.
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
@@ -110,13 +110,13 @@ def test_network_that_collapsed_is_trained_again(monkeypatch):
     assert record == {"collapsed": False, "collapsed_before_n": 1}
 
 
-def test_control_is_calibrated_with_presses_of_another_board():
+def test_control_uses_the_same_draw_of_the_next_board():
     names = "b0-draw0", "b0-draw1", "b1-draw0", "b1-draw1"
     folds = [fold(name, range(1), range(1), range(1)) for name in names]
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_changes_that_make_a_board_foreign_keep_the_length_of_fields():
+def test_each_simulated_foreign_board_has_fields_of_unchanged_length():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))

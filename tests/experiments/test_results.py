@@ -11,7 +11,7 @@ from reskin.errors import SchemaError
 from tests.data import tables
 
 
-def test_lost_rows_are_counted_for_each_capture(tmp_path):
+def test_results_list_the_lost_rows_of_each_capture(tmp_path):
     for i in range(2):
         account = {"bytes_n": 82 * (i + 1), "skipped_resync_bytes_n": i}
         io.write_readings(tmp_path / f"b{i}_s0-wear.parquet", [tables.readings()], account)
@@ -21,19 +21,19 @@ def test_lost_rows_are_counted_for_each_capture(tmp_path):
     assert losses["left_out"] == {"low_force_rows_n": 3}
 
 
-def test_losses_of_the_main_captures_are_not_counted_again(tmp_path):
+def test_results_contain_no_losses_if_an_experiment_uses_the_main_captures(tmp_path):
     write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}
     assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
 
 
-def test_only_capture_is_returned():
+def test_capture_is_returned_if_there_is_exactly_one():
     assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
 
 
 @pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
-def test_none_or_several_captures_are_refused_where_one_is_needed(captures):
+def test_error_is_raised_if_there_is_no_capture_or_more_than_one(captures):
     with pytest.raises(
         SchemaError, match=f"ci-glass: {len(captures)} captures, but .* reads exactly one. Set skins_n: 1"
     ) as no:

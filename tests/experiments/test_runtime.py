@@ -1,7 +1,7 @@
 """Tests of experiment runtime, which compares errors and run times of numerical methods.
 
-These are quadratures (over the nodes of a skin) and integrators (of the relaxation over time). References are closed
-forms.
+The methods are quadratures (sums over the nodes of a skin) and integrators (of the relaxation over time). They are
+compared with closed forms.
 """
 
 from dataclasses import replace
@@ -103,7 +103,7 @@ def test_skin_built_with_a_quadrature_equals_the_simulated_skin():
     assert ours.depth_zero_m == drawn.depth_zero_m
 
 
-def test_places_of_pokes_are_relative_to_the_pattern_of_magnets():
+def test_pokes_are_at_fixed_places_relative_to_the_shifted_skin():
     one = trial(skin_seat_mm=1.0)
     assert np.abs(one.skin.seat_m).min() > 0
     places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
@@ -170,7 +170,7 @@ def test_gauss_nodes_integrate_polynomials_exactly():
         assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
 
 
-def test_tabulated_path_of_material_equals_the_computed_flow():
+def test_tabulated_paths_of_material_points_equal_the_computed_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
     path, poke_m, material = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
@@ -188,7 +188,7 @@ def test_tabulated_path_of_material_equals_the_computed_flow():
     # 1 mm.
     np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
     np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
-    # The horizontal components of the rotation from z towards r.
+    # These are the horizontal components of the axis about which z rotates towards r.
     turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
@@ -226,7 +226,7 @@ def test_finer_quadratures_have_smaller_errors(quadratures):
     assert error_of(rows, "magpylib cuboids", 2, 2) > error_of(rows, "magpylib cuboids", 1, 4)
 
 
-def test_error_of_the_reference_is_a_tenth_of_the_error_limit(quadratures):
+def test_error_of_the_reference_is_below_a_tenth_of_the_error_limit(quadratures):
     rows, _ = quadratures
     assert rows[0].method == REFERENCE
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
@@ -245,8 +245,8 @@ def test_fields_of_magpylib_equal_those_of_our_kernel(quadratures):
 def test_field_computed_by_the_flow_equals_that_computed_by_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
-    # The tolerance is 0.5 %, because the two methods interpolate between different nodes. If moments were not rotated,
-    # the error would be larger than dB itself.
+    # The tolerance is 0.5 %, because the two methods interpolate between different nodes. If the moments were not
+    # rotated, the error would be larger than the field change dB itself.
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 
@@ -303,7 +303,7 @@ def test_no_rule_is_chosen_if_all_errors_are_above_the_limit():
     assert choice.differs
 
 
-def test_rule_in_use_has_no_error_if_it_was_not_tried():
+def test_error_of_the_quadrature_in_use_is_missing_if_it_was_not_tried():
     assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
 
 
@@ -328,7 +328,7 @@ def test_methods_are_timed_in_alternating_order():
 
 
 def test_times_are_medians_divided_by_the_number_of_indentations(monkeypatch):
-    # Readings of the clock before and after each of three calls.
+    # The clock is read before and after each of three calls. Its readings are the running sums of these numbers.
     now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)

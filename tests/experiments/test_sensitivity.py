@@ -1,6 +1,6 @@
 """Tests of experiment sensitivity, which finds the smallest weight whose addition the readings show.
 
-References are loops, the normal distribution and SciPy.
+Results are compared with loops, the normal distribution and SciPy.
 """
 
 from itertools import pairwise
@@ -61,7 +61,7 @@ def test_fractions_of_correctly_ordered_pairs_follow_the_normal_distribution():
     np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)
 
 
-def test_gain_and_noise_are_recovered():
+def test_gain_and_noise_of_simulated_fillings_are_recovered():
     numbers, figure_data = analyse_levels(fillings(), WEIGHT_N)
     # The tolerance is about three standard errors: 0.5 uT in 150 uT.
     assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)
@@ -92,13 +92,13 @@ def test_smallest_resolved_step_does_not_depend_on_the_scale_of_fields(factor):
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
-def test_all_steps_from_the_smallest_resolved_one_on_are_resolved():
+def test_smallest_resolved_step_is_the_one_above_which_all_steps_are_resolved():
     assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
     assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
     assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
 
 
-def test_with_large_noise_no_step_is_resolved():
+def test_no_step_is_resolved_if_the_noise_is_large():
     numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
@@ -106,9 +106,10 @@ def test_with_large_noise_no_step_is_resolved():
 
 
 def two_fillings(values, spread):
-    """Return two fillings, whose mean field is `values` at levels 0.1 N apart.
+    """Return readings of two fillings with levels 0.1 N apart.
 
-    From one level to the next, the rises of the two fillings differ by `spread`.
+    The mean field of both fillings at each level is given by `values`. From one level to the next, the increases of the
+    field in the two fillings differ by `spread`.
     """
     wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
     return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
@@ -136,7 +137,7 @@ def test_number_of_falls_and_rank_correlation_equal_loops_and_scipy(values, spre
 
 
 def test_verdict_on_monotonicity_does_not_depend_on_the_size_of_filling_steps():
-    fine_N = 0.002 * np.arange(251)  # The same range of weights as WEIGHT_N, with steps a tenth as large.
+    fine_N = 0.002 * np.arange(251)  # These weights have the same range as WEIGHT_N, but a tenth of its step.
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
@@ -169,7 +170,8 @@ def test_number_of_falls_caused_by_noise_equals_the_expected_number():
 def test_readings_are_sorted_by_filling_and_weight():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
-    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # Two fillings, whose levels are mixed.
+    # There are two fillings, whose levels are not in order.
+    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
@@ -188,7 +190,7 @@ def glass(noise_uT):
     return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
 
 
-def test_if_even_the_finest_step_is_resolved_it_is_an_upper_limit():
+def test_table_says_at_most_if_even_the_finest_step_is_resolved():
     table = tables(glass(0.0)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "at most 0.1"
     assert table["ours"][1] == "at most 10"  # A weight of 0.1 N is 10.2 mL of water.

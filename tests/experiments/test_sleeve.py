@@ -1,6 +1,6 @@
 """Tests of experiment sleeve, in which one large skin covers several boards.
 
-Tested are held-out indentations, borders between boards, the frame rate, scores and the map of errors.
+The tests cover held-out indentations, borders between boards, the frame rate, scores and the map of errors.
 """
 
 import re
@@ -130,7 +130,7 @@ def test_scores_equal_scikit_learn_and_loops():
 
 
 @given(st.floats(0, 20), st.integers(0, 100))
-def test_if_all_predictions_have_the_same_offset_all_errors_equal_it(off_mm, seed):
+def test_all_place_errors_equal_the_offset_that_all_predictions_share(off_mm, seed):
     true, _, indentation = predictions(seed)
     scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
     for part in (scored, scored["near_seam"], scored["inside"]):
@@ -138,7 +138,7 @@ def test_if_all_predictions_have_the_same_offset_all_errors_equal_it(off_mm, see
     assert scored["p95_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
 
 
-def test_without_presses_near_a_border_there_are_no_border_scores():
+def test_border_scores_are_missing_if_no_press_is_near_a_border():
     alone = lay_out((50.8, 101.6), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0)
     true, predicted, indentation = predictions()
     scored = score_places(true, [predicted], indentation, alone)
@@ -177,7 +177,7 @@ def numbers_and_figure_data(n=40):
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
 
-def test_table_lists_methods_and_source_and_has_no_number_of_the_paper():
+def test_table_lists_methods_without_a_number_of_the_paper():
     numbers, _ = numbers_and_figure_data()
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
@@ -193,7 +193,7 @@ def test_table_lists_methods_and_source_and_has_no_number_of_the_paper():
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
-def test_score_of_an_area_without_presses_is_a_dash():
+def test_table_has_a_dash_for_border_errors_if_no_press_is_near_a_border():
     numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]

@@ -1,4 +1,4 @@
-"""Tests that all stability cases of experiment stability pass, and that the cases detect planted faults."""
+"""Tests that all cases of experiment stability pass, and that a fault planted in the library makes a case fail."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,8 @@ def failed(cases):
 @pytest.fixture(scope="module")
 def cases():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(physics, "POKES_N", 100)  # fewer pokes: array checks are slow while memory is traced
+        # Fewer pokes are used, because checks of arrays are slow while memory is traced.
+        patch.setattr(physics, "POKES_N", 100)
         return survey(DESIGN, SEED)
 
 
@@ -45,7 +46,7 @@ def test_every_case_passes(cases):
     assert failed(cases) == set()
 
 
-def test_rows_are_unique_and_describe_the_outcome(cases):
+def test_each_case_has_one_row_with_expected_and_actual_outcome(cases):
     assert len({(case.area, case.case) for case in cases}) == len(cases)
     assert {case.area for case in cases} == {"time", "physics", "chip", "wire"}
     assert all(case.should and case.happened for case in cases)
@@ -61,7 +62,7 @@ def sliding():
     return sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
 
 
-def test_base_without_damping_is_detected(monkeypatch):
+def test_sliding_cases_detect_a_base_without_damping(monkeypatch):
     monkeypatch.setattr(contact, "_in_series", lambda layer_N_per_m, _: layer_N_per_m[:, None, None] * np.eye(2))
     assert failed(sliding()) == {
         "a drag with a coefficient of friction of 10 on a sliding skin",
@@ -69,7 +70,7 @@ def test_base_without_damping_is_detected(monkeypatch):
     }
 
 
-def test_slide_without_rotation_and_linear_depth_are_detected(monkeypatch):
+def test_sliding_cases_detect_a_missing_rotation_and_a_wrong_force_curve(monkeypatch):
     def straight(force_N, *, thickness_m, **kwargs):
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
         return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **kwargs), curve_m)
@@ -87,8 +88,8 @@ def extremes():
     return extreme_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
 
 
-def test_too_short_depth_table_is_detected(monkeypatch):
-    monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
+def test_depth_table_that_ends_before_the_greatest_depth_is_detected(monkeypatch):
+    monkeypatch.setattr(extremes_module, "FINER", 1)  # A less accurate reference is enough to detect this fault.
     at_depth = deformation.at_depth
     monkeypatch.setattr(
         deformation, "at_depth", lambda flow, depth_m: at_depth(flow, min(depth_m, 0.62 * flow.thickness_m))
@@ -110,13 +111,13 @@ def test_wrong_layer_compliance_is_detected_for_all_tips(monkeypatch):
         one.cache_clear()
 
 
-def test_cells_as_wide_as_the_gap_are_detected(monkeypatch):
+def test_quadrature_with_cells_wider_than_the_gap_is_detected(monkeypatch):
     monkeypatch.setattr(extremes_module, "CELL_SHARE", 1.5)
     assert len(failed(near(DESIGN.skin))) >= 2
 
 
-def test_fixed_stiffening_thickness_is_detected(monkeypatch):
-    monkeypatch.setattr(extremes_module, "FINER", 1)  # a less accurate reference is enough to detect this fault
+def test_stiffening_that_ignores_the_thickness_of_the_skin_is_detected(monkeypatch):
+    monkeypatch.setattr(extremes_module, "FINER", 1)  # A less accurate reference is enough to detect this fault.
     monkeypatch.setattr(slide, "stiffening", lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3)
     assert failed(extremes()) == {
         f"a skin of {size} mm thickness, with all other lengths scaled too" for size in ("0.2", "20")
@@ -128,12 +129,12 @@ def test_skin_without_springs_has_no_sliding_cases():
 
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
-def test_streams_of_other_boards_are_checked(monkeypatch, chips_n, gain_sel):
-    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # a single block is faster while memory is traced
+def test_all_cases_of_byte_streams_pass_for_other_boards(monkeypatch, chips_n, gain_sel):
+    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # A single block is used, because decoding is slow while memory is traced.
     assert failed(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
-def test_case_without_the_expected_error_and_nan_fail():
+def test_case_fails_if_the_expected_error_is_not_raised_or_its_value_is_nan():
     def raises():
         raise CaptureError("here: a thing must be so; got nothing. Mend it.")
 
@@ -142,7 +143,7 @@ def test_case_without_the_expected_error_and_nan_fail():
     assert not error_case("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
 
 
-def test_errors_of_another_type_are_not_caught():
+def test_rejection_case_does_not_catch_errors_of_unexpected_types():
     with pytest.raises(ZeroDivisionError):
         rejection_case("wire", "a", should="b", attempt=lambda: 1 / 0)
 
@@ -152,23 +153,24 @@ def test_peak_memory_counts_arrays_that_exist_at_once():
         for _ in range(3):
             np.ones(125_000)
 
-    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # 10 %: overhead of the array object
+    # The tolerance allows for the overhead of array objects.
+    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)
 
 
-# Each of the following tests disables one guard of the library. A stability case must detect the missing guard.
+# Each of the following tests disables one check or limit (guard) of the library. A stability case must then fail.
 
 
-def test_naive_small_step_quotient_is_detected(monkeypatch):
+def test_formula_that_loses_digits_in_small_time_steps_is_detected(monkeypatch):
     monkeypatch.setattr(aging, "_mean_decay", lambda x: (1 - np.exp(-x)) / np.where(x > 0, x, 1.0))
     assert "dt / tau_min 1e-16" in failed(time_cases())
 
 
-def test_decreasing_time_is_detected(monkeypatch):
+def test_missing_check_for_infinite_time_steps_is_detected(monkeypatch):
     monkeypatch.setattr(aging.np, "isfinite", lambda _: np.True_)
     assert "a time step of inf s" in failed(time_cases())
 
 
-def test_missing_force_limit_and_flag_are_detected(monkeypatch):
+def test_missing_range_of_the_force_sensor_and_wrong_verified_depth_are_detected(monkeypatch):
     monkeypatch.setattr(rig, "FORCE_RANGE_N", (np.inf,) * 3)
     monkeypatch.setattr(layer, "VERIFIED_DEPTH", 0.99)
     monkeypatch.setattr(physics, "POKES_N", 10)
@@ -192,7 +194,7 @@ def test_missing_chip_saturation_is_detected(monkeypatch):
         ("reset_chips", lambda *_: np.zeros(5, bool), "chip 3 lost its settings"),
     ],
 )
-def test_missing_guard_is_detected(monkeypatch, guard, disabled, case):
+def test_chip_cases_detect_that_a_check_for_faults_is_disabled(monkeypatch, guard, disabled, case):
     monkeypatch.setattr(faults, guard, disabled)
     assert any(name.startswith(case) for name in failed(chip_cases(DESIGN.chip, 5, SEED)))
 

@@ -1,4 +1,4 @@
-"""Tests that the training code passes extreme cases, and that these cases detect planted faults."""
+"""Tests that the training code passes extreme cases, and that a fault planted in the code makes one case fail."""
 
 from dataclasses import replace
 
@@ -56,7 +56,7 @@ def test_scaler_with_a_too_large_minimum_scale_is_detected(monkeypatch):
     assert failed(scaling_cases(SEED)) == {"labels multiplied by 2^-20"}
 
 
-def test_triplet_loss_of_distances_that_are_not_squared_is_detected(monkeypatch):
+def test_triplet_loss_without_squared_distances_is_detected(monkeypatch):
     def triplet_loss_of_roots(anchor, positive, negative):
         nearer, farther = ((anchor - one).pow(2).sum(-1).sqrt() for one in (positive, negative))
         return torch.relu(nearer - farther + 1e-3).mean(-1)
@@ -65,7 +65,7 @@ def test_triplet_loss_of_distances_that_are_not_squared_is_detected(monkeypatch)
     assert failed(triplet_cases(SEED)) == {"triplet loss of identical readings, with a weight of 1000"}
 
 
-def test_triplets_with_equal_distances_are_detected(monkeypatch):
+def test_missing_check_for_equal_distances_in_triplets_is_detected(monkeypatch):
     monkeypatch.setattr(losses, "_find_anchors", lambda place: np.ones(len(place), bool))
     monkeypatch.setattr(batches, "draw_triplets", lambda points, anchor, rng: (anchor, anchor))
     assert failed(triplet_cases(SEED)) == {"triplets if each skin has only two pokes"}
@@ -89,7 +89,7 @@ def test_training_that_does_not_notice_a_collapse_is_detected(monkeypatch):
     assert not learning._collapsed(JOB, ROWS).holds
 
 
-def test_networks_of_a_stack_that_influence_each_other_are_detected(monkeypatch):
+def test_influence_between_networks_of_a_stack_is_detected(monkeypatch):
     original = network.Stack.features
 
     def mixed(self, inputs):
@@ -111,6 +111,6 @@ def test_batches_that_ignore_the_seed_are_detected(monkeypatch):
     assert not learning._same_seed(JOB, ROWS).holds
 
 
-def test_folds_of_too_few_groups_are_detected(monkeypatch):
+def test_missing_check_for_too_few_groups_in_folds_is_detected(monkeypatch):
     monkeypatch.setattr(learning, "draw_folds", lambda *_: [splits.NO_POOL])
     assert len(failed(fold_cases())) == 3

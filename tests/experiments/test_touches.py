@@ -37,8 +37,8 @@ NOISE_uT = 2.0
 def pad(rows_n=40):
     """Return recordings of touches at each place and at each pair of places.
 
-    The field change is the sum, over the touched places, of the force times a direction that belongs to the place.
-    Noise is added.
+    Each place has a direction in the space of channels. The field change is the sum over the touched places of the
+    force times the direction of the place, plus noise.
     """
     rng = rng_for(0, "touches", "pad")
     directions = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
@@ -87,7 +87,7 @@ def test_residual_is_small_only_for_the_pair_of_places_that_is_touched(split_pad
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_a_place_without_training_rows_is_mistaken_for_two(split_pad):
+def test_touch_of_a_place_that_was_not_in_training_is_taken_for_two_touches(split_pad):
     result = evaluate_detection(*split_pad, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
@@ -95,7 +95,7 @@ def test_single_touch_at_a_place_without_training_rows_is_mistaken_for_two(split
     assert result["sums_called_two_pct"]["direction above noise"] > 90
 
 
-def test_places_and_forces_are_predicted(split_pad):
+def test_touched_places_and_forces_are_predicted(split_pad):
     blocks, double = split_pad
     place, force = evaluate_places(blocks, double), evaluate_forces(blocks, rng_for(0, "touches", "force"))
     assert place["by_time"]["mean"] == 100
@@ -126,7 +126,7 @@ def test_unusable_recordings_are_omitted_with_a_reason():
     assert result.left_out["(1, 2)"] == "no recording of place 1 alone"
 
 
-def test_if_all_recordings_are_of_pairs_the_reason_is_reported():
+def test_result_states_why_recordings_of_pairs_alone_cannot_be_used():
     _, double = pad()
     result = sort_recordings(double)
     assert (

@@ -89,7 +89,7 @@ def test_plotted_visits_include_the_first_and_the_last():
 
 
 @given(st.floats(-500, 500), st.floats(0.5, 3))
-def test_drift_of_the_no_load_field_changes_only_raw_readings(drift_uT, scale):
+def test_drift_changes_raw_readings_but_not_field_changes(drift_uT, scale):
     db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
     rest_uT = drift_uT * np.arange(5)[:, None]
     numbers, _ = over_time(Visits(np.arange(5), db_uT + rest_uT, scale * db_uT), 100)
@@ -97,7 +97,7 @@ def test_drift_of_the_no_load_field_changes_only_raw_readings(drift_uT, scale):
     assert numbers["db_change_uT"] == 0
 
 
-def test_spread_between_skins_is_the_rms_difference_over_pairs():
+def test_spread_between_skins_is_the_rms_difference_over_all_pairs_of_skins():
     lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
     numbers, plotted = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
     pairs = [(one, other) for one in lines for other in lines if one < other]

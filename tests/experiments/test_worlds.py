@@ -1,6 +1,6 @@
-"""Tests of experiment worlds, which varies the settings of scene decide to find those that determine table 2.
+"""Tests of experiment worlds, which finds the settings of scene decide on which the results of table 2 depend most.
 
-A world is one of these simulated variants.
+The experiment simulates variants of the scene, which are called worlds.
 """
 
 from pathlib import Path
@@ -29,13 +29,13 @@ def law_error(skin: str = "b0_s0", residual: Residual = RESIDUAL, size: float = 
     return with_residual(CHANGE_uT, PRESSES, size, residual, 1, skin) - CHANGE_uT
 
 
-def test_error_of_the_law_has_the_given_size_is_smooth_and_is_reproducible():
+def test_error_of_the_law_is_a_smooth_reproducible_field_of_the_given_size():
     relative_errors = [
         np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)
     ]
     assert np.sqrt(np.mean(np.square(relative_errors))) == pytest.approx(0.4, rel=0.1)
     relative_error = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    # Differences between places that are 0.5 mm apart.
+    # These are the differences between places that are 0.5 mm apart.
     step = np.linalg.norm(np.diff(relative_error.reshape(33, 33, 15), axis=1), axis=2)
     assert step.mean() < 0.25 * np.linalg.norm(relative_error, axis=1).mean()
     np.testing.assert_array_equal(law_error(), law_error())
@@ -43,7 +43,7 @@ def test_error_of_the_law_has_the_given_size_is_smooth_and_is_reproducible():
     assert with_residual(CHANGE_uT, PRESSES, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
 
 
-def test_part_of_the_error_of_the_law_is_common_to_all_skins():
+def test_own_share_sets_how_much_errors_of_the_law_differ_between_skins():
     fully_shared = RESIDUAL.model_copy(update={"own_share": 0.0})
     np.testing.assert_array_equal(law_error("b0_s0", fully_shared), law_error("b1_s0", fully_shared))
     pairs = [np.corrcoef(law_error(f"b{i}_s0").ravel(), law_error(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
@@ -67,7 +67,7 @@ def decide_settings() -> Settings:
     return Settings("decide", "decide.yaml", scene, read_shared_files(ROOT))
 
 
-def test_each_world_has_the_rows_of_table_2(decide_settings, tmp_path):
+def test_scores_of_each_world_are_given_for_each_row_of_table_2(decide_settings, tmp_path):
     worlds(decide_settings, decide_settings.section(Worlds, "worlds"), results=tmp_path / "results.json")
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]

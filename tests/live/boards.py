@@ -1,7 +1,7 @@
 """Helpers for tests of live boards.
 
-They are scripts (the bytes and times of an emulated board) in which two pokes alternate, a model of these pokes, and
-readers.
+They make scripts, which are the bytes and times of an emulated board. In a script, two pokes alternate. A model for
+these pokes and readers of scripts are here as well.
 """
 
 import threading
@@ -24,7 +24,7 @@ from tests.recordings.headers import make_header
 RATE_HZ = 400.0
 QUIET_S, POKE_S = 1.5, 1.0
 PAUSE_S = 2.0
-# The place x and y (mm) and the force (N) of the two pokes, which alternate.
+# These are the places x and y (mm) and the forces (N) of the two pokes, which alternate.
 PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])
 INPUT_SCALE_uT = 300.0
 
@@ -52,7 +52,7 @@ def make_script(
 def changes_uT(chips_n: int) -> np.ndarray:
     """Return the field changes of the two pokes [2 ch].
 
-    They differ from chip to chip, unlike those of a distant magnet.
+    The field changes differ from chip to chip, unlike field changes by a distant magnet.
     """
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 
@@ -62,10 +62,11 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
 
     For the two pokes, its predictions are exact, except for an offset of `off_mm` along x.
     """
-    # The weights of a linear model from channels to place and force [3 ch].
+    # These are the weights of a linear model that computes place and force from the channels, as an array [3 ch].
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    # ReLUs set negative values to 0. Therefore each value is passed twice, as it is and negated.
+    # ReLUs set negative values to 0. To keep negative values, each value is passed through the layers twice: once
+    # unchanged and once with the opposite sign.
     weights["layer1.weight"][:6] = np.concatenate([linear, -linear])
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)

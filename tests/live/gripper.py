@@ -19,8 +19,8 @@ from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1
-# PERIOD_S is the period with which the stiffness of the object changes. SETTLED_S is the time from which on the force
-# is evaluated.
+# PERIOD_S is the period with which the stiffness of the object changes. The force is evaluated only after the time
+# SETTLED_S.
 PERIOD_S, SETTLED_S = 6.0, 1.0
 SOFT_N_MM, HARD_N_MM = 0.3, 3.0
 NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
@@ -56,9 +56,9 @@ def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
 
 
 class Finger:
-    """A skin that is pressed at the place `at_mm`. Its readings depend on the force.
+    """A skin that is pressed at the place `at_mm`.
 
-    They are interpolated between readings at simulated forces.
+    Readings at some forces are simulated. The reading at any other force is interpolated between these readings.
     """
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
@@ -80,7 +80,10 @@ class Finger:
 
 
 class FingerReader:
-    """A reader that returns one frame at a time, for the force that is on the finger at this time."""
+    """A reader that returns one frame at a time.
+
+    Each frame has the field for the force that then acts on the finger.
+    """
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 
@@ -118,7 +121,7 @@ def grip(
             continue
         estimate_N = float(estimates.target[-1, 2])
         forces_N.append((wire.force_N, estimate_N))
-        # The controller is proportional: it closes in proportion to the missing force.
+        # This is a proportional controller: the gripper closes in proportion to the missing force.
         closed_mm += GAIN_MM_N * (aim_N - estimate_N)
         share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)

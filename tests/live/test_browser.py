@@ -58,7 +58,7 @@ COMPARE_TRACES = """((board, i) => {
     .map((values) => values.filter((_, at) => at % 4 === 3));
   return [old.filter((alpha, at) => Math.abs(alpha - fresh[at]) > 64).length, fresh.filter(Boolean).length]; })"""
 pytestmark = [
-    pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}"),
+    pytest.mark.skipif(BROWSER is None, reason=f"RESKIN_BROWSER is not set, and PATH has none of {NAMES}"),
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.timeout(300),
@@ -93,14 +93,17 @@ class Tab:
             if accept(found := await self.value(expression)):
                 return found
             await asyncio.sleep(0.02)
-        raise AssertionError(f"never: {expression}; last {found}")
+        raise AssertionError(f"{expression} was never as expected; its last value is {found}")
 
     async def press_key(self, key: str) -> None:
         for kind in ("keyDown", "keyUp"):
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
-        """Check that nothing is cut off at the widths of a phone and of a desktop. Save screenshots if requested."""
+        """Check that nothing is cut off on screens with the widths of a phone and of a desktop.
+
+        Save screenshots if requested.
+        """
         for wide in WIDTHS_PX:
             await self.call(
                 "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False
@@ -142,7 +145,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
     return act_in_browser
 
 
-def test_page_draws_contacts_and_its_buttons_zero_and_record_work(tmp_path, monkeypatch):
+def test_page_draws_contacts_and_its_buttons_work(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
 
@@ -194,7 +197,7 @@ CLICK = """((x, y) => { const {frame, parts: {board}} = boards[0], [px, py] = fr
   board.dispatchEvent(new MouseEvent("click", {clientX: at.left + px, clientY: at.top + py, bubbles: true})); })"""
 
 
-def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path, random_pokes):  # noqa: F811
+def test_calibrations_can_be_saved_loaded_and_undone_on_the_page(tmp_path, random_pokes):  # noqa: F811
     quiet = make_poke_script(random_pokes)
     place_mm, force_N = random_pokes[2:]
     poke_i = np.minimum(np.maximum(np.arange(len(quiet)) - QUIET_N, 0) // (2 * POKED_N), len(place_mm) - 1)
@@ -202,7 +205,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     true[np.linalg.norm(quiet.frames.b_uT - quiet.frames.b_uT[0], axis=1) < 100] = np.nan
 
     async def act(tab: Tab) -> None:
-        assert not await tab.value("boards[0].truthShown()")  # The true place is shown only on demand.
+        assert not await tab.value("boards[0].truthShown()")  # The true place is shown only if the user asks for it.
         await tab.value("boards[0].parts.truth.click()")
         await tab.until("boards[0].parts.off.innerText.includes('the estimate is off by')")
         await tab.until("boards[0].last.contact && !isNaN(boards[0].last.trueX)")
@@ -211,7 +214,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
         await tab.value(f"{CLICK}(3.5, 12)")
         typed = "[boards[0].parts.x.value, boards[0].parts.y.value].map(Number)"
         found_mm = await tab.until(typed, lambda values: values != [0, 0])
-        # The tolerance in mm: a pixel is 0.05 mm, and values have one decimal.
+        # The tolerance is in mm. A pixel is 0.05 mm wide, and values are shown with one decimal.
         assert np.abs(np.array(found_mm) - (3.5, 12)).max() < 0.15
         await tab.value("boards[0].parts.label.click()")
         await tab.until("boards[0].state.labelled.includes('calibrated to a labelled press')")
@@ -240,7 +243,7 @@ def test_page_saves_loads_and_undoes_calibrations_and_shows_true_places(tmp_path
     assert [file.name for file in (tmp_path / "skins").iterdir()] == ["zap1.safetensors"]
 
 
-def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  # noqa: F811
+def test_key_a_adapts_the_model_to_presses(tmp_path, random_pokes):  # noqa: F811
     async def act(tab: Tab) -> None:
         await tab.until(
             "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"
@@ -255,9 +258,9 @@ def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  
         serve(name, load_universal(), in_browser(tmp_path, act))
 
 
-def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
+def test_page_shows_errors_before_and_after_adapting_to_guided_presses(tmp_path, guided_pokes):  # noqa: F811
     quiet = make_poke_script(guided_pokes)
-    # A pause before the first place, in which the test presses the button.
+    # The script begins with a pause, in which the test presses the button.
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)
     script = replace(quiet, t_s=quiet.t_s + late_s)
 

@@ -11,7 +11,7 @@ from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encod
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
-# A script has 8 slots of 12 frames at 400 Hz. There is one fault in each slot except the last one.
+# A script has 8 parts (slots) of 12 frames each, at 400 Hz. Each slot except the last one contains one fault.
 SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0
 NOT_FINITE_SHARE = 0.02
 SEEDS_N = 200
@@ -100,4 +100,4 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost_with_its_reason():
         _, account = decode_portions(split_randomly(data, rng), script.wire, script.frames.temperature_degC.shape[1])
         assert account == {"bytes_n": len(data)} | {name: count[name] for name in REASONS}, f"seed {seed}"
         total += count
-    assert all(total[name] > 100 for name in REASONS)  # Every reason for a loss has occurred.
+    assert all(total[name] > 100 for name in REASONS)  # Each reason for a loss of bytes must have occurred.

@@ -55,7 +55,7 @@ def test_record_measures_the_rate_and_the_repeated_readings(tmp_path, capsys):
     rate = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").rate
     assert rate.arrived_hz == rate.sent_hz == pytest.approx(400, rel=0.05)
     assert rate.method == "arrivals"
-    assert rate.repeated_frames < 0.01  # When the script begins again, a whole frame may be repeated.
+    assert rate.repeated_frames < 0.01  # A frame may be repeated when the script begins again.
     assert rate.repeated_readings == pytest.approx(2 / 3, abs=0.01)
     output = capsys.readouterr().out
     assert "% of readings repeat; over 5 % of readings repeat: the board sends faster" in output
@@ -68,7 +68,7 @@ def test_recording_of_an_emulated_board_can_be_marked_as_simulated(tmp_path):
         assert parse((tmp_path / source / HEADER_FILE).read_text(), "header").source == source
 
 
-def test_options_for_wire_format_and_chips_need_a_port(tmp_path):
+def test_options_wire_and_chips_raise_without_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
             commands.record(None, seconds=0.5, out=tmp_path / "run1", **(NO_OPTIONS | options))

@@ -49,7 +49,7 @@ class SimulatedClock:
         return False
 
     def wait(self, seconds):
-        self.s += max(seconds, 1e-9)  # A smaller step would vanish by rounding.
+        self.s += max(seconds, 1e-9)  # A smaller time step would be lost by rounding.
 
 
 class FakeReader:
@@ -93,7 +93,7 @@ def test_no_byte_is_lost_while_nobody_reads_from_the_open_port(port):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_script_begins_again_when_the_port_is_reopened(port):
+def test_emulated_board_starts_again_when_its_port_is_reopened(port):
     # When a port is opened, bytes that wait there are discarded, so some of the first frames may be missing.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
@@ -121,7 +121,7 @@ def test_option_speed_multiplies_the_frame_rate_of_the_script(times, speed):
     np.testing.assert_allclose(reader.arrival_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
-def test_reader_that_is_late_gets_at_most_a_tenth_of_a_second_at_once(times):
+def test_reader_that_pauses_then_receives_at_most_a_tenth_of_a_second_at_once(times):
     reader = FakeReader(times, late_i=100, late_s=2.0)
     play(SCRIPT, reader, times)
     late_s = np.array(reader.arrival_s) - SCRIPT.t_s
@@ -130,7 +130,7 @@ def test_reader_that_is_late_gets_at_most_a_tenth_of_a_second_at_once(times):
     assert max(Counter(reader.arrival_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
-def test_link_has_the_same_name_after_unplugging(tmp_path):
+def test_link_to_an_emulated_board_returns_with_its_name_after_unplugging(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = make_port(str(link))
     player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
@@ -146,7 +146,7 @@ def test_link_has_the_same_name_after_unplugging(tmp_path):
     end.unplug()
 
 
-def test_link_that_is_in_use_is_an_error_and_is_not_removed(tmp_path):
+def test_make_port_raises_if_the_link_is_in_use_and_keeps_the_link(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     leads_to = link.readlink()
@@ -155,7 +155,8 @@ def test_link_that_is_in_use_is_an_error_and_is_not_removed(tmp_path):
     assert link.readlink() == leads_to
     first.unplug()
     assert not link.is_symlink()
-    link.symlink_to(leads_to.with_name("999999"))  # A link that was left by an emulator that was killed.
+    # This link leads to no port. Such a link remains if an emulator is killed.
+    link.symlink_to(leads_to.with_name("999999"))
     second = make_port(str(link))
     assert link.exists()
     second.unplug()
@@ -187,7 +188,7 @@ def test_invalid_names_of_ports_are_refused(tmp_path):
 
 
 class TestFaults:
-    def test_faults_of_values_change_only_frames_within_their_time(self):
+    def test_faults_that_change_values_change_only_frames_during_the_fault(self):
         for name in (
             "failed-read",
             "chip-reset",
@@ -206,7 +207,7 @@ class TestFaults:
             assert differs[inside].mean() > 0.4, name
             assert [len(piece) for piece in changed.pieces] == [len(piece) for piece in SCRIPT.pieces]
 
-    def test_faults_of_bytes_change_the_number_of_frames(self):
+    def test_faults_that_drop_or_repeat_bytes_change_the_number_of_frames(self):
         def frames_n(name: str) -> int:
             return len(
                 decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
@@ -214,9 +215,9 @@ class TestFaults:
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
-        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # Each torn frame also costs the frame after it.
+        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # The frame after each torn frame is lost, too.
 
-    def test_clock_jump_needs_frames_with_a_clock(self):
+    def test_fault_clock_jump_raises_if_frames_have_no_clock(self):
         with pytest.raises(ParamsError, match="needs a capture with a clock of the board"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
@@ -260,7 +261,7 @@ def test_script_of_a_simulation_has_contacts(source):
     contact = np.isfinite(true[:, 0])
     np.testing.assert_array_equal(np.isfinite(true), np.repeat(contact[:, None], 3, axis=1))
     change_uT = np.linalg.norm(script.frames.b_uT - script.frames.b_uT[~contact].mean(axis=0), axis=1)
-    # In uT. The noise of 15 channels together is about 15 uT.
+    # The limit is 60 uT. The noise of 15 channels together is about 15 uT.
     assert change_uT[~contact].max() < 60 < np.median(change_uT[contact])
     # The true forces belong to the same times as the field changes, so a shift by a frame or more reduces their
     # correlation.
@@ -273,7 +274,7 @@ def test_true_contacts_of_a_capture_are_unknown(tmp_path):
     assert read_script(str(write_script(POKE_SCRIPT, tmp_path / "c0"))).true_contacts is None
 
 
-def test_true_contact_is_that_of_the_last_frame_that_was_sent(times):
+def test_true_contact_belongs_to_the_last_frame_that_was_sent(times):
     true = np.arange(3.0 * len(SCRIPT)).reshape(-1, 3)
     script, found = replace(SCRIPT, true_contacts=true), []
     board = EmulatedBoard(script, SimpleNamespace(name="port"))
@@ -333,12 +334,12 @@ class TestRobot:
         log.close()
         dwells = list(DwellBuilder().feed(SampleTable("log").feed((tmp_path / "robot.csv").read_bytes())))
         touches = [dwell for dwell in dwells if dwell.label.contact]
-        # The rows after the last touch are not ended by another phase, so they become no dwell.
+        # The rows after the last touch become no dwell, because no row of another phase ends them.
         assert len(dwells) == 2 * len(touches)
         for pass_i in range(2):
             places = [touch.label[1:3] for touch in touches if touch.label.pass_i == pass_i]
             assert sorted(places) == sorted(map(tuple, points_mm().tolist()))
-        for touch in touches:  # At any time of a dwell, its label is the true contact.
+        for touch in touches:  # At any time during a dwell, the true contact equals the label of the dwell.
             inside = (robot_script.t_s >= touch.t_start_s - 1e9) & (robot_script.t_s <= touch.t_end_s - 1e9)
             true = robot_script.true_contacts[inside]
             assert np.isfinite(true).all()
@@ -347,9 +348,9 @@ class TestRobot:
     def test_boards_with_different_names_have_different_skins(self, robot_script):
         other = read_script("nominal", board="b2", robot=True)
         untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
-        assert np.abs(untouched[0] - untouched[1]).max() > 50  # The difference is in uT.
+        assert np.abs(untouched[0] - untouched[1]).max() > 50  # The two skins differ by more than this number of uT.
 
-    def test_options_for_the_nominal_board_are_refused_elsewhere(self, tmp_path):
+    def test_options_for_the_nominal_board_raise_for_other_sources(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")
         for options in ({"board": "b1"}, {"robot": True}):
             with pytest.raises(ParamsError, match="can only be used with source nominal"):

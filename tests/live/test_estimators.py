@@ -102,7 +102,7 @@ def test_external_fields_that_are_stronger_than_expected_raise_an_alarm(random_p
     assert "external field" in {name.split(":")[0] for name in skin.health.alarms}
 
 
-def test_model_is_adapted_to_collected_presses(random_pokes):
+def test_model_is_adapted_after_enough_presses_were_collected(random_pokes):
     _, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     pokes = Presses()
     for batch in readings:
@@ -160,7 +160,7 @@ def test_presses_within_the_noise_are_refused(random_pokes):
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
 
 
-def test_new_presses_replace_the_earlier_ones(random_pokes):
+def test_second_adaptation_replaces_the_presses_of_the_first_one(random_pokes):
     db_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
     corrected, adapted_once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for estimator in (corrected, adapted_once):
@@ -219,7 +219,7 @@ def test_presses_guided_by_the_page_are_added_to_the_labels_of_a_calibration(gui
     assert calibrated.presses_n == kept.sum()
 
 
-def test_short_contact_is_not_a_press():
+def test_contact_of_one_or_two_readings_is_not_counted_as_a_press():
     pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
     pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), np.zeros(6), contact))
@@ -239,7 +239,7 @@ def test_board_opened_with_a_saved_calibration_uses_it(random_pokes, tmp_path):
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
     before, mean = calibrated.predict(b_uT), calibrated.skin.mean
-    # This is a user's file. It has the name of the card of model s3, but is not a card.
+    # This file has the name of the card of model s3, but is another file of the user.
     (tmp_path / "s3.json").write_text("{}")
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)

@@ -5,7 +5,7 @@ import numpy as np
 from reskin.seeds import rng_for
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
-SEEDS = range(3)  # For each seed, a skin is drawn and a network is trained.
+SEEDS = range(3)  # Each seed gives another skin and another network.
 
 
 def test_controller_holds_the_estimated_force_at_half_a_newton():

@@ -51,7 +51,7 @@ def test_healthy_board_raises_no_alarm():
 
 
 @pytest.mark.parametrize("name", ALARMS)
-def test_fault_is_named_and_counted(name):
+def test_alarm_names_the_fault_and_counts_its_frames(name):
     health = feed(inject_fault(name))
     assert set(health.alarms) == {ALARMS[name]}
     alarm = health.alarms[ALARMS[name]]
@@ -101,14 +101,14 @@ def test_reset_chip_is_found_on_a_board_without_contact():
     assert ALARMS["chip-reset"] in alarms
 
 
-def test_chip_that_reads_zeros_is_named():
+def test_alarm_names_a_chip_that_reads_zeros():
     health = feed(inject_fault("zeros"))
     assert {name: alarm.count_n for name, alarm in health.alarms.items()} == {
         f"chip {chip_i}: zeros in place of a reading": 600 for chip_i in range(5)
     }
 
 
-def test_repeated_frames_and_jumps_of_the_clock_raise_alarms():
+def test_repeated_frames_and_clock_jumps_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
@@ -117,7 +117,7 @@ def test_chips_that_are_slower_than_the_frames_raise_an_alarm():
     health = feed(inject_fault("slow-chips"))
     assert set(health.alarms) == {READINGS_REPEAT}
     alarm = health.alarms[READINGS_REPEAT]
-    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # These are two thirds of the readings in 1.5 s.
+    assert alarm.count_n == pytest.approx(2 / 3 * 600, abs=5)  # This is two thirds of the number of readings in 1.5 s.
     assert 1.5 < alarm.first_s <= 1.5 + REPEATS_FRAMES_N / 400
     assert alarm.action == "flag"
 
@@ -151,10 +151,11 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_equal_change_on_all_chips_is_reported_as_an_external_field():
+def test_alarm_for_external_fields_is_raised_if_all_chips_change_equally():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
-    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # This change is too weak to be judged.
+    # This change is too weak to be called an external field.
+    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)

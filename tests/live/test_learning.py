@@ -33,7 +33,7 @@ LONG_S = 20.0
 class PausingReader(ScriptReader):
     """A reader that pauses at given times of the script until `resume` is called, and that can write a recording.
 
-    As in a real reader, the time is a unix time. It is the time of the start plus the time in the script.
+    As in a real reader, times are unix times: the time at which the reader was started, plus the time in the script.
     """
 
     def __init__(self, script, pauses_s=()):
@@ -216,13 +216,14 @@ def test_labels_from_the_page_are_recorded(tmp_path, monkeypatch):
     blocks, account = read(folder)
     assert places_of(blocks) == {(12.0, 4.0)}
     assert account["clock_residual_us"] == 0
-    # The second press of the script lasts one second. Nearly all of its frames are labelled, and no frame without
-    # contact.
+    # The second press of the script lasts one second. Nearly all of its frames are labelled, and frames without contact
+    # are not labelled.
     assert 0.9 * 400 * POKE_S < account["frames_contact_n"] <= 400 * POKE_S
     log = probe.parse(folder / PROBE_FILE, "log")
     assert np.isnan(log.Fz_N).all()
     changes_uT = np.concatenate([block.b_uT - block.noload_uT for block in blocks])
-    assert np.linalg.norm(changes_uT, axis=1).min() > 300  # In uT. Each press changes the field by more than 600 uT.
+    # The limit is in uT. Each press changes the field by more than 600 uT.
+    assert np.linalg.norm(changes_uT, axis=1).min() > 300
 
 
 def test_guided_presses_are_recorded_with_their_places(guided_pokes, tmp_path, monkeypatch):  # noqa: F811
@@ -302,7 +303,7 @@ def test_unusable_press_is_explained_and_the_next_press_is_used(parts, problem):
     np.testing.assert_allclose(press.db_uT, 100.0)
 
 
-def test_page_describes_the_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
+def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pokes, tmp_path):  # noqa: F811
     measured = read_measured(MEASURED_FILE)
     noload_uT, b_uT, place_mm, force_N = random_pokes
     shipped = UniversalEstimator(load_universal())

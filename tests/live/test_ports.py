@@ -16,7 +16,7 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # The number of frames per chunk. Chunks start in the middle of a frame.
+CHUNK_N = 3  # Each chunk has the bytes of this number of frames, and starts in the middle of a frame.
 
 
 def chunks_of(script, cut_n=31):
@@ -32,7 +32,7 @@ def chunks_of(script, cut_n=31):
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
 @pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
-def test_wire_format_number_of_chips_rate_and_steps_are_detected(wire, chips_n, rate_hz):
+def test_properties_of_a_board_are_detected_from_its_bytes(wire, chips_n, rate_hz):
     script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
     found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
@@ -52,7 +52,7 @@ def test_devices_that_send_other_bytes_are_not_taken_for_boards():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_arbitrary_bytes_are_described_without_an_error(data, size):
+def test_bytes_of_an_unknown_device_are_described_without_an_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     found = find.recognise("port", chunks)
     assert str(found).startswith("port: ")
@@ -70,7 +70,7 @@ def test_frames_with_random_values_are_described_without_an_error(seed, chips_n)
     assert found.describe_rate().startswith("port: ")
 
 
-def test_chips_without_noise_have_no_detectable_step():
+def test_steps_of_chips_are_unknown_if_readings_have_no_noise():
     script = make_script(pokes_n=0)
     without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
     assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
@@ -109,12 +109,12 @@ def test_busy_port_is_an_error_of_one_sentence():
         assert str(find.detect_board(name, 0.1)).startswith(busy)
 
 
-def test_other_device_is_not_a_serial_port():
+def test_opening_a_device_that_is_not_a_serial_port_raises():
     with pytest.raises(CaptureError, match=f"{os.devnull}: cannot open the port: it is not a serial port"):
         find.open_port(os.devnull, find.BAUD)
 
 
-def test_single_board_is_found_and_two_boards_are_ambiguous(monkeypatch):
+def test_find_board_raises_unless_exactly_one_board_is_connected(monkeypatch):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         found = {board.port: board for board in find.scan_ports([name, "/dev/none", other])}
@@ -133,7 +133,8 @@ class TestReplugging:
     def find(self, *port_lists):
         """Find the port of a board that was plugged in again.
 
-        Each poll sees the next list of ports, and polls after the last list see the last list again.
+        Each time the function looks for ports, it sees the next of the given lists. After the last list, it sees the
+        last list again.
         """
         polls, printed = iter(port_lists), []
         last = [set(port_lists[-1])]
@@ -144,7 +145,7 @@ class TestReplugging:
 
         return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, timeout_s=1.0), printed
 
-    def test_port_of_a_board_that_is_plugged_in_again_is_found(self):
+    def test_board_that_is_plugged_in_again_is_found_at_its_new_port(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
         assert found == "c"  # The board may then have another port.
         assert printed == ["Unplug the board.", "a disappeared. Plug the board in again."]

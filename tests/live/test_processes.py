@@ -29,7 +29,7 @@ from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 
-LONG_S = 120.0  # A time limit, which is enough to import PyTorch on a busy machine.
+LONG_S = 120.0  # This time limit is long enough to import PyTorch on a busy machine.
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
@@ -42,7 +42,7 @@ def restore_ctrl_c() -> None:
 
 
 class Shell:
-    """An object that runs `reskin` commands in a folder. `close` stops those that still run."""
+    """An object that runs `reskin` commands in a folder. `close` stops the commands that still run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []
@@ -124,7 +124,7 @@ async def watch_page(address: str) -> None:
                 near_n += int(np.abs(found - PLACES).max(axis=1).min() < 1.0)
             if near_n >= 10 and "no data" in alarms and "unplugged" in alarms:
                 return
-        raise AssertionError(f"{near_n} messages of pokes near their place; alarms: {alarms[:500]}")
+        raise AssertionError(f"{near_n} messages had a poke near its place; alarms: {alarms[:500]}")
 
 
 class connect:
@@ -147,7 +147,7 @@ class connect:
         await self._socket.close()
 
 
-def test_killed_recording_can_be_added(shell, tmp_path):
+def test_recording_of_a_killed_process_can_be_added(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)

@@ -1,4 +1,4 @@
-"""Tests that labelled recordings can be added to a scene, however the recording has ended."""
+"""Tests that labelled recordings can be added to a scene, even if the recorder was killed or the disk was full."""
 
 import os
 import signal
@@ -134,7 +134,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
 
     def append(file, data):
         taken.append(data)
-        if len(taken) > 2:  # After the header of the log and one touch, the disk is full.
+        if len(taken) > 2:  # The disk becomes full after the header of the log and one touch are written.
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
@@ -158,7 +158,7 @@ def test_invalid_label_sources_are_refused(labels, gauge, scan, message):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 
-def test_prompted_places_are_in_random_order_by_default():
+def test_places_are_prompted_in_random_order_by_default():
     assert label_source("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
     assert label_source("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
     assert label_source(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"

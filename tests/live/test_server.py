@@ -84,7 +84,7 @@ async def until(socket, wanted: Callable[[dict], bool]) -> dict:
     raise AssertionError("the message was never received")
 
 
-def test_page_receives_estimates_and_the_buttons_zero_and_record_work(tmp_path, monkeypatch):
+def test_page_receives_estimates_and_can_zero_and_record(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
     models = [read_network(write_model(tmp_path))]
@@ -155,7 +155,7 @@ def test_page_of_an_emulated_board_receives_the_true_contact(tmp_path, monkeypat
         serve(board.port, [], act, emulated=board)
 
 
-def test_address_that_cannot_be_used_is_an_error_and_is_not_printed():
+def test_address_that_cannot_be_used_raises_before_it_is_printed():
     printed: list[str] = []
     with socketlib.create_server(("127.0.0.1", 0)) as busy:
         number = busy.getsockname()[1]
@@ -243,7 +243,7 @@ def test_requests_from_other_machines_need_the_token(tmp_path):
     serve(str(tmp_path / "none"), [], act, token="secret")
 
 
-def test_invalid_messages_are_ignored_and_too_many_are_refused(tmp_path, monkeypatch):
+def test_server_ignores_invalid_messages_and_limits_their_size_and_the_number_of_pages(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:

@@ -84,7 +84,7 @@ def test_unplugged_board_does_not_delay_the_others(tmp_path):
     with ExitStack() as stack, ExitStack() as unplugged:
         names = plug_in_all(stack, unplugged, tmp_path, (1, 2, UNPLUGGED_I))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
-            # The number of readings of each other board during each update of the last board.
+            # For each update of the last board, `updates` counts the readings of the other boards.
             updates, found = Counter(), []
             for *others, last in skins:
                 found += [contact[1:4] for contact in others if contact.F_N > 0]
@@ -105,7 +105,7 @@ def skin_at(port: str) -> LiveSkin:
     return skin
 
 
-def test_error_in_the_model_is_raised_to_the_caller():
+def test_error_in_the_model_is_raised_in_the_thread_that_iterates_over_skins():
     failing, working = skin_at("failing"), skin_at("working")
     failing.estimator = FailingModel()
     with LiveSkins([failing, working]) as skins:

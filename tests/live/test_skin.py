@@ -35,7 +35,7 @@ SCRIPT = make_script(pokes_n=2)
 LATE = {"no data", "slower than before: frames are missing"}
 
 
-def test_every_reading_has_time_place_and_force(tmp_path):
+def test_estimates_in_contact_have_the_place_and_force_of_the_poke(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
     unread_n = 1000  # At most this number of frames is discarded if the pseudo-terminal is opened late.
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -59,14 +59,14 @@ def test_estimates_of_several_models_are_averaged_with_a_standard_deviation(tmp_
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    # The first touch that is detected may be either of the two pokes, because a busy machine may miss the first one.
+    # The first touch that is detected may be either of the two pokes, because a busy machine may miss the first poke.
     off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
     assert touched.sd_F_N == pytest.approx(0.0, abs=0.01)
 
 
-def test_caller_that_is_slow_gets_the_latest_reading(tmp_path):
+def test_slow_caller_receives_the_latest_reading(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
@@ -87,7 +87,7 @@ def test_caller_that_is_slow_gets_the_latest_reading(tmp_path):
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
-def test_pauses_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
+def test_readings_continue_after_alarms_for_pauses_and_unplugging(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, seen = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -148,7 +148,7 @@ def test_no_load_reading_waits_until_the_skin_is_not_touched():
     assert not play_to_skin(moving)[0].zeroed
 
 
-def test_zero_called_in_another_thread_restarts_the_no_load_reading():
+def test_no_load_reading_restarts_if_another_thread_calls_zero():
     class ZeroingList(list):
         def append(self, frames):  # This function runs between two statements of the thread that reads the port.
             super().append(frames)
@@ -194,7 +194,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
 
 
-def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
+def test_places_and_forces_are_estimated_on_a_sleeve_of_forty_chips(tmp_path):
     model = read_network(write_model(tmp_path, chips_n=40))
     skin, readings = play_to_skin(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
@@ -221,7 +221,7 @@ def test_eight_boards_are_read_at_once():
         assert list(pool.map(look, names)) == list(chips_n)
 
 
-def test_wrong_number_of_chips_and_missing_ports_are_refused(tmp_path):
+def test_open_raises_for_a_wrong_number_of_chips_or_a_missing_port(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model has 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()

@@ -68,7 +68,7 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     """Replace the recorded arrival times by those of a machine that causes no delays."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
-    assert first >= 0  # The recorded bytes are the last ones that were sent.
+    assert first >= 0  # The recorded bytes are the last bytes that were sent.
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
     received = (ends > 0) & (ends <= len(data))
     times = clocks.Arrivals(ends[received], 1e9 + sent.t_s[received])
@@ -107,5 +107,5 @@ def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path, empty_stor
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
-    # The limits are in mm, mm and N. They are small, because most presses are training data.
+    # The limits are in mm, mm and N. The errors are small, because the network was trained on most of these presses.
     assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()

@@ -1,4 +1,4 @@
-"""Tests that messages to the live page have a limited size, but contain the peaks of the force."""
+"""Tests that messages to the live page have a limited size and contain the peaks of the force."""
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def test_time_bins_contain_force_peaks_and_cover_the_last_ten_seconds():
     assert len(traces.message(traces.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
 
 
-def test_messages_contain_neither_gaps_nor_bins_that_were_sent_before():
+def test_messages_omit_empty_time_bins_and_bins_that_were_sent_before():
     traces = Traces(layout_of(5), 0.0)
     for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
         traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
@@ -44,18 +44,18 @@ def test_messages_contain_neither_gaps_nor_bins_that_were_sent_before():
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
 
 
-def test_times_of_bins_are_precise_after_two_weeks():
+def test_times_of_time_bins_are_still_precise_after_two_weeks():
     traces, t_s = Traces(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
     traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
     start_s, _, _ = forces(traces.message(0, rate_hz=200.0, lost_bytes_n=0))
     np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
-def test_latency_of_the_display_is_measured_by_confirmed_messages():
+def test_latency_is_measured_when_the_page_confirms_a_message():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
-    # A message that is confirmed a second time has no latency, and neither has one that is unknown.
+    # No latency is measured for a message that is confirmed a second time, or for a number that no message had.
     for seen in (number, number + 1, -1):
         traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])

@@ -25,7 +25,7 @@ def train_network(
 def feature_distance(weights: dict[str, np.ndarray]) -> float:
     """Return the distance between the mean features of the known skin and of the new one.
 
-    It is divided by the standard deviation of the features.
+    The distance is divided by the standard deviation of the features.
     """
     net = Stack(paper_layers(15), [weights])
     known, new = (net.features(torch.from_numpy(part)[None])[0].detach().numpy() for part in (KNOWN, NEW))
@@ -48,9 +48,10 @@ def test_weight_of_the_reversed_gradient_rises_from_0_to_1():
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
 def test_training_brings_features_of_both_skins_closer():
-    # The ratio compares the distance after training with and without the reversed gradient. Over 12 seeds, its mean is
-    # 0.30 and its standard deviation is 0.12. Therefore the mean of three seeds is four standard errors (0.068 each)
-    # below 0.6. After only 150 steps, the ratio would be 1.05 +- 0.45, which is inconclusive.
+    # The distance after training with the reversed gradient is divided by the distance after training without it. Over
+    # 12 seeds, the mean of this ratio is 0.30 and its standard deviation is 0.12. Therefore the mean of three seeds is
+    # four standard errors (0.068 each) below 0.6. After only 150 steps, the ratio would be 1.05 +- 0.45, which is
+    # inconclusive.
     ratios = [
         feature_distance(train_network(1.0, seed=seed)) / feature_distance(train_network(0.0, seed=seed))
         for seed in range(3)

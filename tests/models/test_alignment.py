@@ -1,6 +1,6 @@
 """Tests of methods that align the field changes of a new skin with those of known skins.
 
-References are SciPy's matrix square roots, a known linear map, and leave-one-out errors.
+The methods are compared with SciPy's matrix square roots, a known linear map, and leave-one-out errors.
 """
 
 import numpy as np
@@ -47,7 +47,7 @@ def test_coral_equals_a_product_of_square_roots_of_covariances():
 
 
 @pytest.mark.parametrize("align", [match_channels, coral])
-def test_aligning_a_skin_with_itself_changes_nothing(align):
+def test_aligning_a_skin_with_itself_does_not_change_its_inputs(align):
     np.testing.assert_allclose(align(SOURCE, SOURCE)(SOURCE), SOURCE)
 
 
@@ -63,7 +63,7 @@ def test_direct_standardisation_recovers_a_linear_map():
     np.testing.assert_allclose(direct(SOURCE, SOURCE @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_direct_standardisation_keeps_directions_without_pairs():
+def test_direct_standardisation_does_not_change_channels_that_no_pair_covers():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)

@@ -1,3 +1,5 @@
+"""Tests of the layers and the initial weights of the networks."""
+
 import numpy as np
 import pytest
 from torch import nn
@@ -8,7 +10,7 @@ from tests.models.plain import PRINTED
 
 
 @pytest.mark.parametrize("name", sorted(LAYERS))
-def test_layers_equal_those_printed_in_the_paper_and_in_the_released_code(name):
+def test_layers_equal_those_in_the_paper_and_in_its_released_code(name):
     layers = []
     for layer in LAYERS[name](15):
         layers += [f"{layer.in_n}-{layer.out_n}"] + ["ReLU"] * layer.relu

@@ -1,3 +1,5 @@
+"""Tests of virtual boards: copies of training rows as chips with other gains, tilts and noise would read them."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,7 +32,7 @@ def test_tilt_rotates_the_field_of_each_chip_and_keeps_its_length():
     assert np.abs(copies - np.tile(rows(), (3, 1))).max() > 10
 
 
-def test_rows_of_a_copied_skin_are_on_one_virtual_board():
+def test_all_rows_of_a_copied_skin_have_the_gains_of_one_virtual_board():
     copies, skin = virtual_boards(rows(), SKIN, augmentation(gain_sd=0.3), rng_for(1, "draw"))
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
@@ -44,11 +46,12 @@ def test_rows_of_a_copied_skin_are_on_one_virtual_board():
 def test_noise_has_the_given_standard_deviation():
     no_field = np.zeros((2000, 15), np.float32)
     copies, _ = virtual_boards(no_field, np.array(["s"] * 2000), augmentation(noise_uT=5.0), rng_for(1, "draw"))
-    assert abs(copies.std() - 5.0) < 0.05  # The tolerance is four standard errors: 90,000 draws have one of 0.012.
+    # The tolerance is four standard errors. The standard error for 90,000 draws is 0.012.
+    assert abs(copies.std() - 5.0) < 0.05
 
 
 @given(st.floats(0.1, 10))
-def test_copies_are_linear_in_the_field(factor):
+def test_readings_of_virtual_boards_are_proportional_to_the_field(factor):
     settings = augmentation(gain_sd=0.2, lean_sd_deg=10.0)
     one, _ = virtual_boards(rows(), SKIN, settings, rng_for(1, "draw"))
     other, _ = virtual_boards(np.float32(factor) * rows(), SKIN, settings, rng_for(1, "draw"))

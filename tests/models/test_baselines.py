@@ -1,3 +1,5 @@
+"""Tests of jobs that fit classical regression methods, with which the networks are compared."""
+
 import pickle
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -85,7 +87,7 @@ def expected_inputs(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_job_equals_a_direct_call_of_fit_and_predict(name, inputs):
+def test_result_of_a_job_equals_a_direct_call_of_fit_and_predict(name, inputs):
     one = method(name, inputs)
     (found,) = results_of(task(one))
     train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
@@ -157,7 +159,7 @@ def test_thinning_keeps_the_given_number_of_rows(fits):
         assert (one["target"] == ROWS.target[numbers]).all()
 
 
-def test_random_choice_of_rows_depends_only_on_seed_and_name(fits):
+def test_thinning_draws_equal_rows_only_if_seed_and_name_are_equal(fits):
     others = {"seed": 4}, {"name": "other"}
     results_of(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
     results_of(*(task(rows_max_n=12, **other) for other in others))

@@ -1,3 +1,8 @@
+"""Tests of the batches of networks that are trained together as a stack.
+
+The loss of a network can have several terms. Each term has a batch of its own in each training step.
+"""
+
 import numpy as np
 import pytest
 import torch
@@ -33,7 +38,7 @@ def test_every_step_has_a_batch_for_each_term():
         }
 
 
-def test_terms_without_data_get_no_batches():
+def test_batches_have_no_arrays_for_loss_terms_without_data():
     assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 
@@ -61,9 +66,9 @@ def test_positive_is_nearer_than_the_negative_in_labelled_triplets():
 
 
 def test_triplets_of_unlabelled_pokes_are_ordered_along_one_line():
-    """Rows can be on two lines.
+    """In a triplet, the positive poke must be nearer to the anchor than the negative poke.
 
-    On one of these lines, the positive poke must be nearer to the anchor than the negative.
+    As rows can be on two lines, this must hold on one of the lines.
     """
     job = some_job(terms=True)
     points, row = job.unlabelled.points, job.unlabelled.row
@@ -97,9 +102,9 @@ def test_batches_of_a_network_do_not_depend_on_other_networks_of_the_stack():
 
 
 def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
-    """Methods are compared on equal batches, so a loss term must not change the random draws for other terms.
+    """Methods are compared on equal batches.
 
-    This must hold in every block of steps.
+    Therefore, in every block of training steps, adding a loss term must not change the random draws for other terms.
     """
     full = some_job(terms=True)
     without = {
@@ -118,7 +123,7 @@ def test_batches_of_other_terms_stay_the_same_if_a_loss_term_is_added():
                 assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_each_block_and_each_network_draws_other_rows():
+def test_different_blocks_and_networks_draw_different_rows():
     same_rows = some_job(0)
     other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
     feed = BatchSampler([same_rows, other], BATCH_N, "cpu")

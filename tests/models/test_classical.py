@@ -1,3 +1,5 @@
+"""Tests of the classical regression methods, with which the networks are compared."""
+
 import math
 
 import numpy as np
@@ -100,7 +102,7 @@ def test_predictions_do_not_depend_on_the_size_of_blocks(method):
         np.testing.assert_allclose(found[i : i + 1], fitted.predict(query_uT[i : i + 1]), atol=PREDICTION_ATOL_MM)
 
 
-def test_nearest_neighbour_at_distance_zero_determines_the_prediction():
+def test_prediction_at_a_training_row_is_the_target_of_this_row():
     db_uT, target = rows()
     weight = np.where(np.arange(len(db_uT)) < 5, 50, 1).astype(np.float32)
     np.testing.assert_allclose(fit_to("knn", db_uT, target, weight).predict(db_uT), target, atol=PREDICTION_ATOL_MM)
@@ -167,7 +169,8 @@ def test_predictions_are_better_than_the_mean_of_the_targets(method):
 
 
 @every_method
-@settings(max_examples=10, deadline=None)  # Fewer examples than usual, because each fits two models.
+# Hypothesis tries fewer examples than usual, because each example fits two models.
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10_000), st.integers(-20, 20))
 def test_predictions_scale_with_the_unit_of_the_targets(method, seed, power):
     """The factor (1e-6 to 1e6) is a power of 2, so no value is rounded, and decision trees split at the same values."""
@@ -181,7 +184,7 @@ def test_predictions_scale_with_the_unit_of_the_targets(method, seed, power):
 
 @every_method
 @pytest.mark.parametrize("shift_mm", [-500.0, 3.0, 40.0])
-def test_predictions_shift_with_the_places_of_the_targets(method, shift_mm):
+def test_shifting_the_training_places_shifts_the_predictions(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
     # Places are rounded to multiples of 1/64 mm, so that they are exact after the shift.
@@ -263,7 +266,7 @@ def test_rbf_ridge_selects_random_rows():
     assert (again.predict(db_uT) != fitted.predict(db_uT)).any()
 
 
-def test_rbf_ridge_always_selects_rows_of_greater_weight():
+def test_rbf_ridge_always_selects_rows_with_a_weight_above_1():
     """Only a selection of the training rows is used, but it must contain every row whose weight is greater than 1.
 
     Five of the 300 rows have a greater weight. Their inputs are far from the inputs of all other rows, so a prediction

@@ -1,3 +1,8 @@
+"""Tests of the inputs of networks, which are computed from field changes.
+
+Input `raw` is the field change itself. Input `shape` is its direction and the logarithm of its length.
+"""
+
 import math
 
 import numpy as np
@@ -14,7 +19,10 @@ LOG_ATOL = 1e-5  # Tolerance for logarithms, which are at most 17: a few roundin
 
 
 def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
-    """Return field changes of about 120 uT. This is far above the limit below which lengths are not divided out."""
+    """Return field changes of about 120 uT.
+
+    Field changes below a limit, which is far smaller, are not normalised to unit length.
+    """
     return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
 
 
@@ -23,7 +31,7 @@ def test_input_raw_is_the_unchanged_field_change():
     assert (VIEW["raw"](db_uT) == db_uT).all()
 
 
-def test_input_shape_is_the_direction_and_the_log_length():
+def test_input_shape_consists_of_the_direction_and_the_log_length_of_the_field():
     db_uT = rows()
     seen = VIEW["shape"](db_uT)
     assert seen.shape == (20, 16)

@@ -1,3 +1,9 @@
+"""Tests of training jobs, and of the keys under which their results are stored in the cache.
+
+A job trains a network on one fold, or adapts a trained network to unlabelled pokes of a new skin, or fine-tunes it to
+few labels. A control is trained like an adapted network, but without the unlabelled pokes.
+"""
+
 from collections.abc import Callable
 from dataclasses import fields, replace
 
@@ -28,7 +34,7 @@ from tests.models.example_jobs import (
     without_triplets,
 )
 
-NEW = np.arange(24, ROWS_N)  # Rows of the skins that are not in the training data.
+NEW = np.arange(24, ROWS_N)  # These are the rows of skins that are not in the training data.
 KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
@@ -57,14 +63,14 @@ def test_adaptation_ignores_places_and_forces_of_the_new_skin(rows, new):
     assert (once.predicted == blind.predicted).all()
 
 
-def test_adaptation_ignores_the_names_of_skins_of_its_pokes():
+def test_adaptation_ignores_to_which_skin_its_unlabelled_pokes_belong():
     assert equal_results(
         train_job(adaptation(), example_data()),
         train_job(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0")),
     )
 
 
-def test_adaptation_depends_on_field_changes_and_order_of_the_pokes_on_lines():
+def test_adaptation_depends_on_the_fields_and_the_order_of_the_unlabelled_pokes():
     once, along = train_job(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
     assert not equal_results(once, train_job(adaptation(along=backwards), example_data()))
@@ -72,7 +78,7 @@ def test_adaptation_depends_on_field_changes_and_order_of_the_pokes_on_lines():
     assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
-def test_lines_contain_no_places_and_no_forces():
+def test_lines_of_unlabelled_pokes_contain_no_places_and_no_forces():
     assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
 
 
@@ -115,7 +121,7 @@ def test_fine_tuning_uses_only_the_given_labels_of_the_new_skin():
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
-def test_test_rows_do_not_change_the_trained_network(scaling, view):
+def test_trained_network_does_not_depend_on_test_rows(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
     once = train_job(job, example_data())
     planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
@@ -167,9 +173,9 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
         pooled(weight_decay=0.5, rate_max=1e-4),
         without_triplets(),
     ],
-    ids=["another name", "another schedule", "no triplets"],
+    ids=["other names", "other schedule", "no triplet loss"],
 )
-def test_recipes_have_equal_initial_weights_and_batches(other):
+def test_jobs_with_other_recipes_have_equal_initial_weights_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
@@ -181,7 +187,7 @@ def test_adaptation_and_control_have_equal_batches():
 
 
 @pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
-def test_folds_and_seeds_have_different_batches(changes):
+def test_jobs_of_other_folds_or_seeds_have_other_weights_and_batches(changes):
     other = replace(pooled(), **changes)
     assert (
         prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
@@ -206,32 +212,32 @@ def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
 
 
 INFLUENTIAL_ROWS = {
-    "a trained field": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
-    "a trained place": ("pooled", with_row("target", TRAIN[3], 1.0)),
-    "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
-    "a tested field": ("pooled", with_row("db_uT", TEST[3], 1.0)),
-    "a poked field": ("adapting", with_row("db_uT", POKED[3], 1.0)),
-    "an own field": ("few labels", with_row("db_uT", LABELLED[1], 1.0)),
-    "an own label": ("few labels", with_row("target", LABELLED[1], 1.0)),
+    "field of a training row": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
+    "target of a training row": ("pooled", with_row("target", TRAIN[3], 1.0)),
+    "skin of a training row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
+    "field of a test row": ("pooled", with_row("db_uT", TEST[3], 1.0)),
+    "field of an unlabelled poke": ("adapting", with_row("db_uT", POKED[3], 1.0)),
+    "field of a labelled row": ("few labels", with_row("db_uT", LABELLED[1], 1.0)),
+    "target of a labelled row": ("few labels", with_row("target", LABELLED[1], 1.0)),
 }
 OTHER_ROWS = {
-    "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
-    "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
-    "the name of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
-    "the skin of a tested row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
-    "a poked place": ("adapting", with_row("target", POKED[3], np.nan)),
-    "a label that is not its own": ("few labels", with_row("target", POKED[5], 1.0)),
+    "target of a test row": ("pooled", with_row("target", TEST[3], 1.0)),
+    "field of a row that is not used": ("pooled", with_row("db_uT", 30, 1.0)),
+    "names of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
+    "skin of a test row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
+    "target of an unlabelled poke": ("adapting", with_row("target", POKED[3], np.nan)),
+    "target of a row whose label is not used": ("few labels", with_row("target", POKED[5], 1.0)),
 }
 
 
 @pytest.mark.parametrize("what", sorted(INFLUENTIAL_ROWS))
-def test_cache_key_changes_with_rows_that_influence_the_result(what):
+def test_cache_key_changes_if_a_row_that_influences_the_result_changes(what):
     kind, rows = INFLUENTIAL_ROWS[what]
     assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
 
 
 @pytest.mark.parametrize("what", sorted(OTHER_ROWS))
-def test_cache_key_ignores_rows_without_influence(what):
+def test_cache_key_is_unchanged_if_a_row_without_influence_changes(what):
     kind, rows = OTHER_ROWS[what]
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
@@ -261,7 +267,7 @@ def test_different_settings_have_different_cache_keys():
     assert len({key(job) for job in jobs}) == len(jobs)
 
 
-def test_restart_after_collapse_has_other_weights_and_batches():
+def test_training_is_restarted_after_a_collapse_with_other_weights_and_batches():
     """If a training run collapses to a constant output, it is repeated with other random numbers."""
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
@@ -271,7 +277,7 @@ def test_restart_after_collapse_has_other_weights_and_batches():
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
-def test_initial_bias_of_the_output_layer_is_the_mean_target(scaling):
+def test_initial_bias_of_the_output_layer_predicts_the_mean_target(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
     rows = with_values(example_data(), "target", np.arange(3), np.nan)
     prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))
@@ -308,14 +314,14 @@ def test_cache_key_ignores_the_names_of_experiment_and_recipe():
     assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
-def test_cache_key_ignores_rows_that_the_job_does_not_use():
+def test_cache_key_is_unchanged_if_rows_that_the_job_does_not_use_are_removed():
     rows = example_data()
     fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
-def test_data_digest_depends_on_the_skin_of_each_row():
+def test_data_digest_changes_if_rows_belong_to_other_skins():
     rows = example_data()
     other = replace(rows, skin=np.roll(rows.skin, 1))
     assert JobKeys(rows).data_digest() != JobKeys(other).data_digest()
@@ -342,8 +348,8 @@ def test_augmented_copies_have_the_same_targets_and_count_as_new_skins():
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # Virtual boards without spread do not change the fields. Therefore each row appears three times (the original and
-    # two copies), with equal fields and targets.
+    # Virtual boards whose gains and tilts have no spread do not change the fields. Each row therefore appears three
+    # times (the original and two copies) with equal fields and targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()

@@ -1,3 +1,8 @@
+"""Tests of the loss functions: the squared error and the triplet loss.
+
+The triplet loss is positive if the anchor (a) is nearer to the negative (n) than to the positive (p).
+"""
+
 import math
 
 import numpy as np
@@ -137,7 +142,7 @@ def test_triplet_loss_scales_with_the_square_of_the_features(k):
 
 
 @given(st.integers(0, 1000))
-def test_losses_of_a_triplet_and_its_reverse_differ_by_the_difference_of_squared_distances(seed):
+def test_swapping_positive_and_negative_changes_the_loss_by_the_difference_of_distances(seed):
     anchor, positive, negative = random_triplet(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)

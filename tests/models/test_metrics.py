@@ -1,3 +1,5 @@
+"""Tests of the scores of predictions."""
+
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -64,7 +66,7 @@ def test_registration_removes_a_constant_offset_of_places(dx_mm, dy_mm):
 def test_squared_force_error_scales_with_the_square_of_the_unit(scale):
     predicted = TRUE + 0.25
     scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
-    # The tolerance is two roundings per row.
+    # The tolerance allows for two rounding errors per row.
     assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
 
 

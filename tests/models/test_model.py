@@ -1,3 +1,5 @@
+"""Tests of stacks. A stack consists of several networks that are computed together."""
+
 import numpy as np
 import pytest
 import torch

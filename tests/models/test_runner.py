@@ -1,3 +1,8 @@
+"""Tests of the runner, which runs training jobs in worker processes and stores their results in a cache.
+
+Jobs with equal settings are trained together as a stack.
+"""
+
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
@@ -80,7 +85,7 @@ def test_result_says_whether_it_was_read_from_the_cache(tmp_path):
     both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
-    # Also for a result from the cache, the seconds are those of the training.
+    # For a result from the cache, `seconds` is the time that its training took.
     assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])
 
 
@@ -99,7 +104,7 @@ def test_result_of_a_job_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
-def test_each_set_of_rows_is_sent_to_workers_once(tmp_path, monkeypatch):
+def test_each_set_of_rows_is_written_once_for_all_workers(tmp_path, monkeypatch):
     sent, written = [], []
     here, write = InlineExecutor(), io.write_tensors
     monkeypatch.setattr(
@@ -118,15 +123,15 @@ def test_jobs_that_finished_before_a_run_was_killed_are_kept(tmp_path):
     selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
         run(selected, tmp_path / "killed", InlineExecutor(die_after=1))
-    # In the second run, two of the three stacks are left to train.
+    # The second run trains the two of the three stacks that were not finished.
     assert trainings_n(selected, tmp_path / "killed") == 2
     done, fresh = run(selected, tmp_path / "killed"), run(selected, tmp_path / "fresh")
     assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
 def test_stack_killed_while_its_results_were_written_is_trained_again(tmp_path):
-    # The last bits of a result depend on the position of the network in its stack. Many steps with batches of one row
-    # amplify such differences.
+    # Networks at different positions of a stack have different rounding errors. Many training steps with batches of one
+    # row amplify these differences.
     selected = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
@@ -175,11 +180,11 @@ def test_finished_jobs_are_read_from_the_cache(tmp_path):
         (replace(jobs(1)[0], seed_i=1), 1),
         (jobs(1, steps_n=5)[0], 1),
         (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # A job of another fold, which changes the composition of the stack.
+        (jobs(3)[2], 3),  # This is a job of another fold. It changes which jobs are in the stack.
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_additional_job_trains_only_its_stack(tmp_path, more, trained_n):
+def test_adding_a_job_trains_only_the_stack_of_the_new_job(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
@@ -207,7 +212,7 @@ def test_different_jobs_with_the_same_name_are_both_trained(tmp_path):
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
-def test_cache_has_no_files_in_subfolders(tmp_path):
+def test_results_are_written_directly_to_the_folder_of_the_cache(tmp_path):
     run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 

@@ -1,3 +1,5 @@
+"""Tests of scalers, which shift and scale inputs and targets of networks."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -60,7 +62,7 @@ def test_decoding_inverts_encoding_of_targets(seed):
     db_uT, target = rows()
     scaler = fit_standard(db_uT, target)
     expected = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
-    # The tolerance is two roundings in single precision.
+    # The tolerance allows for two rounding errors in single precision.
     np.testing.assert_allclose(scaler.decode(scaler.encode_target(expected)), expected, atol=1e-4)
 
 

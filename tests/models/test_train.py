@@ -1,3 +1,5 @@
+"""Tests of the training loop for a stack, which consists of several networks that are trained together."""
+
 from dataclasses import replace
 from itertools import chain, pairwise
 
@@ -21,8 +23,8 @@ ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
 # Tolerance for weights, relative to their distance from the initial weights. Sums differ by 6e-8 of a term if the order
 # of terms, the processor or the memory alignment changes. Such a difference can make a ReLU positive for one more row.
-# Then all weights of this unit change by a whole step, because AdamW divides a gradient by its size. One unit of 200
-# changes the distance from the start by at most 7 %, and a missing loss term changes it by more.
+# Then all weights of this unit change by a whole step, because AdamW divides a gradient by its size. One of 200 units
+# changes the distance from the initial weights by at most 7 %. A missing loss term changes this distance by more.
 DISTANCE_MAX = 2e-2
 
 
@@ -78,7 +80,7 @@ def test_network_can_overfit_thirty_two_rows():
 
 
 @pytest.mark.parametrize("terms", [NO_TERMS, ALL_TERMS])
-def test_equal_seeds_give_equal_weights_and_other_seeds_do_not(terms):
+def test_only_equal_seeds_give_equal_weights(terms):
     one, again, other = (
         run([replace(some_job(terms=True), rng=some_job(draws=draws).rng)], recipe(steps_n=60), terms)[0]
         for draws in ("a", "a", "b")
@@ -100,7 +102,7 @@ def test_networks_trained_in_a_stack_equal_networks_trained_alone(terms, batch_n
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize(  # Weight decay does not depend on the loss terms, so not every case needs it.
+@pytest.mark.parametrize(  # Weight decay does not depend on the loss terms, so only some of the cases use it.
     ("terms", "decay"),
     [
         (NO_TERMS, 0.0),
@@ -182,7 +184,7 @@ def test_points_of_the_loss_curve_are_evenly_spaced_up_to_the_last_step(steps_n)
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 1), (1, 16), (3, 16), (17, 1), (32, 100)])
-def test_any_number_of_rows_trains_in_any_batch(n, batch_n):
+def test_training_works_for_any_number_of_rows_and_any_batch_size(n, batch_n):
     (outcome,) = run([some_job(n=n)], recipe(steps_n=3, batch_n=batch_n))
     assert np.isfinite(outcome.curve).all()
     assert outcome.stopped_step is None
@@ -235,8 +237,8 @@ def test_divergence_restores_the_weights_of_the_previous_block(monkeypatch):
     )
     (whole,) = run([sound], schedule)
     (outcome,) = run([broken], schedule)
-    # Besides all checks of the first training run, there are two of the second run, which then has no network left to
-    # train.
+    # The first training run makes a check after each block. The second run makes only two checks, because it then has
+    # no network left to train.
     assert len(checks) == len(block_sizes(170)) + 2
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
     assert outcome.curve == whole.curve[: sum(step <= BLOCK_STEPS_N for step in curve_steps(170))]

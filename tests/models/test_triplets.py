@@ -1,3 +1,9 @@
+"""Tests of drawing triplets for the triplet loss.
+
+A triplet consists of an anchor, a positive that is nearer to the anchor, and a negative that is farther away. All
+three are points of one group.
+"""
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -8,7 +14,7 @@ from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
-ROW = np.arange(5, dtype=np.float64)[:, None]  # Five pokes of a line, whose places are the indices 0 to 4.
+ROW = np.arange(5, dtype=np.float64)[:, None]  # These are five pokes on a line. Their places are the indices 0 to 4.
 
 
 def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +76,7 @@ def test_names_of_groups_do_not_change_triplets(case):
 
 
 def test_distances_of_places_use_both_axes():
-    # Seen from (0, 0), the point (3, 0) is nearer than the point (2, 3), although its x is larger.
+    # The point (3, 0) is nearer to (0, 0) than the point (2, 3) is, although its x is larger.
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
     positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
     assert set(positive) == {1}
@@ -91,7 +97,7 @@ def test_error_names_the_group_whose_points_are_all_at_one_place():
         triplet_points(place, skins)
 
 
-def test_places_may_differ_along_one_axis_only():
+def test_triplets_are_possible_if_places_differ_along_one_axis_only():
     assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
@@ -108,7 +114,7 @@ def test_group_without_an_anchor_is_refused():
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
-def test_possible_anchors_equal_those_of_a_double_loop(places):
+def test_points_that_can_be_anchors_equal_those_found_by_a_double_loop(places):
     expected = [
         len({(x - u) ** 2 + (y - v) ** 2 for j, (u, v) in enumerate(places) if j != i}) > 1
         for i, (x, y) in enumerate(places)
@@ -125,7 +131,7 @@ def test_equal_generators_give_equal_triplets():
     assert any((a != b).any() for a, b in zip(one, other, strict=True))
 
 
-def test_every_ordered_pair_is_equally_likely():
+def test_every_pair_of_positive_and_negative_is_equally_likely():
     # From index 0, the four other points have different distances, so they form six ordered pairs (positive, negative).
     n = 6000
     positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))

@@ -1,4 +1,7 @@
-"""Tests of relaxation, hysteresis, wear and temperature against closed forms, 50-digit arithmetic, published values."""
+"""Tests of relaxation, hysteresis, wear and temperature.
+
+References are closed forms, 50-digit numbers and published values.
+"""
 
 import numpy as np
 import pytest
@@ -26,13 +29,13 @@ from reskin.physics.aging import (
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-14  # The relative rounding error of a few dozen operations in double precision.
+ROUNDING = 1e-14  # This is the relative rounding error of a few dozen operations in double precision.
 times_s = st.floats(0, 1e5)
 changes = st.floats(-10, 10)
 
 
 @given(st.floats(1e3, 1e8), st.floats(1e-16, 1e8))
-def test_one_step_equals_50_digit_arithmetic(ratio, dt_over_fastest):
+def test_one_relaxation_step_equals_50_digit_arithmetic(ratio, dt_over_fastest):
     assert signals.step_error(1e-3 * dt_over_fastest, signals.stiff(ratio)) <= signals.ROUNDING
 
 
@@ -40,19 +43,19 @@ def test_force_of_held_pokes_follows_the_relaxation_function():
     assert not broken(signals.check_relaxation())
 
 
-def test_state_is_kept_if_no_time_passes_and_the_force_does_not_change():
+def test_state_of_relaxation_is_kept_if_neither_time_nor_force_changes():
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     assert advance(state, 0.0, 0.0, SKIN_RELAXATION).tobytes() == state.tobytes()
 
 
 @given(changes)
-def test_instantaneous_change_is_not_relaxed(change):
+def test_instantaneous_change_of_the_force_is_not_relaxed(change):
     """No time passes during the change, so each relaxing part of the force changes by its whole share."""
     np.testing.assert_array_equal(advance(np.zeros(5), change, 0.0, SKIN_RELAXATION), SKIN_RELAXATION.share * change)
 
 
 @given(times_s, times_s, changes)
-def test_splitting_a_ramp_into_two_parts_changes_nothing(first_s, second_s, rate):
+def test_force_after_a_ramp_is_the_same_if_the_ramp_is_computed_in_two_steps(first_s, second_s, rate):
     whole = advance(np.ones(5), rate * (first_s + second_s), first_s + second_s, SKIN_RELAXATION)
     halfway = advance(np.ones(5), rate * first_s, first_s, SKIN_RELAXATION)
     size = 1 + abs(rate) * (first_s + second_s)
@@ -62,14 +65,14 @@ def test_splitting_a_ramp_into_two_parts_changes_nothing(first_s, second_s, rate
 
 
 @given(times_s, changes, st.floats(-3, 3))
-def test_relaxing_force_is_proportional_to_the_change_of_the_elastic_force(dt_s, change, factor):
+def test_state_of_relaxation_is_proportional_to_the_change_of_the_elastic_force(dt_s, change, factor):
     once = advance(np.zeros(5), change, dt_s, SKIN_RELAXATION)
     np.testing.assert_allclose(
         advance(np.zeros(5), factor * change, dt_s, SKIN_RELAXATION), factor * once, atol=ROUNDING * 30
     )
 
 
-def test_force_at_constant_depth_decreases_to_its_permanent_part():
+def test_force_of_a_tip_at_rest_decreases_to_its_permanent_part():
     relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
     assert (np.diff(relaxed) <= ROUNDING).all()
     assert relaxed[0] == pytest.approx(1, abs=ROUNDING)
@@ -90,7 +93,7 @@ def test_invalid_relaxation_is_refused(tau_s, share):
         Prony(np.array([tau_s]), np.array([share]))
 
 
-def test_force_at_a_reading_is_relaxed_during_approach_and_hold():
+def test_force_at_a_reading_has_relaxed_during_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
@@ -120,7 +123,7 @@ def test_field_memory_equals_the_differential_equation_solved_in_small_steps():
                 np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
-def test_memory_of_a_press_is_5_to_8_percent_and_decays():
+def test_field_memory_of_a_press_is_5_to_8_percent_and_decays():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = field_memory(once_T, MEMORY)
@@ -130,7 +133,7 @@ def test_memory_of_a_press_is_5_to_8_percent_and_decays():
     assert (np.diff(left[1:]) < 0).all()
 
 
-def test_stops_of_the_tip_above_the_skin_leave_no_memory():
+def test_field_memory_is_unchanged_by_stops_of_the_tip_above_the_skin():
     stops_T = np.zeros((2, 4, 1, 3))
     # Each press has four stops of the tip. At the first, second and fourth stop, the tip is above the skin, so the
     # field does not change. At the third stop, it presses.
@@ -144,7 +147,7 @@ def test_stops_of_the_tip_above_the_skin_leave_no_memory():
 
 
 @given(st.floats(-3, 3))
-def test_memory_is_proportional_to_field_changes_and_zero_if_no_time_passes(factor):
+def test_field_memory_is_linear_in_field_changes_and_zero_for_instant_presses(factor):
     change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
     for once, times in zip(field_memory(change_T, MEMORY), field_memory(factor * change_T, MEMORY), strict=True):
         np.testing.assert_allclose(times, factor * once, atol=1e-18)
@@ -161,7 +164,7 @@ DESIGN = {"settling": 0.10, "ageing": 0.01}
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=50).map(lambda n: np.array(sorted(n)))
 
 
-def test_skin_before_its_first_contact_is_neither_softened_nor_faded():
+def test_softening_and_fading_begin_with_the_first_contact():
     assert softening(np.array([0]), **DESIGN) == 1
     assert fading(np.array([0]), per_decade=0.005) == 0
 
@@ -173,7 +176,7 @@ def test_softening_is_the_sum_of_settling_and_ageing():
 
 
 def test_softening_from_contact_1000_to_1030_is_below_1_percent():
-    # Therefore a scene with few contacts on a skin that was cycled 1000 times may neglect softening.
+    # Therefore softening may be neglected in a scene with few contacts on a skin that has had 1000 contacts before.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 
@@ -226,7 +229,7 @@ def test_wear_that_leaves_no_stiffness_is_refused():
 TEMPERATURE = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
 
 
-def test_field_of_3_mt_changes_by_3_6_ut_per_kelvin():
+def test_field_of_3_mT_changes_by_3_6_uT_per_kelvin():
     np.testing.assert_allclose(
         3e-3 * (relative_remanence(np.array([-1.0, 0.0, 1.0])) - 1), [3.6e-6, 0.0, -3.6e-6], atol=1e-18
     )
@@ -239,11 +242,11 @@ def test_board_warms_up_exponentially():
 
 
 @given(st.floats(0, 1e5))
-def test_temperature_of_the_room_oscillates_about_the_warming_board(time_s):
+def test_oscillation_of_the_room_temperature_is_added_to_the_warming(time_s):
     room = TEMPERATURE.model_copy(update={"swing_K": 2.0})
     # The temperature is given as the rise since the start, so it is zero at the start.
     assert temperature_rise_K(np.zeros(1), room) == 0
-    # The first half of the oscillation is warm.
+    # In the first half of the oscillation, the room is warmer.
     assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), TEMPERATURE)
     # The two times are half a period apart, so the oscillation has opposite signs.
     time = np.array([time_s, time_s + 300.0])

@@ -16,7 +16,7 @@ from reskin.seeds import rng_for
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
 B_T = np.array([20e-6, 10e-6, -45e-6])
-ROUNDING = 1e-10  # The relative rounding error of a difference between places that are a few mm apart.
+ROUNDING = 1e-10  # This is the relative rounding error of a difference between places that are a few mm apart.
 MU_R = st.floats(1.0, 1e5)
 NEAR = np.array([[3e-3, 1e-3, 2e-3], [-4e-3, -1e-3, 4e-3]]), np.array([[0.0, 1e-3, 5e-3], [2e-3, 0.0, -1e-3]])
 
@@ -51,7 +51,7 @@ def test_field_outside_equals_magpylib_sphere(mu_r):
 
 
 @given(MU_R)
-def test_normal_b_and_tangential_h_are_continuous_on_the_surface_of_the_ball(mu_r):
+def test_fields_satisfy_the_boundary_conditions_on_the_surface_of_the_ball(mu_r):
     observers_m = on_sphere(RADIUS_M)
     normal = outward(observers_m)
     outside_T, inside_T = B_T + field(observers_m, mu_r=mu_r), 3 * mu_r / (mu_r + 2) * B_T
@@ -71,19 +71,20 @@ def test_ball_of_permeability_one_has_no_field():
     assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
 
 
-def test_field_of_dipoles_near_iron_is_perpendicular_to_its_surface():
+def test_field_of_dipoles_and_their_images_is_perpendicular_to_the_surface_of_iron():
     observers_m = on_sphere(RADIUS_M)
     together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))
     # The component along the surface is zero, except for rounding.
     assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()
     without_T = np.cross(magnet.field(*NEAR, observers_m), outward(observers_m))
-    # Without the ball, the field has a component along the surface. Otherwise this test would show nothing.
+    # Without the ball, the field has a component along the surface. If it had none, the assertion above would also hold
+    # without the ball.
     assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()
 
 
 def test_magnetic_flux_of_the_ball_through_a_surrounding_sphere_is_zero():
-    """Images are the dipoles that replace the magnetised ball."""
+    """The field of the magnetised ball is computed as the field of dipoles that replace the ball (images)."""
     # Gauss's law on a sphere whose radius is 1.5 times that of the ball. The flux is integrated numerically, over 60
     # latitudes and 120 longitudes.
     cos, weights = np.polynomial.legendre.leggauss(60)
@@ -115,6 +116,6 @@ def test_random_directions_are_uniform_unit_vectors():
     np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.012)
 
 
-def test_earth_field_has_its_magnitude_and_dip():
+def test_earth_field_has_the_given_magnitude_and_points_down():
     assert np.linalg.norm(EARTH_T) == pytest.approx(EARTH_SIZE_T)
     assert EARTH_T[2] < 0 < EARTH_T[0]

@@ -8,8 +8,8 @@ from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
-DRAG_M = 0.9e-3  # The greatest depth of a dragged tip in the scenes.
-DEEPEST_RADIUS_H = 0.75  # An upper bound for the contact radius at this depth, divided by the thickness of the layer.
+DRAG_M = 0.9e-3  # This is the greatest depth of a dragged tip in the scenes.
+DEEPEST_RADIUS_H = 0.75  # At depth DRAG_M, the contact radius is at most this fraction of the thickness of the layer.
 DISPLACEMENT_M = np.array([4e-5, 7e-5])
 HELD = {
     # Beyond the outer edge of the elements, u_r falls as 1 / r. Springs of stiffness 2 / r at the edge have the same
@@ -59,7 +59,7 @@ def test_finite_elements_converge_to_the_solution_for_a_pressed_layer(base):
 
 
 @pytest.mark.parametrize("base", ["slipping", "bonded"])
-def test_contact_pressure_deforms_the_surface_to_the_tip(base):
+def test_contact_pressure_deforms_the_surface_to_the_shape_of_the_tip(base):
     contact = layer.contact_of_depth(DEPTH_M, thickness_m=H_M, tip_radius_m=TIP_M, base=base)
     # The Hankel transform of the pressure p is 2 G times the integral of chi(x) cos(kx) dx (G: shear modulus). Its
     # inverse is p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2) dx. The code substitutes x^2 = r^2 + y^2.
@@ -92,7 +92,7 @@ def test_contact_radius_of_the_deepest_drag_is_within_the_range_compared_with_fi
     assert 0.7 < contact.radius_m / H_M < DEEPEST_RADIUS_H
 
 
-# The first contact is that of the deepest drag on the skin. The second one is on a thin layer, where the contact covers
+# The first contact is the contact of the deepest drag on the skin. The second contact is on a thin layer. It covers
 # many cells, so finite elements are more accurate. Measured errors are 0.8 % and 0.05 %.
 @pytest.mark.parametrize(("radius_h", "tolerance"), [(DEEPEST_RADIUS_H, 0.012), (2.5, 1e-3)])
 def test_shear_of_a_dragged_layer_equals_finite_elements(radius_h, tolerance):

@@ -91,7 +91,7 @@ def test_drawn_boards_have_the_given_spreads():
     assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
     cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
     assert np.std(cross) == pytest.approx(0.01, rel=0.1)
-    # The angle between the chip's z axis and that of the board results from two tilts, about x and about y, each with a
+    # The z axis of a chip is tilted relative to that of the board by two angles, about x and about y. Each angle has a
     # standard deviation of 2 degrees.
     tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])
     assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
@@ -134,7 +134,7 @@ def test_array_with_more_than_64_chips_is_refused():
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_drawn_gaps_are_positive():
+def test_gaps_drawn_with_large_spreads_are_positive():
     wide = spreads(board_gap=0.5, board_uneven=0.5)
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])

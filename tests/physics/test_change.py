@@ -15,7 +15,7 @@ from reskin.physics.magnet import change_of_field
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-# The rounding error of a few thousand double-precision operations, relative to the sum of the magnitudes.
+# This is the rounding error of a few thousand double-precision operations, relative to the sum of the magnitudes.
 ROUNDING = 1e-12
 seeds = st.integers(0, 10**6)
 
@@ -56,35 +56,35 @@ def test_compiled_sum_equals_naive_sum(seed):
 
 
 @given(seeds, st.floats(-5, 5).filter(lambda factor: abs(factor) > 1e-6))
-def test_change_is_linear_in_the_moments_and_equals_that_of_magpylib(seed, factor):
+def test_field_change_equals_that_of_magpylib_and_is_linear_in_the_moments(seed, factor):
     assert not broken(dipoles(seed, factor))
 
 
 @given(seeds)
-def test_dipoles_that_do_not_move_change_nothing(seed):
+def test_dipoles_that_do_not_move_do_not_change_the_field(seed):
     rest, _, observers_m = scene(seed)
     assert not change_of_field(rest, rest, observers_m).any()
 
 
-def test_dipoles_without_moment_change_nothing():
+def test_dipoles_without_moment_do_not_change_the_field():
     (nodes_m, moments), (moved_m, _), observers_m = scene(2)
     nothing = np.zeros_like(moments)
     assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
 
 
-def test_empty_set_of_dipoles_changes_nothing():
+def test_empty_set_of_dipoles_does_not_change_the_field():
     nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
     assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
 
 
 @given(seeds)
-def test_changes_of_a_move_and_of_its_reverse_sum_to_zero(seed):
+def test_field_changes_of_a_move_and_of_the_opposite_move_sum_to_zero(seed):
     rest, moved, observers_m = scene(seed)
     back_T = change_of_field(moved, rest, observers_m)
     np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)
 
 
-def test_change_by_a_tiny_move_is_precise():
+def test_field_change_by_a_tiny_move_is_precise():
     # Reference: the derivative of the field along the move. For a move of 1e-9 m, the change is only 1e-6 of the field,
     # so a difference of two fields would lose six digits.
     (nodes_m, moments), _, observers_m = scene(3)

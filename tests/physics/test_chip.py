@@ -58,9 +58,9 @@ def test_readings_within_range_are_neither_wrapped_nor_clipped():
     ],
 )  # fmt: skip
 def test_readings_out_of_range_wrap_around_or_are_clipped(b_uT, wrapped_n, clipped_n):
-    """The chip's counter wraps around above its range.
+    """A reading above the range of the chip's counter wraps around.
 
-    Far above, the sensor itself saturates, and readings are clipped.
+    In a field far above this range, the sensor itself saturates, and readings are clipped.
     """
     assert out_of_range(np.array([b_uT]), "", "", wrapped_n=wrapped_n, clipped_n=clipped_n).holds
 
@@ -82,7 +82,7 @@ def test_readings_are_whole_numbers_of_steps():
     np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)
 
 
-def test_saturation_depends_on_the_field_without_the_offset():
+def test_chip_saturates_by_the_field_without_its_offset():
     _, overruns = read([0, 0, 49.9e-3], board(offset_T=200e-6))
     assert overruns.clipped_n == 0
     assert read([0, 0, 49.9e-3], board(gain=1.1))[1].clipped_n == 1
@@ -108,7 +108,7 @@ phases_s = st.floats(0, CONVERSION_S)
 
 
 @given(rates_hz, phases_s)
-def test_frame_contains_the_last_conversion_that_is_finished(rate_hz, phase_s):
+def test_frame_contains_the_last_conversion_that_ended_before_the_frame(rate_hz, phase_s):
     frame_s = (1 + np.arange(40)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)
@@ -140,7 +140,7 @@ def test_reading_is_the_field_at_the_end_of_its_conversion(rate_hz):
     age_s, _ = last_conversions(frame_s, np.array([0.3e-3]))
     value = np.repeat(frame_s[:, None, None], 3, axis=2)
     seen = sample_at_conversion(value, age_s, rate_hz)
-    # Conversions before the first frame have the field of the first frame, because no earlier field is known.
+    # For conversions before the first frame, the field of the first frame is used, because no earlier field is known.
     late = frame_s - age_s[:, 0] >= frame_s[0]
     np.testing.assert_allclose(seen[late, 0, 0], (frame_s - age_s[:, 0])[late], atol=1e-9)
 

@@ -1,6 +1,6 @@
 """Tests of the deformation of the skin under a tip, which is computed in small steps of depth.
 
-Tested are the laws in `verification`, the limit of small depths and the convergence of the steps.
+The tests check the laws in `verification`, the limit of small depths and the convergence of the steps.
 """
 
 from itertools import pairwise

@@ -124,7 +124,7 @@ def test_lower_surface_of_a_slipping_skin_stays_on_its_base(depth_m):
     assert (after_m[:, 0] > base_m[:, 0]).all()
 
 
-def test_table_of_a_thin_skin():
+def test_table_of_a_thin_skin_is_accurate_up_to_its_greatest_depth():
     thin = deformation.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
     assert deformation.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
     with pytest.raises(ParamsError, match="depth must be so small that"):
@@ -140,7 +140,7 @@ def test_invalid_layers_and_pokes_are_refused(thickness_m, depth_m):
 
 
 @pytest.mark.parametrize("depth_m", [1.3e-3, np.nan, np.inf, -np.inf])
-def test_invalid_depths_are_refused(depth_m):
+def test_moving_nodes_raises_if_the_depth_is_invalid(depth_m):
     with pytest.raises(ParamsError, match="depth must be"):
         move(np.zeros((1, 3)), (0, 0, depth_m))
 

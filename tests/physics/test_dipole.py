@@ -11,7 +11,7 @@ from reskin.errors import ParamsError
 from reskin.physics.magnet import MU0_4PI, field, field_of_each
 from reskin.seeds import rng_for
 
-ROUNDING = 1e-12  # The relative rounding error of a few hundred double-precision operations.
+ROUNDING = 1e-12  # This is the relative rounding error of a few hundred double-precision operations.
 SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)
 
 coordinates = st.floats(-1, 1, allow_subnormal=False)

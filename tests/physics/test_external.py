@@ -60,7 +60,7 @@ def test_suppressor_whitens_the_sum_of_external_field_and_noise(noise_uT):
     np.testing.assert_allclose(matrix @ total @ matrix, noise_uT**2 * np.eye(15), atol=1e-8 * 100**2)
 
 
-def test_suppressor_without_external_field_changes_nothing():
+def test_suppressor_is_the_identity_if_there_is_no_external_field():
     np.testing.assert_allclose(suppressor(np.zeros((15, 15)), 4.0), np.eye(15), atol=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_suppressor_removes_uniform_fields_and_keeps_fields_with_curl():
     uniform_uT = np.tile([50.0, -30.0, 80.0], 5)
     assert np.linalg.norm(uniform_uT @ matrix) < 0.05 * np.linalg.norm(uniform_uT)
     curl_uT = np.zeros((5, 3))
-    # The test field is a vortex around the centre. No magnet outside the skin can cause such a field.
+    # The field is a vortex around the centre, which no magnet outside the skin can cause.
     curl_uT[:, :2] = 10 * CHIPS @ [[0, 1], [-1, 0]]
     # A part of the vortex is removed, because external fields of high order resemble it.
     assert np.linalg.norm(curl_uT.ravel() @ matrix) > 0.8 * np.linalg.norm(curl_uT)

@@ -1,7 +1,7 @@
 """Tests of friction under a dragged tip, whose force is Q = min(k s, mu F).
 
-The tip sticks to the skin, which acts as a spring of stiffness k, until the force reaches the limit mu F. Tested are
-the energy, Coulomb's limit, and paths that are subdivided or rotated.
+The tip sticks to the skin, which acts as a spring of stiffness k, until the force reaches the limit mu F. The tests
+check the energy, Coulomb's limit, and paths that are subdivided or rotated.
 """
 
 import numpy as np
@@ -14,8 +14,8 @@ from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
-ROUNDING = 1e-12  # The relative rounding error of some hundred steps in double precision.
-K = 1000.0  # Stiffness of the spring in N/m, of the same order as that of the skin.
+ROUNDING = 1e-12  # This is the relative rounding error of some hundred steps in double precision.
+K = 1000.0  # The stiffness of the spring in N/m is of the same order as that of the skin.
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
 
@@ -68,7 +68,7 @@ def test_tangential_force_is_never_above_the_friction_limit(path_m, mu, data):
 
 
 @given(st.lists(st.floats(0, 1), max_size=20), st.floats(1e-4, 5e-3), frictions)
-def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
+def test_subdividing_a_straight_path_does_not_change_the_force(cuts, end_m, mu):
     ahead = np.array([0.6, -0.8])
     fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
     ends = [
@@ -96,7 +96,7 @@ def test_loop_dissipates_friction_force_times_sliding_length():
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
-    # From rest, the work done equals the dissipated energy plus the energy that is stored in the spring.
+    # If the tip starts at rest, the work equals the dissipated energy plus the energy that is stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
 

@@ -71,7 +71,7 @@ def test_base_does_not_move_and_surface_has_no_shear_stress():
     assert np.isfinite(top).all()
 
 
-@settings(max_examples=30)  # Fewer examples than usual, because each takes 50 ms.
+@settings(max_examples=30)  # Hypothesis tries fewer examples than usual, because each example takes 50 ms.
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
 def test_force_of_small_tips_equals_the_series_of_dimitriadis(thickness_m, tip_radius_m, relative_depth):
     # The published series in chi = sqrt(R d) / h is wrong from its term in chi^2 on. The force is too low by 8 % at chi
@@ -81,7 +81,7 @@ def test_force_of_small_tips_equals_the_series_of_dimitriadis(thickness_m, tip_r
 
 
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
-def test_forces_equal_published_solutions(tip_m):
+def test_forces_on_thick_and_thin_layers_equal_published_solutions(tip_m):
     press = IndentedLayer(2e-3, tip_m, "bonded")
     thick = mechanics.hertz("bonded", tip_m), *mechanics.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
     laws = mechanics.long_2011(DEPTHS_M, press), *mechanics.scaling(DEPTHS_M, press, 1e9)
@@ -89,7 +89,7 @@ def test_forces_equal_published_solutions(tip_m):
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_pressure_rings_give_the_same_force(base):
+def test_force_equals_that_of_a_solution_with_pressure_rings(base):
     press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
@@ -123,7 +123,7 @@ def test_force_grows_with_depth_and_on_thinner_layers(thickness_m, tip_radius_m)
     assert (thin[1:] > thick[1:]).all()
 
 
-def test_force_is_zero_without_contact_or_stiffness():
+def test_force_is_zero_if_the_tip_does_not_touch_or_the_skin_has_no_stiffness():
     assert not force([-1e-3, -1e-12, 0.0]).any()
     assert not force(DEPTHS_M, modulus_Pa=0.0).any()
 

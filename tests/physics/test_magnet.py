@@ -25,7 +25,7 @@ polarities = st.sampled_from(["checkerboard", "same"])
 
 
 @given(seeds, st.floats(1e-4, 1e-2))
-def test_field_of_a_cube_equals_magpylib_and_far_away_a_dipole(seed, side_m):
+def test_field_of_a_cube_equals_magpylib_and_that_of_a_distant_dipole(seed, side_m):
     assert not broken([*laws.boxes(seed, side_m), laws.octupole()])
 
 
@@ -40,7 +40,7 @@ def test_field_of_a_cuboid_equals_magpylib():
 
 @settings(max_examples=10)
 @given(polarities, seeds)
-def test_field_of_the_array_equals_magpylib_and_obeys_maxwell(polarity, seed):
+def test_field_of_the_array_equals_magpylib_and_satisfies_maxwells_equations(polarity, seed):
     assert not broken(laws.array(polarity, THICKNESS_M, seed))
 
 
@@ -74,13 +74,13 @@ def test_reflected_array_of_magnets_has_the_reflected_field(point_m, polarity):
 
 
 def test_field_of_the_array_equals_the_specification():
-    # The specified field in the slab is 0.38 to 0.65 T. It is weaker where seams cross, and stronger at the faces of
-    # the magnets.
+    # The specified field in the slab is 0.38 to 0.65 T. The field is weaker at places where seams between magnets
+    # cross, and stronger at the faces of the magnets.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 
 
-def test_place_outside_the_slab_is_refused():
+def test_field_of_the_array_raises_for_a_place_outside_the_slab():
     with pytest.raises(ParamsError, match="height of the nodes must be from 0 to .*, inside the skin"):
         magnet.array_field(np.array([[0.0, 0.0, 2.1e-3]]), THICKNESS_M, "same")
 

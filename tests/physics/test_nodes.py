@@ -63,7 +63,7 @@ def test_cells_fill_skins_of_any_size(x_m, y_m, rule):
             assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
 
 
-def test_nodes_of_the_papers_skin_are_unchanged():
+def test_nodes_of_the_papers_skin_equal_those_of_nested_loops():
     rest, marks_m = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE), (-10e-3, -6.35e-3, 0.0, 6.35e-3, 10e-3)
     spans = [np.linspace(a, b, n + 1) for (a, b), n in zip(pairwise(marks_m), (8, 13, 13, 8), strict=True)]
     x_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])

@@ -143,10 +143,11 @@ def test_short_waves_satisfy_the_boundary_conditions():
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
 
 
-def test_shear_and_pressure_satisfy_bettis_reciprocity_theorem():
+def test_work_of_shear_and_pressure_satisfies_bettis_reciprocity_theorem():
     """By Betti's theorem, two kinds of work are equal.
 
-    Pressure on the displacement by the traction does as much work as the traction on the displacement by the pressure.
+    They are the work of the pressure along the displacement that the traction causes, and the work of the traction
+    along the displacement that the pressure causes.
     """
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
@@ -189,7 +190,7 @@ def test_shear_stress_at_the_surface_equals_the_traction():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(2e-3, H_M)])
-def test_every_horizontal_plane_carries_the_force(traction):
+def test_shear_stress_on_every_horizontal_plane_sums_to_the_applied_force(traction):
     r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
     for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
@@ -265,7 +266,7 @@ def test_sticking_contact_moves_rigidly():
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
 def test_traction_of_a_sticking_contact_has_the_greatest_stiffness(a_h, square, fourth):
-    """Of all tractions with equal total force, that of a rigid contact stores the least energy (Thomson's theorem)."""
+    """Of all tractions with equal force, that under a rigid contact stores the least energy (Thomson's theorem)."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
@@ -319,13 +320,13 @@ def test_displacement_is_symmetric_under_reflection_along_the_force():
     nodes_m, mirror = random_places_m(), np.array([1, -1, 1])
     here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
-    # The curl is an axial vector, so its components along the reflected plane change sign.
+    # The curl is an axial vector, so its components in the plane of reflection change sign.
     np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)
     back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
 
-def test_skin_moves_with_the_tip_and_rotates_forward():
+def test_skin_moves_and_rotates_in_the_direction_of_the_drag():
     middle = displace([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()
@@ -333,10 +334,10 @@ def test_skin_moves_with_the_tip_and_rotates_forward():
     assert not middle.half_curl[:, [0, 2]].any()
 
 
-def test_base_and_far_nodes_do_not_move():
+def test_nodes_at_the_base_and_far_from_the_contact_do_not_move():
     base = displace([0.5, 0.3], random_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
-    assert base.half_curl.any()  # The material at the base shears, and therefore rotates, although it does not move.
+    assert base.half_curl.any()  # The material at the base is sheared and therefore rotates, although it does not move.
     away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
     assert not away.displacement_m.any()
     assert not away.half_curl.any()
@@ -348,7 +349,8 @@ def test_displacement_beyond_the_range_of_the_table_is_below_half_a_percent():
         assert np.abs(table.parts[-1, :, :3]).max() < 0.005 * table.parts[..., 0].max()
 
 
-@settings(max_examples=10, deadline=None)  # Fewer examples than usual, because each computes a table in 20 ms.
+# Hypothesis tries fewer examples than usual, because each example computes a table, which takes 20 ms.
+@settings(max_examples=10, deadline=None)
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
 def test_displacement_scales_with_the_size_and_the_inverse_stiffness(size, hardness):
     nodes_m = random_places_m(30)
@@ -421,7 +423,7 @@ def test_midpoint_steps_equal_many_small_steps_of_force():
     assert over[1] < over[0] / 3
 
 
-def test_small_force_needs_no_midpoint():
+def test_midpoint_steps_equal_a_single_step_for_a_small_force():
     nodes_m = random_places_m()
     once, half_way = (
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
@@ -441,7 +443,7 @@ def test_displacement_of_already_moved_nodes_rotates_with_the_force():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
-def test_steepest_gradient_of_the_table_is_that_of_its_places(traction):
+def test_stored_steepest_gradient_is_the_largest_gradient_in_the_table(traction):
     table, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)

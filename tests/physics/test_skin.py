@@ -23,13 +23,13 @@ from tests.physics.test_board import draw_board, no_spread, spreads
 EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
-PEAK_T = 1e-3  # The order of magnitude of the fields. Tolerances for rounding are relative to this value.
-# Two quadratures (grids of nodes). COARSE is for tests of laws that hold with any quadrature. SPARSE is for tests with
-# many skins, which need speed.
+PEAK_T = 1e-3  # Fields are of this order of magnitude. Tolerances for rounding are relative to this value.
+# Skins are represented by grids of nodes (quadratures). COARSE is used in tests of laws that hold with any quadrature.
+# SPARSE has fewer nodes and is used in tests with many skins, which would otherwise be slow.
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
 DEPTH_M = 0.6e-3  # The tested laws hold at any depth. All tests use the same depth, so that a single table is computed.
 places_m = st.floats(-8e-3, 8e-3)
-# There is no deadline, because the first example computes the tables for all examples.
+# Hypothesis has no time limit for an example, because the first example computes the tables for all examples.
 patient = settings(max_examples=20, deadline=None)
 
 
@@ -150,7 +150,7 @@ def test_field_change_equals_the_difference_of_two_fields():
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_stability_cases_hold_for_extreme_skins_and_pokes(base):
+def test_field_changes_are_finite_and_consistent_for_extreme_skins_and_pokes(base):
     usual, again, renamed = (skin(UNEVEN, name, base=base) for name in ("s7", "s7", "s8"))
     soft, hard = (skin(UNEVEN, "s7", base=base, modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))
     bare, strong = (skin(UNEVEN, "s7", base=base, saturation_T=times * 0.11) for times in (0, 5))
@@ -171,17 +171,17 @@ def test_field_change_has_the_symmetries_of_board_and_skin(x_m, y_m, polarity, b
 
 @patient
 @given(places_m, places_m, st.floats(0.01, 5))
-def test_change_is_proportional_to_magnetisation(x_m, y_m, factor):
+def test_field_change_is_proportional_to_the_magnetisation(x_m, y_m, factor):
     skins, pokes_m = (skin(saturation_T=size_T) for size_T in (0.1, 0.1 * factor)), np.array([[x_m, y_m, DEPTH_M]])
     assert mechanics.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
 
 
-def test_tip_above_a_thin_skin_changes_nothing():
+def test_tip_above_a_thin_skin_does_not_change_the_field():
     high = next(s for s in (skin(UNEVEN, f"s{i}", SPARSE) for i in range(50)) if s.depth_zero_m < -0.05e-3)
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
-def test_shifting_skin_or_poke_and_board_is_equivalent():
+def test_shifting_the_skin_equals_shifting_poke_and_board_in_the_opposite_direction():
     # Shifting the skin is equivalent to shifting the poke and the chips in the opposite direction.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
@@ -193,7 +193,7 @@ def test_shifting_skin_or_poke_and_board_is_equivalent():
     assert np.abs(found - change((2e-3, 1e-3, DEPTH_M))).max() > 1e-3 * PEAK_T
 
 
-def test_wider_skin_changes_nothing_far_from_its_edges():
+def test_field_change_far_from_the_edges_does_not_depend_on_the_width_of_the_skin():
     # Both numbers of magnets, 8 and 12, are even. Therefore the same poles are over the chips, which are at least 25 mm
     # away from the edges.
     wide, wider = (
@@ -208,7 +208,7 @@ def test_wider_skin_changes_nothing_far_from_its_edges():
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
 
-def test_pokes_up_to_the_edges_of_the_skin_are_accepted():
+def test_poke_is_accepted_only_inside_the_edges_of_the_skin():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):
@@ -233,9 +233,9 @@ def test_pokes_computed_together_equal_single_pokes():
     ],
 )
 def test_field_change_from_tables_equals_that_of_nodes_moved_in_steps(thickness_mm, at, error, base):
-    # A thickness of 1.82 mm is halfway between two tables. At the depths of the tables, the error is that of
+    # A thickness of 1.82 mm is halfway between two tables. At the depths of the tables, the error is due to
     # interpolation in R/h (radius of the tip divided by the thickness) and in r. Between these depths, the error is 0.6
-    # %: the reference then ends with half a step of `deformation.STEP`, which changes dB by this much.
+    # %, because the reference then ends with half a step of `deformation.STEP`, which changes dB by 0.6 %.
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
@@ -283,7 +283,7 @@ def test_field_at_rest_has_the_magnitude_of_recorded_fields():
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
 
 
-def test_slipping_skin_is_softer_and_reaches_farther():
+def test_slipping_skin_is_softer_and_changes_the_field_of_distant_chips_more():
     bonded, slipping = skin(), skin(base="slipping")
     # At a depth of 1.2 mm, the bonded skin is 1.8 times as stiff as the slipping one.
     assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))
@@ -332,7 +332,7 @@ def held_skin(spread=UNEVEN, **changes):
     return skin(spread, base="slipping", hold=HELD | changes)
 
 
-def test_skin_held_by_springs_slides_as_a_rigid_body():
+def test_skin_held_by_springs_slides_as_a_rigid_body_up_to_the_friction_limit():
     one, free = skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=30), skin(UNEVEN, base="slipping")
     poke_m = np.array([[3e-3, -2e-3, 0.7e-3]])
     [(_, _, free_m)] = moved_dipoles(free, poke_m)
@@ -369,7 +369,7 @@ def test_bonded_skin_held_by_springs_is_refused():
         skin(base="bonded", hold=HELD)
 
 
-def test_rotated_skin_equals_a_board_rotated_in_the_opposite_direction():
+def test_rotating_the_skin_equals_rotating_the_board_in_the_opposite_direction():
     rotated = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
     first = skin(base="slipping").nodes_m
     angle = np.arctan2(rotated.nodes_m[0, 1], rotated.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])

@@ -28,7 +28,7 @@ def motion_of(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
 def drag_matrix(pieces_n, sides_m):
     """Return the matrix of the drag of a rigid motion (f_x, f_y, theta), which is quadratic in the motion.
 
-    It is summed over small pieces of the skin.
+    The drag is summed over small pieces of the skin.
     """
     drag = np.zeros((3, 3))
     for i in range(pieces_n):
@@ -52,7 +52,7 @@ def test_rigid_motion_minimises_the_drag(sides_m):
     np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
 
 
-def test_pull_at_the_edge_of_a_square_moves_and_rotates_it_as_in_the_closed_form():
+def test_motion_of_a_square_pulled_at_its_edge_equals_the_closed_form():
     # A square of side L is displaced by D along y at the place (L/2, 0). Expected: displacement of its middle
     # f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, and rotation theta = 6 f (L/2) / L^2 = 3 f / L.
     move_m, spin_rad = motion_of((SIDE_M / 2, 0.0), (0.0, 1e-4))
@@ -61,14 +61,14 @@ def test_pull_at_the_edge_of_a_square_moves_and_rotates_it_as_in_the_closed_form
 
 
 @given(places_m, displacements_m)
-def test_motion_has_the_given_displacement_at_the_place(place_m, taken_m):
+def test_rigid_motion_has_the_given_displacement_at_the_pressed_place(place_m, taken_m):
     move_m, spin_rad = motion_of(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
 @given(places_m, displacements_m)
-def test_motion_rotates_with_pull_and_place(place_m, taken_m):
+def test_rotating_pull_and_place_rotates_the_rigid_motion(place_m, taken_m):
     """A pull along the line through the middle causes no rotation."""
     (move_m, spin_rad), quarter = motion_of(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = motion_of(quarter @ place_m, quarter @ taken_m)
@@ -98,7 +98,7 @@ def test_motion_on_uniform_springs_equals_force_over_stiffness(place_m, springs_
 
 
 @given(places_m, displacements_m, st.floats(1e-6, 20.0))
-@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # Dividing a force by this tiny displacement overflows.
+@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # This displacement is so small that dividing a force by it overflows.
 def test_friction_limits_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
     whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)
@@ -114,7 +114,7 @@ def test_friction_limits_the_slide(place_m, taken_m, force_N):
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
 
 
-def test_firm_press_moves_the_skin_by_the_full_displacement():
+def test_friction_allows_no_slide_at_zero_force_and_the_full_slide_at_a_large_one():
     whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
         found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)

@@ -40,7 +40,7 @@ def test_compliance_has_the_limits_of_long_and_short_waves():
     np.testing.assert_allclose(found, [0, 5e-7, 5e-4, 1, 1, 1], rtol=1e-6)
 
 
-def test_far_from_the_tip_a_slipping_skin_moves_more_than_a_bonded_skin():
+def test_slipping_skin_moves_more_than_a_bonded_skin_far_from_the_tip():
     under = layer.contact_of_depth(0.2e-3, **SKIN, base="slipping")
     r_m, z_m = np.repeat([8e-3, 12e-3], 3), np.tile([0.0, 1e-3, 2e-3], 2)
     far = layer.displacement(r_m, z_m, layer.waves(under, SKIN["thickness_m"], "slipping"))

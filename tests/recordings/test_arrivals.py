@@ -23,7 +23,7 @@ def arrivals_of(steps: Steps, first: tuple[int, float]) -> Arrivals:
 
 
 def naive_time_s(end_byte: int, table: Arrivals) -> float:
-    """Return the reference: go through the chunks one by one, as documented for `times_of`."""
+    """Return reference times, which a loop over the chunks computes as documented for `times_of`."""
     rows = list(zip(table.byte_end.tolist(), table.t_s.tolist(), strict=True))
     if end_byte <= rows[0][0]:
         return rows[0][1] - (rows[0][0] - end_byte) * (rows[-1][1] - rows[0][1]) / (rows[-1][0] - rows[0][0])

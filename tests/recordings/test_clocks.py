@@ -14,8 +14,8 @@ from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 
 FRAME_S = 1 / 400
-NOISE_UT = 4.0  # The typical noise of real boards.
-DRIFT_UT_PER_S = 10 / 60  # The drift of the no-load field of a board that warms up.
+NOISE_UT = 4.0  # This is the typical noise of real boards.
+DRIFT_UT_PER_S = 10 / 60  # The no-load field of a board that warms up drifts at this rate.
 UNIX_S = 1.7e9
 JITTER_S = (0.2, 0.5)
 
@@ -23,7 +23,7 @@ JITTER_S = (0.2, 0.5)
 def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = JITTER_S) -> ProbeLog:
     """Return a probe log with random travel times between dwells (stops of the tip).
 
-    If both bounds of `travel_s` are equal, the log is periodic.
+    If the least and the greatest travel time are equal, the log is periodic.
     """
     gap_s = rng_for(0, "travel").uniform(*travel_s, 2 * indentations_n)
     start_s = np.cumsum(gap_s + dwell_s)
@@ -66,7 +66,9 @@ def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
     begin_s=st.sampled_from([0.0, UNIX_S]),
     marks_n=st.integers(2, 6),
 )
-def test_exact_marks_recover_offset_and_rate(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
+def test_exact_marks_recover_offset_and_rate_of_the_clock(
+    offset_s: float, drift_ppm: float, begin_s: float, marks_n: int
+) -> None:
     stream_s = begin_s + np.linspace(3, 3600, marks_n)
     # Tolerance: at Unix times, double precision has a resolution of 2e-7 s. The map between the clocks is evaluated
     # between its marks.
@@ -85,7 +87,8 @@ def test_noisy_marks_give_the_least_squares_line() -> None:
     stream_s = np.linspace(0, 600, 12)
     probe_s = 5 + (1 + 50e-6) * stream_s + rng_for(0, "marks").normal(0, 2e-3, 12)
     found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
-    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # The reference is another solver, which has other parameters.
+    # The reference is another solver of least squares, which has other parameters.
+    slope, offset_s = np.polyfit(stream_s, probe_s, 1)
     assert found.rate == pytest.approx(slope, abs=1e-12)
     assert found.offset_s == pytest.approx(offset_s, abs=1e-9)
     assert found.residual_s == pytest.approx(np.abs(probe_s - offset_s - slope * stream_s).max(), abs=1e-9)
@@ -115,32 +118,33 @@ def test_invalid_marks_are_refused(marks: np.ndarray, message: str) -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 12.345, -250.06, UNIX_S])
 @pytest.mark.parametrize("dwell_s", [0.1, 0.4])
-def test_contacts_determine_the_offset_of_the_clocks(offset_s: float, dwell_s: float) -> None:
+def test_offset_of_the_clocks_is_found_from_contacts(offset_s: float, dwell_s: float) -> None:
     log, truth = log_of(100, dwell_s), clock_map(offset_s)
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
     assert worst_s(found, truth, t_s) < dwell_s / 4
-    assert worst_s(found, truth, t_s) < FRAME_S  # The estimate has no bias, because pressing and lifting are symmetric.
+    # The estimated offset has no bias, because a touch begins as long before its dwell as it ends after it.
+    assert worst_s(found, truth, t_s) < FRAME_S
     assert found.explained > 0.8
 
 
-def test_contacts_determine_the_rate_of_a_drifting_clock() -> None:
+def test_rate_of_a_drifting_clock_is_found_from_contacts() -> None:
     log, truth = log_of(2000, 0.1), clock_map(8.0, 1 + 200e-6)
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
     found = from_contacts(blocks, log, "c")
-    # If the rate were not estimated, times at the end would be wrong by more than a dwell.
+    # If the rate of the clock were not estimated, times at the end would be wrong by more than the length of a dwell.
     assert 200e-6 * np.ptp(t_s) > 0.1
     assert worst_s(found, truth, t_s) < 0.1 / 4
 
 
-def test_contacts_that_are_longer_than_the_pauses_determine_the_offset() -> None:
+def test_offset_is_found_from_contacts_that_are_longer_than_the_pauses() -> None:
     log, truth = log_of(60, 0.5, (0.13, 0.4)), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
 
 
-def test_part_of_a_stream_suffices_if_travel_times_are_irregular() -> None:
+def test_offset_is_found_from_a_part_of_the_stream_if_travel_times_are_irregular() -> None:
     log, truth = log_of(100, 0.2), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
@@ -163,7 +167,7 @@ def test_stream_of_a_periodic_protocol_is_refused_because_several_offsets_fit(pa
     lost=st.floats(0, 0.3),
     indentations_n=st.integers(15, 60),
 )
-def test_offset_found_from_incomplete_data_is_correct_or_refused(
+def test_offset_from_incomplete_data_is_either_correct_or_an_error_is_raised(
     faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
 ) -> None:
     log, truth = log_of(indentations_n, 0.25, travel_s), clock_map(7.0)

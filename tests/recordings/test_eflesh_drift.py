@@ -42,5 +42,6 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     assert "late" not in numbers
     assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
     of_trainings = [one["of_trainings"] for one in numbers["findings"]]
-    assert of_trainings == ["supported", "supported"]  # These are the verdicts over three networks per policy.
+    # These are the verdicts over the three networks that were trained for each policy.
+    assert of_trainings == ["supported", "supported"]
     assert numbers["contact_every_s"] > 1  # The time is in seconds per contact. A real rig takes more than one second.

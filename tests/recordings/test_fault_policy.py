@@ -25,8 +25,8 @@ from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# Each case: an injected fault, the wire format, the name of the fault in the log, and the number of faulty frames. None
-# means that the fault is counted in bytes.
+# Each case consists of an injected fault, the wire format, the name of the fault in the log, and the number of faulty
+# frames. None instead of a number means that the fault is counted in bytes.
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -102,7 +102,7 @@ def test_chip_with_power_on_settings_is_refused_or_flagged():
     assert 1.0 <= log.records["chip_reset"].first <= 3.0
 
 
-def test_fault_without_a_time_does_not_change_the_span_of_its_kind():
+def test_fault_at_an_unknown_time_does_not_change_first_and_last_time_of_its_kind():
     mask, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
     log = FaultLog(DEFAULT_POLICY, "x", "ms")
     for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
@@ -204,7 +204,7 @@ def noisy_fields_uT(rows_n: int) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(failed=st.sets(st.tuples(st.integers(0, 49), st.integers(0, CHIPS_N - 1))))
-def test_row_is_valid_if_no_chip_has_failed(failed: set[tuple[int, int]]) -> None:
+def test_rows_are_kept_except_those_in_which_a_chip_has_failed(failed: set[tuple[int, int]]) -> None:
     b_uT, temperature_degC = noisy_fields_uT(50), np.full((50, CHIPS_N), 25.0)
     for row_i, chip_i in failed:
         b_uT[row_i, 3 * chip_i : 3 * chip_i + 3] = faults.FAILED_B_uT
@@ -224,7 +224,7 @@ def test_row_in_which_a_chip_reads_zeros_is_invalid():
 
 
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
-def test_chip_whose_steps_differ_from_those_of_the_other_chips_is_named(chip_i: int) -> None:
+def test_error_names_a_chip_whose_steps_differ_from_those_of_the_other_chips(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
@@ -233,7 +233,8 @@ def test_chip_whose_steps_differ_from_those_of_the_other_chips_is_named(chip_i: 
 
 
 def test_fields_that_are_not_multiples_of_a_step_are_accepted() -> None:
-    # An example is a recorder that averages its readings. There is no step to compare.
+    # Such fields are written, for example, by a recorder that averages readings. They have no step that could be
+    # compared between chips.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
     assert check_rows(b_uT, unknown_degC, None, where="here", policy=DEFAULT_POLICY).keep.all()

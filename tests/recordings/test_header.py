@@ -143,7 +143,7 @@ def test_capture_with_too_many_lost_frames_is_refused(account, message):
         check_losses(account, 0.05, "c0")
 
 
-def test_few_lost_frames_and_frames_between_dwells_are_accepted():
+def test_capture_is_accepted_with_few_lost_bytes_and_many_frames_between_dwells():
     check_losses(
         {"bytes_n": 100, "skipped_resync_bytes_n": 5, "frames_n": 9, "dropped_between_dwells_frames_n": 8}, 0.05, "c0"
     )

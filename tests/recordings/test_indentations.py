@@ -23,8 +23,8 @@ from tests.recordings.headers import make_header
 CHIPS_N = 2
 CLOCK = ClockMap(offset_s=-5.0, rate=1.25, residual_s=0.0, explained=1.0)
 HEADER = make_header(chips_n=CHIPS_N, contacts_before_n=100)
-# The dwells of an indentation, as pairs (gap before the dwell, length). They are in halves of a frame period, so that
-# some frames are on the edge of a dwell.
+# The dwells of an indentation are pairs (gap before the dwell, length). Gaps and lengths are multiples of half a frame
+# period, so that some frames are on the edge of a dwell.
 DWELLS = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), min_size=1, max_size=3)
 
 
@@ -85,7 +85,7 @@ def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.
 
 
 def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
-    """Return the reference: compare every frame with every dwell.
+    """Return the expected readings, by comparing every frame with every dwell.
 
     A frame on the common edge of two dwells belongs to the later one.
     """
@@ -181,23 +181,23 @@ def test_every_frame_and_every_indentation_is_counted(
 
 def test_dropped_frames_are_counted_by_reason() -> None:
     # Frames are at -2, -1, 0, ... s of probe time; the dwells of three indentations are at 0-2 and 3-4 s, at 5-6 and
-    # 7-8 s, and at 9-9.5 s. Those of the fourth indentation are after the end of the stream.
+    # 7-8 s, and at 9-9.5 s. The dwells of the fourth indentation are after the end of the stream.
     log = log_of([[(0, 4), (2, 2)], [(2, 2), (2, 2)], [(2, 1), (1, 1)], [(60, 2), (2, 2)]])
     timed = timed_of(13, {2: "failed", 3: "field", 7: "field", 8: "failed"})
     timed.t_s[12:] = np.nan
     rows, account = join_blocks([timed], log)
     assert account == {
         "frames_n": 13,
-        "frames_noload_n": 1,  # The frame at 2 s.
-        "frames_contact_n": 2,  # The frames at 3 and 4 s.
+        "frames_noload_n": 1,  # This is the frame at 2 s.
+        "frames_contact_n": 2,  # These are the frames at 3 and 4 s.
         "dropped_no_time_frames_n": 1,
         "dropped_not_finite_frames_n": 2,
         "dropped_failed_read_frames_n": 2,
         "dropped_stuck_chip_frames_n": 0,
-        "dropped_between_dwells_frames_n": 2,  # The frames at -2 and -1 s.
-        # The frames at 7 and 8 s, because the no-load dwell of their indentation has no valid frame.
+        "dropped_between_dwells_frames_n": 2,  # These are the frames at -2 and -1 s.
+        # The frames at 7 and 8 s are dropped, because the no-load dwell of their indentation has no valid frame.
         "dropped_no_noload_frames_n": 2,
-        "dropped_no_contact_frames_n": 1,  # The frame at 9 s.
+        "dropped_no_contact_frames_n": 1,  # This is the frame at 9 s.
         "indentations_n": 1,
         "dropped_no_noload_indentations_n": 1,
         "logged_indentations_n": 4,
@@ -207,7 +207,7 @@ def test_dropped_frames_are_counted_by_reason() -> None:
     assert rows["reading_i"].tolist() == [0, 1]
 
 
-def test_readings_are_released_when_the_next_indentation_begins() -> None:
+def test_readings_of_an_indentation_are_returned_when_the_next_one_begins() -> None:
     log = log_of([[(2, 6), (2, 6)]] * 50)
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)

@@ -69,15 +69,15 @@ def _change_uT(readings: Readings) -> np.ndarray:
 
 
 def test_chip_rotations_fitted_to_recordings_equal_those_of_the_scenes(recorded_uT, simulated_uT, design):
-    # Rotations are fitted to all files together. From a single file, a rotation would be wrong by up to 40 degrees, or
-    # even mirrored.
+    # Rotations are fitted to all files together. If they were fitted to a single file, a rotation would be wrong by up
+    # to 40 degrees, or would even be mirrored.
     for chip_i, turn_deg in enumerate(design.chips_turn_deg):
         read_uT = recorded_uT[:, :, chip_i].reshape(-1, 3)
         found, _ = orthogonal_procrustes(read_uT, np.tile(simulated_uT[:, chip_i], (len(LAB), 1)))
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         assert np.linalg.det(found) > 0, f"chip {chip_i} is mirrored"
-        # A wrong quarter turn would give a difference of 1. Smaller differences are due to the positions of skins on
-        # their boards, and to skins that slide.
+        # If a chip had a wrong rotation by a quarter turn, the difference would be 1. Smaller differences are due to
+        # the positions of skins on their boards, and to skins that slide.
         assert np.abs(found.T - turn).max() < 0.35, f"chip {chip_i}"
 
 

@@ -30,7 +30,7 @@ def lab(tmp_path_factory, shared_data, empty_store) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    # A single experiment is enough, because scene ci tests the others.
+    # A single experiment is enough, because the other experiments are tested with scene ci.
     settings |= {"experiments": ["lobo"], "split": {}}
     recorded = ("compare", "universal", "reference_methods", "random_presses", "mounting", "recorded_limits")
     for section in ("few_labels", "audit", *recorded):
@@ -71,7 +71,7 @@ def test_stages_run_in_the_order_of_the_generated_list(lab):
 
 
 def test_board_can_be_added_and_removed(lab, shared_data):
-    file = str(shared_data / "lab/board1_depth1.csv")  # This file serves as the recording of a third board.
+    file = str(shared_data / "lab/board1_depth1.csv")  # This file is used as the recording of a third board.
     run(lab, "reskin", "add", file, "--layout", "lab", "--board", "board3", "--skin", "skin3", "--scene", "lab")
     output = run(lab, "dvc", "repro", "split@lab").stdout  # Stage split is the first stage that combines boards.
     assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in output

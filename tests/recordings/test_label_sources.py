@@ -67,13 +67,13 @@ def test_program_that_moves_a_robot_yields_labels(context, tmp_path):
     assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
 
 
-def test_label_function_is_called_until_it_returns_none(context, tmp_path):
+def test_function_that_returns_labels_is_called_until_it_returns_none(context, tmp_path):
     labels = [None, Label(True, 1.0, 1.0), Label(False)]
     from_program(labels.pop, DWELL_s).run(context)
     assert len(log_of(tmp_path)) == 2
 
 
-def test_invalid_label_or_failing_robot_ends_the_labels(context):
+def test_labelling_ends_if_the_robot_fails_or_a_label_is_invalid(context):
     def pokes():
         yield Label(False)
         raise RuntimeError("the robot is in its limits")
@@ -121,7 +121,7 @@ def test_answer_to_a_prompt_may_be_an_index_a_force_or_skip(context, tmp_path):
     ("line", "x_mm", "force_N"),
     [("12N", 0, 12), ("10N", 0, 10), ("10.5N", 0, 10.5), ("3 2.5N", 3, 2.5), ("3", 3, np.nan), ("12", 12, np.nan)],
 )
-def test_force_with_its_unit_is_never_read_as_place_and_force(context, tmp_path, line, x_mm, force_N):
+def test_answer_with_a_number_and_unit_is_read_as_a_force_and_not_as_a_place(context, tmp_path, line, x_mm, force_N):
     prompter, printed = prompts(
         ["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", line, "", "q"], scan="snake", text="line:13:1"
     )
@@ -179,7 +179,7 @@ def fake_gauge(monkeypatch):
 
 
 class GaugeContext(LabelContext):
-    """The context of a label. A label lasts until the gauge has sent data or is unplugged, instead of a fixed time."""
+    """The context of a label. Instead of a fixed time, a label lasts until the gauge has sent data or is unplugged."""
 
     gauge: FakeGauge
 
@@ -217,7 +217,7 @@ def test_labels_continue_after_the_gauge_is_unplugged(context, fake_gauge):
     assert context.writer.touches_n == 2
 
 
-def test_gauge_without_other_labels_detects_touches_by_their_force(context, tmp_path, fake_gauge):
+def test_touches_are_detected_by_the_force_if_a_gauge_is_the_only_label_source(context, tmp_path, fake_gauge):
     fake_gauge([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
     # The clock is simulated. With a real clock, a busy machine would split a touch of 0.5 s into several touches.
     ticks = count()
@@ -236,7 +236,7 @@ def test_gauge_without_other_labels_detects_touches_by_their_force(context, tmp_
 class PollCounter(threading.Event):
     """A stop event that counts how often a program waits for it.
 
-    The reader of a growing table waits for this event once per poll.
+    The reader of a growing table waits for this event each time it looks for new rows (polls).
     """
 
     def __init__(self):
@@ -273,7 +273,7 @@ def test_rows_that_are_appended_to_a_table_are_read(context, tmp_path, exists):
     ("interruption", "problem"),
     [("replaced", "replaced"), ("cut", r"shortened to \d+ bytes, but \d+ bytes had"), ("removed", "removed")],
 )
-def test_labels_end_when_reading_the_table_is_interrupted(context, tmp_path, interruption, problem):
+def test_labelling_ends_if_the_growing_table_is_replaced_or_cut(context, tmp_path, interruption, problem):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
     label_thread = LabelThread(from_table(file), context)

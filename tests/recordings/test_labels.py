@@ -1,4 +1,4 @@
-"""Tests that labels become the same dwells (stops of the tip) for chunks of any size, and the probe log is valid."""
+"""Tests that labels become a valid probe log, with equal dwells (stops of the tip) for chunks of any size."""
 
 import math
 
@@ -26,7 +26,7 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
                   st.floats(0, 100), st.floats(0.001, 5))  # fmt: skip
 
 
-def test_touch_is_written_if_a_no_load_dwell_comes_before_it(tmp_path):
+def test_writer_skips_dwells_that_do_not_fit_and_writes_the_touch(tmp_path):
     writer = ProbeLogWriter(tmp_path)
     # This dwell is skipped, because no no-load dwell comes before it.
     writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))
@@ -43,7 +43,7 @@ def test_touch_is_written_if_a_no_load_dwell_comes_before_it(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    # This dwell is skipped, because it is the late label of a program that hangs.
+    # This dwell is skipped, because it comes too late, from a program that hangs.
     writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))
 
 
@@ -106,7 +106,7 @@ def test_each_phase_of_a_table_becomes_one_dwell():
     assert touch.label.Fz_N == 0.5
 
 
-def test_long_touch_is_divided_into_dwells_and_a_new_place_starts_a_new_one():
+def test_dwell_ends_at_the_maximum_duration_and_where_the_place_changes():
     text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
     found, _ = dwells_of(text)
     assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)

@@ -1,4 +1,4 @@
-"""Tests of `reskin.load_recording`, which must return the same readings as the readers of each kind of recording."""
+"""Tests that `reskin.load_recording` returns the same readings as the reader of each kind of recording."""
 
 import sys
 
@@ -26,7 +26,7 @@ from tests.test_io import readings
 
 RATE_HZ, FRAMES_N, CHIPS_N = 100.0, 120, 2
 CHANNELS = ["bx0_uT", "by0_uT", "bz0_uT", "bx1_uT", "by1_uT", "bz1_uT"]
-# The x coordinates of three contacts. Each lasts 0.2 s, and comes after 0.2 s without contact.
+# These are the x coordinates of three contacts. Each contact lasts 0.2 s and begins after 0.2 s without contact.
 PLACES_MM = (2.0, 6.0, 10.0)
 
 
@@ -70,7 +70,7 @@ def check_units(frame):
     assert all(unit == "1" for name, unit in numeric.items() if not name.endswith(f"_{unit}"))
 
 
-def test_frames_of_all_kinds_of_logs_are_the_same(tmp_path):
+def test_load_recording_returns_equal_frames_for_all_kinds_of_logs(tmp_path):
     t_s, b_uT, temperature_degC = frames_of_board()
     folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
     (tmp_path / "log.csv").write_text(sd_card.render(t_s, b_uT, temperature_degC))
@@ -93,7 +93,7 @@ def test_frames_of_all_kinds_of_logs_are_the_same(tmp_path):
     assert set(stream["board"]) == {"board1"}
 
 
-def test_labelled_capture_has_the_rows_that_stage_ingest_makes(tmp_path):
+def test_load_recording_returns_the_rows_that_stage_ingest_writes(tmp_path):
     folder = write_stream(tmp_path / "run1", {PROBE_FILE: labels().encode()})
     _, blocks, counts = open_capture(folder, DEFAULT_POLICY)
     io.write_readings(tmp_path / "run1.parquet", blocks, counts)
@@ -117,7 +117,7 @@ def test_labelled_capture_has_the_rows_that_stage_ingest_makes(tmp_path):
     assert sorted(frame["x_mm"].unique()) == list(PLACES_MM)
 
 
-def test_faults_are_handled_as_in_stage_ingest():
+def test_load_recording_has_the_same_fault_policy_as_stage_ingest():
     assert STANDARD_POLICY == DEFAULT_POLICY
 
 
@@ -144,7 +144,7 @@ def test_table_file_is_read_like_a_capture_of_its_layout(tmp_path):
         reskin.load_recording(tmp_path / "my table.csv", frames=True)
 
 
-def test_error_for_another_file_names_the_file(tmp_path):
+def test_load_recording_raises_an_error_that_names_the_unreadable_file(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     io.write_table(tmp_path / "other.parquet", pa.table({"x": [1.0]}))
@@ -164,7 +164,7 @@ def test_error_for_another_file_names_the_file(tmp_path):
         reskin.load_recording(stream / STREAM_FILE)
 
 
-def test_layout_that_is_needed_is_named_in_the_error(shared_data):
+def test_load_recording_tells_which_layout_a_recording_needs(shared_data):
     for name, layout in (("lab/board1_depth1.csv", "lab"), ("eflash7/multi_touch_1_2_20251109_230349.csv", "eflash7")):
         with pytest.raises(ReskinError, match=f"This is layout {layout}. Convert it to a capture with `reskin add`"):
             reskin.load_recording(shared_data / name)

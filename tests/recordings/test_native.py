@@ -1,6 +1,7 @@
 """Tests of captures in our own format, whose bytes are decoded.
 
-Indentations are recovered, and every byte and frame is in a reading or counted as lost.
+The tests check that indentations are recovered, and that every byte and every frame is either used in a reading or
+counted as lost.
 """
 
 import dataclasses
@@ -24,9 +25,9 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 RATE_HZ = 100.0
-OFFSET_S = 40.0  # The time of the probe minus the time of the stream.
+OFFSET_S = 40.0  # This is the time of the probe minus the time of the stream.
 INDENTATIONS_N = 60
-# The number of frames in each phase of an indentation: without load, while the tip moves down or up, and in contact.
+# Each indentation has this number of frames without load, while the tip moves down or up, and in contact.
 NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5
 CHIPS_N = 5
 
@@ -145,7 +146,7 @@ def test_every_byte_of_a_damaged_stream_is_counted(tmp_path: Path) -> None:
     b_uT[20:23, 3:6], temperature_degC[20:23, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[40] = np.nan
     whole = encode(dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC), "binary")
-    broken = whole[: 82 * 100 + 30] + whole[82 * 101 :]  # A part of one frame, 52 bytes, is missing.
+    broken = whole[: 82 * 100 + 30] + whole[82 * 101 :]  # 52 bytes of one frame are missing.
     _, account = read(write(tmp_path, "binary", stream=broken), header_of("binary", "rate"))
     assert account["bytes_n"] == len(broken)
     skipped = [key for key in account if key.startswith("skipped_") and key.endswith("_bytes_n")]
@@ -175,7 +176,7 @@ def test_frames_with_a_stuck_chip_are_dropped(tmp_path: Path, marks: tuple[tuple
     assert account["frames_n"] == used + sum(account[key] for key in dropped)
 
 
-def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_has_power_on_settings(tmp_path: Path) -> None:
     b_uT = FRAMES.b_uT.copy()
     steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
     b_uT = np.round(b_uT / steps_uT) * steps_uT

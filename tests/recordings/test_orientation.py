@@ -33,11 +33,11 @@ def inverse_of(way: str) -> str:
 
 
 @pytest.mark.parametrize("way", DEPARTURES)
-def test_reported_departure_is_the_inverse_of_the_change_of_labels(way):
+def test_change_of_the_labels_is_found_and_its_inverse_is_reported(way):
     assert other_orientation(relabel(board("one"), way), board("other")) == inverse_of(way)
 
 
-def test_correct_labels_and_captures_without_information_raise_no_alarm():
+def test_no_alarm_is_raised_for_correct_labels_or_too_little_information():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
     assert other_orientation(relabel(board("few", 19), "with x mirrored"), other) is None
@@ -47,10 +47,10 @@ def test_correct_labels_and_captures_without_information_raise_no_alarm():
     assert other_orientation(relabel(one, "with x mirrored"), noise) is None
 
 
-def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
+def test_each_wrong_orientation_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
     """The recordings at depth 2 are used.
 
-    Of all 18 pairs of recordings, one is inconclusive: board 2 at depth 3 compared with board 1 at depth 1.
+    Of all 18 pairs of recordings, only one is inconclusive: board 2 at depth 3 compared with board 1 at depth 1.
     """
     boards = {}
     for number in (1, 2):

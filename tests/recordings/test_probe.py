@@ -1,4 +1,4 @@
-"""Tests of reading and writing the probe log, a CSV file with the labels. Errors name the row."""
+"""Tests of reading and writing the probe log, a CSV file with the labels. Errors must name the invalid row."""
 
 import dataclasses
 from pathlib import Path
@@ -38,12 +38,12 @@ def test_written_log_is_read_unchanged() -> None:
     assert log.Fz_N[3] == 2.5
 
 
-def test_order_of_columns_does_not_matter() -> None:
+def test_columns_may_be_in_any_order() -> None:
     swapped = "\n".join(",".join(reversed(row.split(","))) for row in GOOD.splitlines()) + "\n"
     assert_same(probe.parse(swapped, "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
 
-def test_log_is_read_from_a_file_as_from_its_text(tmp_path: Path) -> None:
+def test_probe_log_can_be_read_from_a_file_or_from_its_text(tmp_path: Path) -> None:
     (tmp_path / "probe.csv").write_text(GOOD, encoding="utf-8")
     assert_same(probe.parse(tmp_path / "probe.csv", "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
@@ -138,6 +138,6 @@ def test_other_units_or_signs_are_refused(column: str, factor: float, message: s
         check_log(other, "probe.csv")
 
 
-def test_log_without_labels_is_accepted() -> None:
+def test_probe_log_whose_labels_are_all_unknown_is_accepted() -> None:
     unknown = np.full(len(UNITS_LOG), np.nan, np.float32)
     check_log(dataclasses.replace(UNITS_LOG, **dict.fromkeys(probe.LABELS, unknown)), "probe.csv")

@@ -68,8 +68,8 @@ def test_forces_of_lab_recordings_reach_ten_newtons(shared_data: Path, tmp_path:
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # The tip pushes the skin along x while it presses. From the fields alone, experiment compare finds that the skin
-    # moves by 48 um along the +x axis of the labels.
+    # The tip pushes the skin along x while it presses. Experiment compare, which uses only the fields, finds that the
+    # skin moves by 48 um along the +x axis of the labels.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
@@ -98,7 +98,7 @@ def test_fields_of_lab_skins_are_a_few_millitesla(shared_data: Path, tmp_path: P
 def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> None:
     readings, account = ingest(ini, shared_data / SCREW, tmp_path)
     assert account["rows_read_n"] == 23_300
-    assert account["rows_n"] == 23_299  # The fields are one row late. Therefore one row has no partner.
+    assert account["rows_n"] == 23_299  # The fields are one row late, so one row of labels has no row of fields.
     assert account["passes_n"] == 50
     assert np.bincount(readings.pass_i).tolist() == [466] * 49 + [465]
     touching = np.isfinite(readings.x_mm)

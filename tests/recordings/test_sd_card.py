@@ -42,12 +42,12 @@ def test_written_log_is_read_unchanged(tmp_path_factory, chips_n):
     assert account["rows_n"] == account["rows_read_n"] == 60
 
 
-def test_header_line_is_that_of_the_firmware_that_writes_text(log):
+def test_header_line_of_an_sd_card_log_equals_that_of_the_firmware(log):
     assert column_names(2) == ["t_s", "T0", "Bx0", "By0", "Bz0", "T1", "Bx1", "By1", "Bz1"]
     assert lines(log)[0] == "t_s,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1\n"
 
 
-def test_temperatures_may_be_missing(log):
+def test_sd_card_log_without_temperatures_is_read(log):
     with_temperatures = read_log(log)
     columns = [[cell for i, cell in enumerate(row.split(",")) if i % 4 != 1] for row in lines(log)]
     log.write_text("".join(",".join(row) for row in columns))

@@ -248,7 +248,7 @@ def test_killed_process_loses_no_byte_that_it_has_read(board, tmp_path):
     assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
 
 
-def test_waiting_uses_no_processor_time(board, tmp_path):
+def test_recorder_uses_no_processor_time_while_it_waits(board, tmp_path):
     before_s = time.process_time()
     with pytest.raises(CaptureError):
         record(board, tmp_path, lambda _: None, silence_s=1.0)
@@ -339,7 +339,7 @@ class TestErrors:
         with pytest.raises(CaptureError, match="no bytes arrived"):
             record(board, tmp_path, lambda _: board.unplug())
 
-    def test_bytes_without_any_frame_suggest_a_wrong_baud_rate(self, board, tmp_path):
+    def test_error_suggests_a_wrong_baud_rate_if_no_frame_is_found(self, board, tmp_path):
         noise = bytes(range(128)) * 4
         os.set_blocking(board.board_fd, False)  # Otherwise, writing would block while the error message is prepared.
 

@@ -1,6 +1,5 @@
-"""Synthetic results for tests of the report.
-
-They are model cards (records of trained networks with their scores), and the numbers that each experiment would write.
+"""Synthetic results for tests of the report: model cards, which describe trained networks and their scores, and the
+numbers that each experiment would write.
 """
 
 import xml.etree.ElementTree as ET

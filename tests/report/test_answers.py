@@ -1,3 +1,5 @@
+"""Tests of the answers to the question whether models work on a skin that was not in training."""
+
 import pytest
 
 from pipeline.report.answers import NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms
@@ -38,7 +40,7 @@ def scene(accuracy: dict, r2: dict, source: str = "simulated") -> dict:
         ({"mean": 92.0, "n": 2, "values": [89.0, 95.0]}, PARTLY),
     ],
 )
-def test_answer_on_places_depends_on_the_whole_interval(accuracy, reached):
+def test_answer_on_places_is_yes_only_if_the_whole_interval_reaches_the_limit(accuracy, reached):
     place = answers(scene(accuracy, over(0.8, 0.7, 0.9))).place
     assert place.level == reached
     assert ("not reached" in " ".join(place.sentences)) == (
@@ -49,7 +51,7 @@ def test_answer_on_places_depends_on_the_whole_interval(accuracy, reached):
 @pytest.mark.parametrize(
     ("r2", "reached"), [(over(0.95, 0.92, 0.97), YES), (over(0.76, 0.6, 0.85), PARTLY), (over(0.2, 0.1, 0.3), NO)]
 )
-def test_answer_says_that_a_force_with_low_r2_is_not_usable(r2, reached):
+def test_answer_says_that_forces_are_not_usable_if_r2_is_low(r2, reached):
     force = answers(scene(over(80.0, 70.0, 90.0), r2)).force
     assert (force.level, force_level(r2)) == (reached, reached)
     assert ("not usable" in force.short) == (reached == NO)
@@ -57,7 +59,7 @@ def test_answer_says_that_a_force_with_low_r2_is_not_usable(r2, reached):
     assert "1.4 N" in force.short  # The mean force is 1.4 N.
 
 
-def test_answer_is_about_the_best_model_that_needs_no_labels():
+def test_answer_describes_the_best_model_that_needs_no_labels():
     found = answers(scene(over(80.0, 70.0, 88.0), over(0.8, 0.7, 0.9)))
     assert found.place.short.startswith("80.0 % [70.0, 88.0] of readings are within 1 mm")
     assert f"Paper: {TABLE_2['adapted']['accuracy_pct'][0]:g} %" in " ".join(found.place.sentences)
@@ -103,13 +105,13 @@ def test_answer_uses_experiment_random_presses_if_it_was_run():
     assert found.place.short.startswith("65.0 % (64.0; 66.0)")
     assert found.place.second == f"Universal model (ours), {WAYS[shipped]}: 43.0 % (42.0; 44.0) within 1 mm."
     assert "With 40 labelled presses: 87.0 % (86.0; 88.0) within 1 mm." in found.place.sentences
-    # This is the mean of the rms errors of the two boards.
+    # The rms error is the mean over the two boards.
     assert found.force.short.startswith("not usable; rms error 1.5 N")
     assert "needs from the new skin: 65 presses without labels." in found.tested
 
 
 @pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
-def test_answer_is_about_the_universal_model_if_table_2_is_incomplete(dropped, leads):
+def test_answer_describes_the_universal_model_if_table_2_is_incomplete(dropped, leads):
     numbers = scene(over(78.0, 73.8, 81.7), over(0.6, 0.4, 0.8))
     numbers["table2"]["single"] = row(over(40.0, 30.0, 50.0), over(0.2, 0.1, 0.3))
     numbers["table2"] = {name: scores for name, scores in numbers["table2"].items() if name != dropped}
@@ -120,7 +122,7 @@ def test_answer_is_about_the_universal_model_if_table_2_is_incomplete(dropped, l
     assert ("Universal model" in found.place.second) == (dropped == "")
 
 
-def test_boards_and_skins_are_counted_if_the_protocol_is_missing():
+def test_answer_states_the_numbers_of_boards_and_skins_if_the_protocol_is_missing():
     numbers = scene(over(86.0, 78.0, 91.5), over(0.8, 0.7, 0.9))
     numbers["described"] = {"grid": {"over_skins": {"rest_changes_in_1_uT": {"mean": 5.0, "n": 18}}}}
     del numbers["protocol"]
@@ -157,10 +159,10 @@ def test_answer_from_a_simulated_scene_says_that_it_is_no_evidence_about_real_sk
     assert "no evidence" not in recorded
 
 
-def test_rms_error_is_given_without_a_standard_deviation():
+def test_rms_of_squared_errors_has_no_standard_deviation():
     assert rms({"mean": 4.0, "n": 2, "sd": 1.0, "values": [1.0, 9.0]}) == {"mean": 2.0, "n": 2, "values": [1.0, 3.0]}
     assert rms(None) is None
 
 
-def test_answer_without_an_interval_depends_on_the_mean():
+def test_answer_depends_on_the_mean_if_there_is_no_interval():
     assert [level({"mean": value, "n": 1}, 90.0, 50.0) for value in (90.0, 89.9, 49.9)] == [YES, PARTLY, NO]

@@ -1,3 +1,5 @@
+"""Tests of the checklist, which compares each result of the paper with ours and gives a verdict on each claim."""
+
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +60,7 @@ def judge_value(
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
-def test_every_row_refers_to_an_existing_number(one):
+def test_every_row_of_the_checklist_refers_to_an_existing_number(one):
     assert one.ours is None or resolve(all_experiments(), one.ours) is not None
     assert one.stage is None or one.stage in STAGES
     assert (one.paper is None) != (one.says is None)
@@ -69,7 +71,7 @@ def test_every_number_of_the_paper_is_in_the_checklist():
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
     used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
     assert printed - used == set()
-    assert len(printed) > 30  # This shows that the set is not empty by mistake.
+    assert len(printed) > 30  # This checks that the set is not empty by mistake.
 
 
 def test_every_figure_and_table_of_the_paper_has_a_row():
@@ -97,7 +99,7 @@ def test_row_of_a_missing_experiment_says_that_it_was_not_run():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_number_is_met_within_the_papers_standard_deviation_or_ten_percent(mean, sd, ours, path):
+def test_number_is_met_within_one_standard_deviation_of_the_paper_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == (
         "within the paper's standard deviation",
@@ -119,7 +121,7 @@ def test_number_agrees_with_the_paper_if_our_interval_includes_it(printed, verdi
 
 
 @pytest.mark.parametrize(("bias_N", "meaning"), [(-0.02642, "under-estimated"), (0.02642, "over-estimated")])
-def test_row_explains_the_sign_of_a_bias(bias_N, meaning):
+def test_row_says_whether_the_bias_means_too_much_or_too_little_force(bias_N, meaning):
     numbers = all_experiments()
     numbers["drift"]["late"]["bias_N"] = bias_N
     bias = line(numbers, "figure-5b")
@@ -144,7 +146,7 @@ def test_row_states_our_protocol_beside_that_of_the_paper():
         ("positive", -0.1, None, "above 0", "no"),
     ],
 )  # fmt: skip
-def test_limits_are_compared_with_the_mean(rule, ours, paper, criterion, met):
+def test_mean_is_compared_with_the_limit_if_there_is_no_interval(rule, ours, paper, criterion, met):
     judgement = judge_value(ours, paper, rule=rule)
     assert (judgement.verdict, judgement.criterion, judgement.met) == (FEW_BOARDS, criterion, met)
 
@@ -170,14 +172,14 @@ def test_claims_are_judged_by_the_interval_over_boards(rule, low, high, verdict)
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
-def test_verdicts_on_at_least_and_at_most_a_limit_are_opposite(low, width, limit):
+def test_rules_at_least_and_at_most_with_the_same_limit_have_opposite_verdicts(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judge_value(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
     assert (least == SUPPORTED) == (low > limit)
 
 
-def test_decrease_of_an_error_counts_as_gain():
+def test_decrease_of_an_error_counts_as_a_gain():
     assert judge_value(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
     assert judge_value(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
 
@@ -191,17 +193,17 @@ def test_decrease_of_an_error_counts_as_gain():
         (-4.0, 2.9, CONTRADICTED, False),
     ],
 )
-def test_sizeable_gain_must_be_at_least_half_of_the_papers_gain(low, high, verdict, equivalent):
+def test_gain_is_sizeable_if_it_is_at_least_half_of_the_papers_gain(low, high, verdict, equivalent):
     judgement = judge_value(over_boards(low, high), 5.97, rule="sizeable")
     assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98 (half of the paper's gain)")
     assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
-def test_repeats_on_one_skin_are_not_enough_for_a_verdict():
+def test_limit_has_no_verdict_if_all_repeats_are_on_one_skin():
     assert judge_value(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
-def test_rule_over_several_counts_fails_if_it_fails_at_one_count():
+def test_claim_about_several_counts_is_contradicted_if_it_is_contradicted_at_one():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
@@ -239,7 +241,7 @@ def test_every_claim_has_a_verdict():
     }
 
 
-def test_claim_about_counts_that_were_not_tried_is_not_reached():
+def test_claim_about_numbers_of_pokes_that_were_not_tried_is_marked_as_not_reached():
     numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
     assert line(numbers, "plateau")["note"] == NOT_REACHED
@@ -247,13 +249,13 @@ def test_claim_about_counts_that_were_not_tried_is_not_reached():
     assert line(numbers, "plateau")["note"] == NOT_RUN
 
 
-def test_networks_of_one_training_skin_are_not_compared_as_pooled_training():
+def test_networks_of_one_training_skin_are_not_compared_with_pooled_training():
     item = {"ours": "table2.multi.accuracy_pct"}
     assert judge_value(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
     assert judge_value(stat(90.0), (85.0, 1.0), **item).met == "no"
 
 
-def test_reason_for_a_difference_is_shown_only_if_there_is_one():
+def test_reason_for_a_difference_is_shown_only_if_our_number_differs():
     numbers = all_experiments()
     rows = [row(ours="single_random.accuracy_pct", why="Because.")]
     assert checklist(numbers, rows)["note"][0] == "Because."
@@ -261,7 +263,7 @@ def test_reason_for_a_difference_is_shown_only_if_there_is_one():
     assert checklist(numbers, rows)["note"][0] == "–"
 
 
-def test_note_says_that_a_shorter_run_has_not_reached_the_papers_protocol():
+def test_note_says_that_a_run_is_shorter_than_the_papers_protocol():
     numbers = all_experiments()
     assert line(numbers, "figure-5b")["note"] == "45,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["contacts_n"] = 18_000
@@ -275,7 +277,7 @@ def test_note_says_that_a_shorter_run_has_not_reached_the_papers_protocol():
 
 
 @pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
-def test_settings_of_a_simulated_rig_are_not_judged(name):
+def test_numbers_that_are_settings_of_the_simulated_rig_are_not_judged(name):
     assert line(all_experiments("simulated"), name)["note"] == SETTING
     assert line(all_experiments("recorded"), name)["met"] in ("yes", "–")
 
@@ -300,7 +302,7 @@ def test_reason_contains_the_numbers_of_the_run():
     assert "80 % nearer to the skin, and ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
-def test_equal_numbers_are_not_given_as_a_reason():
+def test_setting_that_equals_the_papers_is_not_given_as_a_reason():
     numbers = all_experiments()
     numbers["flexible"]["gap_less_pct"] = 80.0
     assert "a possible reason" not in line(numbers, "flexible-accuracy_pct")["note"]
@@ -314,7 +316,7 @@ def test_equal_numbers_are_not_given_as_a_reason():
         ({"mean": 99.0, "n": 1}, "–"),
     ],
 )  # fmt: skip
-def test_papers_number_is_inside_or_outside_our_interval(ours, within):
+def test_checklist_says_whether_the_papers_number_is_in_our_interval(ours, within):
     numbers = all_experiments() | {"a": {"accuracy_pct": ours}}
     assert checklist(numbers, [row(ours="a.accuracy_pct")])["paper in our interval"][0] == within
 
@@ -330,8 +332,8 @@ def test_p_values_of_related_claims_are_corrected_by_holms_method():
     rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
-    # There are three claims. Their p-value of 0.01 becomes 0.03. Those of 0.03 and 0.04 become 0.06, which is not
-    # significant, although the intervals exclude 0.
+    # There are three claims with the p-values 0.01, 0.03 and 0.04. The corrected p-values are 0.03, 0.06 and 0.06. A
+    # value of 0.06 is not significant, although the interval excludes 0.
     assert table["verdict"].tolist() == [SUPPORTED, INCONCLUSIVE, INCONCLUSIVE, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
@@ -351,13 +353,13 @@ def test_name_of_an_unknown_number_of_the_paper_is_refused():
         look_up({}, "SHEARS.x")
 
 
-def test_path_of_a_number_can_select_list_items_by_a_value():
+def test_path_of_a_number_can_select_an_item_of_a_list_by_its_values():
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
     assert resolve(all_experiments(), "paired.of=adapted,over=multi.over") == "multi"
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
 
 
-def test_p_value_of_a_claim_of_several_parts_is_that_of_the_first_part():
+def test_p_value_of_a_claim_of_several_parts_follows_the_direction_of_the_first_part():
     claim = row(rule="each", ours="x.accuracy_pct")
 
     def parts(*means: float) -> list[dict]:

@@ -48,7 +48,10 @@ INTEGRATORS = [
 
 
 def with_times(rows: list[Precision]) -> list[dict]:
-    """Return the rows of a study with run times. Failed rows and the row of the reference have none."""
+    """Return the rows of a study with run times.
+
+    Rows of failed methods and the row of the reference have no run time.
+    """
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
     return [asdict(row) | times.get(row.key, {}) for row in rows]
@@ -115,7 +118,7 @@ def test_rows_without_an_error_or_a_time_are_not_drawn():
     assert count_marks(untimed) == count_marks(without)
 
 
-def test_pages_contain_the_studies_of_the_scene():
+def test_cost_pages_contain_only_the_studies_that_were_run():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
     assert set(cost_pages(stages | {"integrators": with_times(INTEGRATORS)}, "simulated")) == {
@@ -142,7 +145,7 @@ def test_equal_rows_give_equal_figures():
 
 
 @given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))
-def test_each_other_point_is_slower_or_less_accurate_than_one_on_the_front(points):
+def test_front_contains_all_points_that_no_other_point_beats_in_time_and_error(points):
     kept = front(points)
     assert set(kept) <= set(points)
     times, errors = np.array(kept).reshape(-1, 2).T
@@ -277,10 +280,10 @@ def test_figures_of_costs_have_units_and_name_their_source():
         assert "recorded" in text
 
 
-def test_each_additional_point_adds_one_mark(costs):
+def test_figure_of_training_times_has_one_mark_for_each_method(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
-    # Each point is a mark in the panel and has a mark in the legend. Ticks are marks too.
+    # Each method has one mark in the panel and one in the legend. Ticks are marks, too, and are subtracted.
     assert count_marks(all_) - ticks["all"] - (count_marks(few) - ticks["few"]) == 2
 
 
@@ -293,7 +296,7 @@ def count_marks(svg: str) -> int:
     return len(re.findall("<use ", svg))
 
 
-def test_cells_of_methods_that_were_not_timed_are_dashes():
+def test_cost_tables_have_dashes_for_methods_that_were_not_timed():
     timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
     untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
     rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]

@@ -1,4 +1,4 @@
-"""Tests of the titles of marks in figures (SVG). Browsers show them as tooltips with the values of the mark."""
+"""Tests of the titles of marks in figures (SVG). Browsers show a title as a tooltip with the values of its mark."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -59,7 +59,7 @@ def test_points_of_an_errorbar_plot_without_bars_have_titles():
     assert len(titles(draw(lambda axes: axes.errorbar([1, 2], [5, 6], None, fmt="o")))) == 2
 
 
-def test_titles_use_the_texts_of_ticks():
+def test_titles_of_marks_use_the_texts_of_ticks_if_ticks_have_texts():
     def plot(axes):
         axes.plot([3.1, 3.2], [0.9, 2.1], "o")
         axes.set_yticks([1, 2], ["one\nskin", "two skins"])
@@ -93,9 +93,9 @@ def test_title_of_a_line_without_marks_is_its_label():
 @pytest.mark.parametrize(
     "values",
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
-    ids=["too many", "one not drawn"],
+    ids=["too many marks", "one mark not drawn"],
 )
-def test_plots_with_too_many_or_missing_values_have_no_titles(values):
+def test_marks_have_no_titles_if_there_are_too_many_or_one_is_not_drawn(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []
     assert titles(draw(lambda axes: axes.scatter(values, values))) == []
 

@@ -52,8 +52,8 @@ def test_each_place_is_drawn_once():
 
 def test_skin_and_chips_are_drawn_only_on_the_grid_of_the_paper():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # On the paper's grid, there are more elements: five chips, the skin and two entries of the legend. There are fewer
-    # spines of the axes, by two.
+    # The figure on the paper's grid has more elements: five chips, the skin and two entries of the legend. Its axes
+    # have two spines fewer.
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
@@ -85,7 +85,7 @@ def test_svg_is_made_smaller_without_changing_digits_in_texts():
     assert re.search(r"^ ", text, re.MULTILINE) is None
 
 
-def test_fonts_of_formulas_have_an_alternative():
+def test_fonts_of_formulas_have_sans_serif_as_alternative():
     with drawing(3.0, 2.0) as figure:
         figure.subplots().set_yscale("log")
         families = re.findall(r"font-family: ([^\";]*)", svg(figure))
@@ -127,7 +127,7 @@ def test_figure_of_the_number_of_sensors_has_a_line_for_each_method():
     assert "adapted" not in texts_of(sweep_sensors([one for one in SENSORS if one["method"] == "multi"], "recorded"))
 
 
-def test_error_bars_end_at_possible_scores():
+def test_error_bars_do_not_exceed_the_range_of_the_metric():
     accuracy = [row(95.0, sd=10.0, n=6), row(50.0, sd=10.0, n=6), row(5.0, sd=10.0, n=6)]
     means, lengths = bars(accuracy, "accuracy_pct")
     np.testing.assert_array_equal(means, [95.0, 50.0, 5.0])
@@ -143,7 +143,7 @@ def test_error_bars_end_at_possible_scores():
         ({"sd_seeds": 1.5, "n": 1}, 1.5, 1.5), ({"n": 1}, 0.0, 0.0),
     ],
 )  # fmt: skip
-def test_meaning_of_bars_depends_on_the_spread_that_is_known(spread, down, up):
+def test_bars_show_the_interval_the_range_or_the_standard_deviation(spread, down, up):
     _, lengths = bars([row(50.0, **spread)], "accuracy_pct")
     np.testing.assert_array_equal(lengths, [[down], [up]])
 
@@ -172,7 +172,7 @@ def test_figure_of_table_2_has_all_its_rows():
         assert label in labels
 
 
-def test_figures_of_table_2_are_about_place_and_force():
+def test_one_figure_of_table_2_shows_place_errors_and_another_force_errors():
     figures = headline_figures(all_experiments(), "simulated")
     assert "MSE_F / N²" in texts_of(figures[FORCE])
     assert "R² of F" in texts_of(figures[FORCE])
@@ -205,7 +205,7 @@ def titles(svg: str) -> list[str]:
 
 
 @pytest.mark.parametrize("large", [True, False])
-def test_figure_of_unseen_boards_shows_each_board_beside_the_paper(lab, large):
+def test_figure_of_unseen_boards_has_a_mark_for_each_board_and_for_the_paper(lab, large):
     shown = titles(unseen_boards(lab, "recorded", large=large))
     rows = boards_rows(lab)
     assert {row["labels"] for row in rows} >= {"0", "10", "40"}

@@ -72,7 +72,8 @@ def test_table_of_paired_differences_has_the_difference_of_the_papers_means():
         "+6.0 [5.0, 7.0]",
         "+0.1 [-2.9, 3.1]",
     ]
-    # The differences of means in the paper's table 2 are 81.03 - 84.43 and 87.00 - 81.03. The paper has no control.
+    # The expected differences of the paper are 81.03 - 84.43 and 87.00 - 81.03, from the means in its table 2. The
+    # paper has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
     assert "95 % interval over n boards" in to_markdown(table)

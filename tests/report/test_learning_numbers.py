@@ -1,6 +1,7 @@
-"""Tests of the numbers of experiments on many skins, against values calculated by hand.
+"""Tests of the numbers of experiments on many skins.
 
-Contrasts, which are also tested, are differences between points of a sweep.
+They are compared with values calculated by hand. Some of the numbers are contrasts, which are differences between
+points of a sweep.
 """
 
 import json
@@ -18,7 +19,8 @@ from pipeline.statistics import tidy
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # The gain by adaptation on each skin, in percentage points.
+# On each skin, adaptation increases the accuracy by this number of percentage points.
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
@@ -98,7 +100,7 @@ def test_paired_differences_are_averaged_over_the_skins_of_each_board():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_difference_of_multi_and_single_uses_the_skins_that_both_were_tested_on():
+def test_methods_multi_and_single_are_compared_on_skins_on_which_both_were_tested():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
     assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}
@@ -116,7 +118,7 @@ def test_protocol_counts_the_data_for_training_and_for_tests():
     assert counts["lobo"]["trained_on_rows_n"] == cards[0]["train_rows_n"]
 
 
-def test_missing_experiment_has_no_numbers():
+def test_numbers_contain_only_the_experiments_that_were_run():
     assert numbers([]) == {"variants": {}}
     assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "protocol", "variants"}
     without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
@@ -128,7 +130,7 @@ def test_missing_experiment_has_no_numbers():
     assert "null" not in json.dumps(numbers())
 
 
-def test_networks_with_other_recipes_are_counted_only_as_variants():
+def test_scores_of_networks_with_other_recipes_are_only_in_the_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
@@ -163,7 +165,7 @@ def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    # There is one board, with two draws of skins, and n counts boards.
+    # The number n is that of boards. There is one board, with two draws of skins.
     assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
@@ -190,7 +192,7 @@ def test_training_times_are_medians_over_networks():
         "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    # These are median times. The last method was not timed.
+    # These are the medians of the times of each method. The last method was not timed.
     assert [row.get("train_s") for row in timed] == [2, 100, 35, None]
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
@@ -214,7 +216,7 @@ def gains(contrast: dict) -> dict[str, float]:
     return {board: metrics["accuracy_pct"] for board, metrics in contrast["by_board"].items()}
 
 
-def test_contrasts_of_pokes_are_the_gain_and_its_rest_at_large_numbers():
+def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
     found = contrasts_of_pokes(
         tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
     )
@@ -226,7 +228,7 @@ def test_contrasts_of_pokes_are_the_gain_and_its_rest_at_large_numbers():
     assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
-def test_contrasts_beyond_the_counts_of_a_sweep_are_missing():
+def test_contrasts_at_counts_that_the_sweep_does_not_contain_are_missing():
     found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
@@ -238,7 +240,7 @@ def test_contrasts_beyond_the_counts_of_a_sweep_are_missing():
     }  # fmt: skip
 
 
-def test_contrasts_of_sensors_compare_methods_and_gains():
+def test_contrasts_of_sensors_are_differences_between_methods_and_numbers_of_skins():
     scores = {
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},

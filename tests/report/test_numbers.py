@@ -1,6 +1,5 @@
-"""Tests of the files with the results of a scene.
-
-These are numbers.json (equal for equal runs), provenance.json, and the scores that `dvc metrics` shows.
+"""Tests of the files with the results of a scene: numbers.json, which is equal for equal runs, provenance.json, and the
+scores that `dvc metrics` shows.
 """
 
 import copy
@@ -43,7 +42,7 @@ def test_equal_runs_differ_only_in_their_provenance():
     assert all(row.keys() & set(TIMES) for row in provenance["runtime"]["adaptation"])
 
 
-def test_numbers_contain_no_commit_machine_or_times():
+def test_numbers_do_not_contain_the_commit_the_machine_or_run_times():
     numbers = split(run(1.0))[0]
     assert set(numbers["provenance"]) == {"scene", "source", "seed"}
     assert "stages" not in numbers["runtime"]
@@ -51,7 +50,7 @@ def test_numbers_contain_no_commit_machine_or_times():
     assert numbers["runtime"]["quadratures"][0] == STUDY
 
 
-def test_joining_split_results_gives_them_back():
+def test_results_that_are_split_and_joined_are_unchanged():
     numbers = run(1.0)
     before = copy.deepcopy(numbers)
     assert join(*split(numbers)) == before
@@ -99,7 +98,7 @@ def test_scores_of_recorded_scenes_include_registered_scores_and_best_methods():
     }
 
 
-def test_run_times_and_provenance_change_no_score():
+def test_scores_do_not_depend_on_run_times_and_provenance():
     numbers = all_experiments()
     before = headline_scores(numbers)
     numbers["provenance"] |= {"git": "other", "trained": "other", "device": "other", "seconds": 9.0}

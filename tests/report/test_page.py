@@ -1,3 +1,5 @@
+"""Tests of the report page of a scene, and of the index page of all scenes."""
+
 import html
 import json
 import os
@@ -77,7 +79,7 @@ class Reader(HTMLParser):
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_experiments() if numbers is None else numbers
-    # The synthetic numbers lack values that the tables of these experiments need, so these experiments are omitted.
+    # These experiments are omitted, because the synthetic numbers lack values that their tables need.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
@@ -94,7 +96,7 @@ def read() -> Reader:
     return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
 
 
-def test_page_loads_nothing_and_contains_no_script(read):
+def test_page_loads_only_files_of_the_report_and_has_no_script(read):
     assert [one for one in ("script", "link", "svg") if read.all(one)] == []
     names = ("src", "href", "data")
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
@@ -117,7 +119,7 @@ def test_links_lead_to_ids_that_exist_once(read):
     assert labels <= set(ids)
 
 
-def test_tables_have_names_of_columns(read):
+def test_tables_have_captions_and_header_cells(read):
     tables = read.all("table")
     assert len(tables) > 8
     assert all(above[-1].startswith("div.box") for _, above in tables)
@@ -174,7 +176,7 @@ def test_first_section_answers_questions_on_place_and_force(read):
     ]
 
 
-def test_levels_of_headings_are_in_order(read):
+def test_no_level_of_headings_is_skipped(read):
     levels = [int(tag[1]) for tag, _, _ in read.elements if re.fullmatch(r"h[1-6]", tag)]
     assert levels[0] == 1
     assert levels.count(1) == 1
@@ -212,7 +214,7 @@ def test_figures_have_texts_for_screen_readers(read):
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_figures_results_and_tables_of_a_section_are_in_this_order():
+def test_section_shows_figures_then_the_comparison_with_the_paper_then_tables():
     for part in render().split("<section id=")[1:]:
         places = [part.index(mark) for mark in ("<figure", "Comparison with the paper", "<details") if mark in part]
         assert places == sorted(places)
@@ -242,7 +244,7 @@ def test_figure_that_states_no_size_is_refused():
         ("rms error 0.6 N, 78 % of 3 Names", "rms error 0.6_N, 78_% of 3 Names"),
     ],
 )
-def test_numbers_are_not_broken_at_the_end_of_a_line(text, kept):
+def test_no_line_is_broken_within_a_number_and_its_unit(text, kept):
     assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
@@ -260,7 +262,7 @@ def test_section_about_the_scene_lists_counts():
     assert about(numbers).endswith("Main captures: 1, with 2,000 readings.")
 
 
-def test_results_with_verdicts_come_first():
+def test_results_with_a_verdict_come_first_in_the_comparison_with_the_paper():
     table, section = checklist(all_experiments()), next(one for one in read_sections() if one.key == "skins")
     shown = beside_paper(section, table)
     assert 0 < len(shown.rows) <= BESIDE_N
@@ -269,7 +271,7 @@ def test_results_with_verdicts_come_first():
     assert judged == sorted(judged, reverse=True)
 
 
-def test_results_that_cannot_be_compared_are_omitted():
+def test_comparison_with_the_paper_omits_results_that_cannot_be_compared():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
     (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "smaller than the paper's: 8,000 contacts"}])).rows
@@ -290,7 +292,7 @@ def test_page_begins_with_the_scene(read):
     assert place < read.words.index(read_sections()[0].title)
 
 
-def test_tables_that_belong_to_no_section_are_shown_with_their_texts_escaped(read):
+def test_page_shows_and_escapes_tables_that_belong_to_no_section(read):
     assert "Surprise" in read.words
     assert "<b>" in read.words  # The tag is shown as text, and not interpreted.
     assert "a & b" in read.words
@@ -362,7 +364,7 @@ def luminance(colour: str) -> float:
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def test_contrast_of_colours_meets_wcag():
+def test_contrast_of_colours_meets_the_guidelines_of_wcag():
     text = render()
     light, dark, printed = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
     for theme in (light, light | dark, light | printed, light | dark | printed):
@@ -403,7 +405,8 @@ def test_recorded_scenes_come_first_in_the_index():
 
 
 def test_scenes_without_held_out_boards_come_last_in_the_index():
-    # In the alphabet, scene `a` comes before scene `here`. But it has no held-out boards, so it comes last.
+    # In alphabetical order, scene `a` would come before scene `here`. Scene `a` comes last, because it has no held-out
+    # boards.
     alone = {name: value for name, value in scene_numbers("a", "simulated").items() if name != "table2"}
     both = index([alone, scene_numbers("here", "simulated")], {})
     assert both.index("Scene here") < both.index("Scene a")
@@ -435,7 +438,7 @@ def test_index_links_to_tables_and_figures_of_the_paper():
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
-def test_first_sentence_about_each_scene_describes_it(file):
+def test_description_of_each_scene_begins_with_a_short_sentence(file):
     about = about_scene(file.read_text(encoding="utf-8"))
     assert about[0].isupper()
     assert not about.startswith("Scene")
@@ -443,7 +446,7 @@ def test_first_sentence_about_each_scene_describes_it(file):
     assert 20 < len(about) < 250
 
 
-def test_index_loads_nothing_and_contains_no_script():
+def test_index_loads_only_files_of_the_report_and_has_no_script():
     text = index([scene_numbers("here", "simulated")], {"here": HEADLINE_SVG})
     addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
     assert addresses
@@ -473,7 +476,7 @@ for (const px of [400, 1400]) {{
 </script></body>"""
 
 
-@pytest.mark.skipif(BROWSER is None, reason=f"no browser: no RESKIN_BROWSER, on the path none of {NAMES}")
+@pytest.mark.skipif(BROWSER is None, reason=f"RESKIN_BROWSER is not set, and PATH has none of {NAMES}")
 @pytest.mark.parametrize("one", ["scene", "all scenes"])
 def test_nothing_is_wider_than_the_page_on_phones_and_desktops(one, tmp_path):
     wide = pd.DataFrame(

@@ -61,7 +61,7 @@ def test_sentence_about_shear_is_about_held_out_lines():
     assert "25.00\u00a0% of the variance of the normal forces" in sentences(numbers)["shear.svg"]
 
 
-def test_accuracy_after_drift_has_one_decimal():
+def test_sentence_about_drift_gives_accuracies_with_one_decimal():
     numbers = numbers_of("paper")
     numbers["drift"]["each"][-1]["accuracy_pct"] = 94.5
     assert "94.5\u00a0% with a no-load reading before each contact" in sentences(numbers)["drift.svg"]
@@ -84,5 +84,5 @@ def test_sentence_is_about_unseen_boards_instead_of_table_2_if_they_were_tested(
     assert "3.0\u00a0N with 40" in written[FORCE]
 
 
-def test_sentences_can_be_written_for_results_without_optional_parts():
+def test_sentences_can_be_written_if_results_lack_optional_parts():
     assert set(sentences({})) <= set(sentences(all_experiments()))

@@ -1,4 +1,4 @@
-"""Tests of the statistics over boards, against SciPy and loops. Further tests are about symmetries."""
+"""Tests of the statistics over boards. They are compared with SciPy and with loops, and must have their symmetries."""
 
 import io
 
@@ -49,7 +49,8 @@ from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
 from tests.report.synthetic import SKINS, adapted_cards, card
 
-FEW = settings(max_examples=25, deadline=None)  # Fewer examples than usual, because building tables takes milliseconds.
+# Hypothesis tries fewer examples than usual, because building each table takes milliseconds.
+FEW = settings(max_examples=25, deadline=None)
 DOUBLE = 1e-9  # The relative rounding error of sums of numbers of about 10.
 VALUES = st.lists(st.floats(-50, 50), min_size=4, max_size=9).filter(lambda values: np.std(values) > 1e-3)
 PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=4, max_size=9).filter(
@@ -85,7 +86,7 @@ def board_scores(values: list[float]) -> pd.DataFrame:
 
 
 def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
-    # The squared errors of fold b0 are 0 and 4 for its two seeds. That of fold b1 is 16.
+    # The squared errors of fold b0 are 0 and 4 for its two seeds. The squared error of fold b1 is 16.
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
@@ -112,7 +113,7 @@ def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
             cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
             for name in METRICS[
                 :3
-            ]:  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
+            ]:  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
                 total = 0.0
                 for one in cards:
                     total += one["scores"][part][name]
@@ -120,7 +121,7 @@ def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
                 assert row[name] == pytest.approx(total / 2, rel=1e-12)
 
 
-def test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows():
+def test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins():
     predicted = TRUE + RNG.normal(0, 1, TRUE.shape)
     board = np.repeat("b0", 30)
     parts = [slice(0, 10), slice(10, 30)]
@@ -135,7 +136,8 @@ def test_score_table_written_as_csv_is_read_again():
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
     table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    # The numbers of rows of the three parts of the table. In each part, rows are as labelled, registered, or per skin.
+    # The table has three parts. These are their numbers of rows, which have scores as labelled, registered, or per
+    # skin.
     assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
@@ -240,7 +242,7 @@ def test_swapping_the_methods_negates_the_difference(values):
 
 @FEW
 @given(VALUES, st.floats(-50, 50))
-def test_comparison_with_a_threshold_equals_comparison_of_shifted_values_with_zero(values, above):
+def test_comparing_values_with_a_threshold_equals_comparing_shifted_values_with_zero(values, above):
     stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
@@ -264,7 +266,7 @@ def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
         ([-9.0, 9.0], UNDECIDED),
     ],
 )
-def test_verdict_within_limits_depends_on_the_whole_interval(ends, expected):
+def test_verdict_on_equivalence_depends_on_the_whole_interval(ends, expected):
     assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == expected
 
 
@@ -275,7 +277,7 @@ def test_difference_on_a_single_board_has_no_verdict():
 
 
 def test_repeats_on_one_skin_do_not_count_as_boards():
-    # Here, n counts repeats on one skin, so there is no interval over boards.
+    # The number n is that of repeats on one skin, so there is no interval over boards.
     assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
 
 
@@ -304,7 +306,7 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_interval_of_the_difference_includes_the_spread_over_training_skins():
+def test_interval_of_a_difference_is_wider_if_the_gain_depends_on_the_training_skin():
     boards = [f"b{i}" for i in range(4)]
     equal_gains = transfer_scores(
         {fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")}
@@ -390,11 +392,11 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
         ]
         if (
             name != "r2_f"
-        ):  # R^2 has a test of its own, test_scores_of_skins_with_different_numbers_of_rows_are_those_of_all_rows.
+        ):  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
             assert stat["values"] == pytest.approx(means)
 
 
-def test_draws_of_one_board_are_averaged():
+def test_scores_of_several_draws_are_averaged_within_each_board():
     cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
     assert over_boards(tidy(cards)) == over_boards(tidy(adapted_cards()))
     alone = over_boards(tidy([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
@@ -403,7 +405,7 @@ def test_draws_of_one_board_are_averaged():
     assert alone["sd_seeds"] > 0
 
 
-def test_transfer_scores_count_pairs_of_training_and_test_skins():
+def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins():
     rng = rng_for(0, "transfer")
     tested = [f"b{i}" for i in range(1, 5)]
     boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
@@ -424,7 +426,7 @@ def test_transfer_scores_count_pairs_of_training_and_test_skins():
     assert stat["ci95"][0] > 0
 
 
-def test_experiments_transfer_and_lobo_have_equal_test_rows():
+def test_experiment_transfer_tests_each_skin_on_the_same_rows_as_experiment_lobo():
     split = Split(transfer_skins_n=3, pool_passes_n=2)
     table = six_by_three_in_passes(5)
     many = {skin: fold for fold in draw_folds(table, ["lobo"], split, 0) for skin in np.unique(table.skin[fold.test])}
@@ -440,7 +442,7 @@ TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collaps
 
 
 @given(TRAININGS)
-def test_every_attempt_of_a_training_is_counted(done):
+def test_trainings_that_were_repeated_are_counted_with_all_their_attempts(done):
     attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),

@@ -38,10 +38,10 @@ def test_scores_of_recorded_scenes_are_shown_without_those_of_the_paper():
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}, "mse_f_N2": {"mean": 1.0, "n": 2}}
     lines = summarise({"provenance": {"source": "recorded"}, "table2": {"multi": row}})
     assert "(" not in "".join(lines)
-    assert any("50" in line and "–" in line for line in lines)  # A score that is unknown is shown as a dash.
+    assert any("50" in line and "–" in line for line in lines)  # An unknown score is shown as a dash.
 
 
-def test_final_model_of_recorded_boards_is_named():
+def test_summary_names_the_final_model_of_recorded_boards():
     model = {"file": "data/models/mine/final/final.safetensors", "boards_n": 3}
     row = {"accuracy_pct": {"mean": 50.0, "n": 2}}
     for source, named in (("recorded", True), ("simulated", False)):
@@ -49,7 +49,7 @@ def test_final_model_of_recorded_boards_is_named():
         assert (model["file"] in lines[-1]) is named
 
 
-def test_methods_with_labels_are_shown_with_the_fewest_and_the_most():
+def test_summary_shows_methods_with_the_fewest_and_the_most_labels():
     def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
         scores = {"accuracy_pct": {"mean": accuracy_pct}, "r2_f": {"mean": accuracy_pct / 100}}
         return {"method": method, "inputs": "raw", "labels_n": labels_n, "as_labelled": scores}
@@ -92,7 +92,7 @@ def test_report_is_called_reproduced_only_if_it_was_computed_again(checkout):
     assert "Scene quick is reproduced: all " in run("quick")
 
 
-def test_differences_from_the_commit_are_counted_with_probable_reasons(checkout):
+def test_summary_counts_differences_from_the_committed_report_and_gives_reasons(checkout):
     scores = numbers_of("quick")["table2"]
     scores["multi"]["accuracy_pct"]["mean"] *= 0.5
     change(checkout, "numbers.json", table2=scores)
@@ -102,7 +102,7 @@ def test_differences_from_the_commit_are_counted_with_probable_reasons(checkout)
     assert "package torch 2 (committed: 1)" in output
 
 
-def test_reports_that_are_not_committed_or_missing_are_named(checkout):
+def test_summary_lists_reports_that_are_missing_or_not_committed(checkout):
     (checkout / "reports/quick").rename(checkout / "reports/mine")
     assert "Scene mine: its report is not committed" in run("mine")
     assert "Scene other: no results yet. Run: dvc repro report@other" in run("other")

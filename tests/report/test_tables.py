@@ -67,7 +67,7 @@ def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(cards), headline="paper")}
 
 
-def test_scores_are_averaged_over_boards_and_scores_of_single_skins_over_pairs():
+def test_scores_of_table_2_are_means_over_boards_or_pairs_of_skins():
     table2 = numbers()["table2"]
     spread = pytest.approx(50**0.5)
     assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": spread, "values": [80.0, 90.0]}
@@ -75,7 +75,7 @@ def test_scores_are_averaged_over_boards_and_scores_of_single_skins_over_pairs()
     assert table2["single"]["accuracy_pct"] == pairs
 
 
-def test_rows_about_readings_before_touch_follow_the_row_of_their_split():
+def test_table_has_scores_of_predictions_from_readings_before_touch():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
     predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
@@ -95,7 +95,7 @@ def test_missing_experiment_has_no_table():
     assert "null" not in json.dumps(only_single)
 
 
-def test_first_split_in_the_table_is_that_of_the_paper():
+def test_split_of_the_paper_is_first_in_the_table():
     accuracy_by_split = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
     shown = numbers(
         [card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in accuracy_by_split.items()]
@@ -114,14 +114,14 @@ def test_variants_are_in_a_separate_table():
     assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 
 
-def test_counts_of_captures_are_summed():
+def test_bytes_and_frames_of_all_captures_are_summed():
     assert add_up(COUNTS) == {
         "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
         "lost_bytes_n": 3,
     }  # fmt: skip
 
 
-def test_counts_of_captures_are_given_for_each_protocol():
+def test_lost_bytes_and_rows_are_counted_for_each_protocol():
     wear = {"accounts": COUNTS, "left_out": {}}
     losses = {
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
@@ -143,7 +143,7 @@ def test_counts_of_captures_are_given_for_each_protocol():
 def test_every_row_names_its_source():
     for source in ("simulated", "recorded"):
         tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # This is the paper's table, with one column for our skin.
+        ours = tables.pop("table1")[OURS]  # This table is table 1 of the paper, with one more column for our skin.
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
         for table in tables.values():
@@ -170,7 +170,7 @@ def test_tables_of_scores_explain_their_metric():
     assert "within 1 mm" not in to_markdown(tables["captures"])
 
 
-def test_unknown_number_is_a_dash():
+def test_table_shows_a_dash_for_an_unknown_number():
     unknown = card("single_temporal", "s0", 99.0)
     del unknown["scores"]["all"]["mse_f_N2"]
     table = make_tables(numbers([unknown]))["single_sensor"]
@@ -192,16 +192,16 @@ def test_standard_deviation_over_seeds_is_shown_with_its_meaning():
     half=st.floats(1e-4, 100),
     asymmetry=st.floats(0.3, 0.7),
 )
-def test_number_of_digits_follows_from_the_uncertainty(mean, half, asymmetry):
+def test_number_of_digits_of_a_score_follows_from_its_uncertainty(mean, half, asymmetry):
     value = {"mean": mean, "n": 6, "ci95": [mean - 2 * half * asymmetry, mean + 2 * half * (1 - asymmetry)]}
     shown, low, high = (float(text) for text in re.sub(r"[\[\],]", "", show(value)).split())
     unit = 10.0 ** -len(show(value).partition(" ")[0].partition(".")[2])
     ends = zip((shown, low, high), (mean, *value["ci95"]), strict=True)
     # All numbers have the same number of decimals.
     assert all(abs(one - exact) <= 0.5001 * unit for one, exact in ends)
-    digits = np.floor(np.log10(half / unit)) + 1  # The number of digits of half the interval.
+    digits = np.floor(np.log10(half / unit)) + 1  # This is the number of digits with which half the interval is shown.
     assert digits <= 3  # There are two digits, or three if an end of the interval would otherwise be rounded to 0.
-    # There are fewer digits only if the mean already has four.
+    # There are fewer digits only if the mean already has four digits.
     assert digits >= 2 or unit == 1 or abs(mean) > 999 * half / 10
 
 
@@ -230,7 +230,7 @@ def test_each_metric_has_a_column():
     assert {metric for row in TABLE_2.values() for metric in row} == set(PAPER_METRICS)
 
 
-def test_summary_contains_our_scores_the_papers_and_those_of_the_control():
+def test_summary_has_our_scores_beside_the_papers_and_a_row_for_the_control():
     numbers = all_experiments()
     table = summary_table(numbers).set_index(HELD_OUT)
     assert len(table) == len(numbers["table2"]) + 1
@@ -243,7 +243,7 @@ def test_summary_contains_our_scores_the_papers_and_those_of_the_control():
     assert "R² of F" in table
 
 
-def test_summary_starts_with_the_universal_model():
+def test_first_row_of_the_summary_is_the_universal_model_without_labels():
     numbers = all_experiments()
     rows = [
         {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
@@ -290,7 +290,7 @@ def test_table_1_columns_have_sources_with_years():
         assert f"{year}" in TABLE_1.columns[name]
 
 
-def test_only_reskin_meets_every_requirement():
+def test_only_reskin_meets_every_requirement_in_table_1():
     requirements = [name for name in TABLE_1.rows if name not in ("Type", "Frequency")]
     met = {
         column: all(TABLE_1.rows[name][i] == "yes" for name in requirements) for i, column in enumerate(TABLE_1.columns)
@@ -309,7 +309,7 @@ def test_table_1_contains_the_cells_of_the_paper(measured):
     assert table.iloc[-1]["property"] == LOCALISATION
 
 
-def test_settings_of_a_simulation_are_not_called_measured():
+def test_table_1_calls_numbers_of_a_simulation_settings():
     for source, rate, area in (
         (
             "simulated",
@@ -357,7 +357,7 @@ SIMULATED = described("simulated", noise_xy_uT=3.3, force_max_N=40.0, step_z_uT=
 RECORDED = described("recorded", noise_xy_uT=3.1, force_max_N=4.0)
 
 
-def test_table_of_skins_has_mean_range_and_number():
+def test_table_of_skins_gives_mean_range_and_number_of_skins():
     table = skins_table({"quick (simulated)": SIMULATED})
     assert table["quick (simulated)"].tolist() == [
         "3.3 [1.65 … 6.6] (3)",

@@ -1,6 +1,6 @@
-"""Tests of simulated captures, against the protocol and the simulated field.
+"""Tests that simulated captures agree with their protocol and with the simulated field.
 
-Further tests are about names, seeds and the terms of the physics.
+Other tests check the names of captures, random seeds, and optional terms of the physics such as ageing.
 """
 
 import numpy as np
@@ -88,7 +88,7 @@ def test_position_errors_of_the_robot_change_fields_and_not_labels():
     exact, loose = capture_of(noiseless_scene()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
     moved_uT = (frames_by_indentation(exact) - frames_by_indentation(loose))[:, READ].std()
-    assert moved_uT > 2 * 5.0  # This is twice the noise of a reading.
+    assert moved_uT > 2 * 5.0  # This limit is twice the noise of a reading.
 
 
 def test_labels_have_the_commanded_place_and_the_measured_force(capture):
@@ -141,7 +141,7 @@ def sleeve(**changes):
     return with_protocol("sleeve", SCATTER, boards=SECTIONS["boards"] | {"sleeve": SLEEVE}, **changes)
 
 
-def test_scattered_pokes_are_at_their_labels():
+def test_fields_of_scattered_pokes_are_those_at_the_labelled_places():
     scene = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
     one = capture_of(scene, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([labels_in_contact(one, "x_mm"), labels_in_contact(one, "y_mm")]).astype(float)
@@ -198,25 +198,26 @@ def test_ageing_softens_the_skin_and_moves_its_no_load_field(capture):
     early_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         0
     ]
-    # The limit is three standard deviations of noise alone: of a difference of two means of two readings with 5 uT
-    # each.
+    # Without drift, there would only be the noise of a difference of two means, each of two readings with 5 uT of
+    # noise. The limit is three standard deviations of this noise.
     assert np.abs(early_uT).max() < 12
 
 
 def test_relaxation_lowers_only_the_force(capture):
     slack = capture_of(aged_capture(relaxation=RELAXATION))
     ratio = np.median(labels_in_contact(slack, "Fz_N")[65:130] / labels_in_contact(capture, "Fz_N")[65:130])
-    # After 1 s, the two fastest terms (0.05 each) have relaxed, and at most a tenth of the third.
+    # After 1 s, the two fastest terms of the relaxation (0.05 each) and at most a tenth of the third term have relaxed.
     assert 0.88 < ratio < 0.91
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
 
-def test_warming_is_read_by_chips_and_weakens_the_field(capture):
+def test_warming_raises_chip_temperatures_and_weakens_the_field(capture):
     warm = capture_of(aged_capture(temperature=TEMPERATURE))
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
-    # The constant offset of the chips, of 200 uT, summed over 15 channels. The mean of |normal| is 0.8.
+    # Chips have constant offsets with a standard deviation of 200 uT. This is the expected sum of their magnitudes over
+    # 15 channels, because the mean of |normal| is 0.8.
     offset = 5 * 3 * 200 * 0.8
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 
@@ -241,7 +242,7 @@ def test_captures_do_not_depend_on_the_order_in_which_they_are_simulated():
     ]
 
 
-def test_skins_of_a_board_have_the_same_chips_and_different_fields(capture):
+def test_skins_of_one_board_have_different_fields(capture):
     other = capture_of(skin="b0_s1")
     # The limit is six standard deviations of the noise.
     assert not np.allclose(frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20)
@@ -253,7 +254,7 @@ def test_skin_without_magnetisation_has_no_signal():
 
 
 @pytest.mark.parametrize(("section", "name"), [("rig", "rate"), ("skin", "stickiness"), ("spreads", "chip_gian")])
-def test_unknown_parameter_is_named(section, name):
+def test_error_names_an_unknown_parameter(section, name):
     with pytest.raises(ParamsError, match=name):
         synthesis(section, **{name: 1.0})
 

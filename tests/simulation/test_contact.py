@@ -1,4 +1,7 @@
-"""Tests of the contact response against the formulas of its terms; without terms, all contacts are equal."""
+"""Tests of the contact response against the formulas of its optional terms, such as ageing.
+
+Without optional terms, all contacts must be equal.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +34,7 @@ def response(tilt=0.0, **terms):
     return simulate_response(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
 
 
-def test_without_optional_terms_all_contacts_are_equal(first):
+def test_all_contacts_are_equal_without_optional_physics_terms(first):
     one, (rest_T, change_T) = response(), first
     np.testing.assert_array_equal(one.rest_T, np.tile(rest_T, (200, 1, 1)))
     np.testing.assert_array_equal(one.change_T[:, 0], np.tile(change_T, (200, 1, 1)))
@@ -39,13 +42,13 @@ def test_without_optional_terms_all_contacts_are_equal(first):
     assert not one.force_N[:, :, :2].any()
 
 
-def test_field_fades_per_decade_of_contacts(first):
+def test_field_fades_by_the_given_fraction_per_decade_of_contacts(first):
     one = response(ageing=Ageing(settling=0.0, ageing=0.0, fading_per_decade=0.02, wandering_uT=0.0))
     # The number of decades after 100 contacts is log10(1 + 99) = 2.
     np.testing.assert_allclose(one.rest_T[99], (1 - 0.02 * 2) * first[0], rtol=1e-12)
 
 
-def test_force_softens_and_relaxes_in_every_direction():
+def test_softening_and_relaxation_reduce_all_components_of_the_force():
     ageing, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
     relaxation = Relaxation(approach_s=slack[0], hold_s=slack[1])
     plain = response(tilt=0.1, friction=Friction(coefficient=0.8))
@@ -54,14 +57,14 @@ def test_force_softens_and_relaxes_in_every_direction():
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 
 
-def test_tip_that_leans_pushes_sideways(first):
+def test_tilted_tip_causes_a_sideways_force(first):
     one = response(tilt=0.1, friction=Friction(coefficient=0.8))
     np.testing.assert_allclose(one.force_N[:, 0, 0], 0.1 * one.force_N[:, 0, 2])
     assert np.linalg.norm(one.change_T[0, 0] - first[1]) > 0.01 * np.linalg.norm(first[1])
 
 
 @pytest.mark.parametrize(("depth_mm", "deep"), [(0.5, False), (1.4, True)])
-def test_unverified_depths_are_counted(depth_mm, deep):
+def test_presses_deeper_than_the_verified_depth_are_counted(depth_mm, deep):
     tip_m = np.array([[[0.0, 0.0, depth_mm * 1e-3]]])
     one = simulate_response(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
     assert one.beyond_verified_n == deep

@@ -50,17 +50,18 @@ def test_repeated_conversions_repeat_their_noise():
     assert repeats[1] == pytest.approx(1 - 1 / 1.84, abs=0.02)  # A conversion takes 1.84 ms, and a frame 1 ms.
 
 
-def test_chip_reads_the_field_at_the_time_of_its_conversion():
+def test_chip_reads_the_field_of_an_earlier_time_because_conversion_takes_time():
     one = response()
     ramp = one.change_T[:, 0].copy()
     frames_n = len(timeline(Rig(**SECTIONS["rig"]), 1))
     found_uT = read(QUIET).b_uT.reshape(N, frames_n, CHIPS_N, 3)
-    # The first frame while the tip moves down, in which the field change is a third of the whole.
+    # Frame 5 is the first one while the tip moves down. At its time, the field change is a third of the whole change.
     share = (found_uT[:, 5] / 1e6 - one.rest_T) / ramp
     large = np.abs(ramp) > 1e-4  # One step of 0.15 uT is less than 0.002 of this change.
     assert (share[large] < 1 / 3 + 0.002).all()
     assert (share[large] > -0.01).all()
-    # The age of conversions differs between chips and between indentations.
+    # The field changes differ, because the time since the last conversion differs between chips and between
+    # indentations.
     assert share[large].max() - share[large].min() > 0.2
 
 

@@ -50,7 +50,7 @@ def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
-def test_heavier_weight_sinks_deeper():
+def test_depth_increases_with_the_weight():
     depth_m = depths_under_load(SKIN, load_steps_N(1.0, 0.02)[None])[0]
     assert depth_m[0] == -SKIN.depth_zero_m
     assert (np.diff(depth_m) > 0).all()
@@ -61,11 +61,11 @@ def test_weight_that_is_too_heavy_for_the_skin_is_refused():
         depths_under_load(SKIN, np.array([[1e4]]))
 
 
-def test_glass_is_filled_in_equal_steps():
+def test_weight_of_the_glass_increases_in_equal_steps():
     np.testing.assert_allclose(load_steps_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
 
 
-def test_protocol_of_a_filling_states_weights_instead_of_depths():
+def test_labels_of_a_filling_are_weights_and_no_depths():
     capture = capture_of("glass", GLASS)
     log = capture.probe
     assert np.isnan(log.depth_mm[log.contact]).all()
@@ -105,7 +105,7 @@ def test_logarithms_of_durations_are_uniform():
     assert stops.depth_mm.max() <= 1.2
 
 
-def test_walk_consists_of_footfalls_and_swings():
+def test_walk_has_the_given_number_of_footfalls_of_limited_duration():
     plan = Walk(**WALK | {"steps_n": 40, "terms": ()}).plan(rng_for(0, "walk"), SKIN_MM)
     down = plan.depth_mm[0] > 0
     edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))

@@ -33,7 +33,7 @@ def test_grid_pass_has_390_indentations():
 
 def test_lines_of_a_drag_are_2_mm_apart():
     plan = plan_of(DRAG)
-    assert plan.x_mm.shape == (2 * 18, 17)  # Lines along 9 rows and 9 columns, at two depths.
+    assert plan.x_mm.shape == (2 * 18, 17)  # There are lines along 9 rows and 9 columns, at two depths.
     rows, columns = slice(0, 9), slice(9, 18)
     np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
     np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])
@@ -75,7 +75,7 @@ def test_hand_protocol_has_325_pokes_without_labels():
     assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)
 
 
-def test_only_hand_pokes_are_random():
+def test_places_depend_on_the_random_generator_only_for_hand_pokes():
     for protocol, alike in ((GRID, True), (DRAG, True), (HAND, False)):
         one, other = plan_of(protocol, "one"), plan_of(protocol, "other")
         assert np.array_equal(one.x_mm, other.x_mm) == alike
@@ -112,12 +112,12 @@ def test_scattered_places_keep_a_margin_to_the_edges(skin_mm, margin_mm):
     assert not plan.tilt.any()
 
 
-def test_protocols_of_different_names_have_different_draws():
+def test_scattered_places_depend_on_the_name_of_the_protocol():
     assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
     assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
 
 
-def test_too_large_margin_is_refused():
+def test_margin_of_half_the_skin_or_more_is_refused():
     with pytest.raises(ParamsError, match="less than half of the skin's shorter side, 25.4 mm; got 25.4"):
         scattered(margin_mm=25.4)
 

@@ -1,4 +1,6 @@
-"""Tests of the simulated rig: timeline, clocks, chunks of bytes, dwells; noise and range of its force sensor."""
+"""Tests of the simulated rig: its timeline, clocks, chunks of bytes and dwells, and the noise and range of its force
+sensor.
+"""
 
 import numpy as np
 import pytest
@@ -35,7 +37,7 @@ def plan(protocol=None):
 DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
 
 
-def test_timeline_of_an_indentation_has_its_phases_in_order():
+def test_timeline_of_an_indentation_is_rest_approach_contact_and_retraction():
     frames = timeline(rig(), 1)
     np.testing.assert_allclose(frames.share, [0] * 5 + [1 / 3, 2 / 3] + [1] * 4 + [2 / 3, 1 / 3])
     assert frames.noload_i == 1
@@ -63,7 +65,7 @@ def test_chunks_contain_every_frame_once_and_never_arrive_early(chunk_frames_max
 
 
 @pytest.mark.parametrize("protocol", [None, DRAG])
-def test_dwells_contain_their_frames(protocol):
+def test_dwells_in_the_log_contain_the_frames_of_their_stops(protocol):
     settings_of_rig, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
     frames = timeline(settings_of_rig, stops_n)
@@ -89,7 +91,7 @@ def test_log_has_every_stop_of_a_line():
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 
 
-def test_robot_misses_places_by_the_given_spread():
+def test_position_errors_of_the_robot_have_the_given_standard_deviations():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))

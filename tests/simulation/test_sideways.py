@@ -1,4 +1,8 @@
-"""Tests of dragged tips: tangential forces against Coulomb's law and a spring, no friction, mirrored drags."""
+"""Tests of dragged tips.
+
+Tangential forces are compared with Coulomb's law and a spring. Other tests drag without friction, or along mirrored
+lines.
+"""
 
 from dataclasses import replace
 
@@ -42,7 +46,7 @@ def test_tip_sticks_in_a_short_drag_and_slides_in_a_long_one():
     stiffness = SKIN.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     limit_N = 0.8 * forces(SKIN, np.array([DEPTH_M]))[0]
     np.testing.assert_allclose(found, [[0, 0], [stiffness * 0.1e-3, 0], [limit_N, 0]], rtol=1e-6)
-    assert found[1, 0] < limit_N  # The tip still sticks at the first stop.
+    assert found[1, 0] < limit_N  # At the first stop, the tip does not slide yet.
 
 
 def test_drag_without_friction_equals_a_press():
@@ -84,7 +88,7 @@ def test_tip_above_the_skin_causes_no_force_and_no_field_change():
     assert not found.change_T.any()
 
 
-def test_lines_of_a_drag_do_not_influence_each_other():
+def test_force_of_a_dragged_line_does_not_depend_on_earlier_lines():
     lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
     both, second = drag(lines_m, tilt=np.zeros((2, 2))), drag(lines_m[1:])
     np.testing.assert_allclose(both.force_N[1], second.force_N[0])
@@ -97,7 +101,7 @@ def test_tangential_force_is_limited_by_friction(coefficient):
     assert (found <= coefficient * forces(SKIN, tip_m[0, :, 2]) * (1 + 1e-12)).all()
 
 
-def test_drag_equals_a_press_and_many_small_shears():
+def test_drag_equals_a_press_followed_by_many_small_shears():
     # Reference: press the material at its rest position behind the tip, then shear it in 50 steps of the force.
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
     found = drag(tip_m, coefficient=0.4)
@@ -117,7 +121,7 @@ def test_drag_equals_a_press_and_many_small_shears():
     assert np.linalg.norm(found.change_T[0, 1] - truth_T) < 0.2 * np.linalg.norm(truth_T)
 
 
-def test_drag_on_a_higher_skin_equals_a_deeper_drag():
+def test_raising_the_skin_equals_dragging_deeper():
     high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
     on_higher_skin = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
     deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
@@ -130,7 +134,7 @@ HELD = EVEN.skin.model_copy(
 )
 
 
-def test_springs_of_a_held_skin_act_in_series_with_its_shear():
+def test_springs_that_hold_the_skin_act_in_series_with_its_shear_stiffness():
     one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
     # The line passes through the middle, so the skin does not rotate.
     tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3

@@ -26,12 +26,12 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # The number of stops of a path. The finer path has twice as many.
+STOPS_N = 48  # A path has this number of stops. The finer path has twice as many.
 # Limit on a ratio: the largest change of dB between two stops on the finer path, divided by the largest change on the
 # coarse path. The ratio is 0.5 if dB is smooth, and 1 if dB jumps.
 HALVED = 0.75
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-# These drags are so short that the tip sticks.
+# These drags are so short that the tip does not begin to slide.
 short_drags_m = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))
 FEW = settings(max_examples=8, deadline=None)
 
@@ -85,7 +85,9 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
 @given(
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
-def test_friction_limits_press_and_drag_together(start_m, angle_rad, force_N, friction, lean, name_i):
+def test_sum_of_sideways_forces_of_press_and_drag_is_limited_by_friction(
+    start_m, angle_rad, force_N, friction, lean, name_i
+):
     board, skin = draw_board_and_skin(f"b{name_i}")
     assert skin.hold is not None
     drag_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
@@ -110,7 +112,7 @@ def test_tip_without_friction_does_not_move_the_skin():
 
 
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
-def test_field_changes_smoothly_while_the_tip_sinks_in_and_sticks(depth_m):
+def test_field_changes_smoothly_while_a_sticking_tip_is_pressed_deeper(depth_m):
     board, skin = draw_board_and_skin("b0")
     # The depths include one at which the shear tables change.
     deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m
@@ -132,7 +134,7 @@ def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forc
     assert fine <= HALVED * coarse
 
 
-def test_jump_of_the_field_by_a_slide_without_limit_is_detected(monkeypatch):
+def test_smoothness_check_detects_a_slide_that_friction_does_not_limit(monkeypatch):
     board, skin = draw_board_and_skin("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
@@ -158,7 +160,7 @@ def test_after_lift_off_only_the_field_memory_remains(terms):
         assert not left_uT.any()
 
 
-def test_friction_limits_only_the_slide_by_light_touches():
+def test_friction_limits_the_slide_by_light_touches_but_not_by_firm_ones():
     board, skin = draw_board_and_skin("b0")
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))

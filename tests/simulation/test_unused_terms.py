@@ -31,7 +31,7 @@ def functions_run(scene):
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
     simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # The first run computes the deformation tables.
-    shear.tabulate_depth.cache_clear()  # Otherwise, a cached result would hide a call.
+    shear.tabulate_depth.cache_clear()  # Without this, a result from the cache would hide a call.
     sys.setprofile(note)
     try:
         simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)
@@ -51,7 +51,7 @@ def test_protocol_without_optional_terms_computes_none_of_them():
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_each_term_calls_only_the_functions_that_it_needs(term):
+def test_each_physics_term_calls_only_the_functions_that_it_needs(term):
     run = functions_run(scene_with(term)) & TERM_FUNCTIONS
     assert run
     assert run <= TERMS[term][1]

@@ -1,6 +1,7 @@
 """Tests of predicting places from readings before contact.
 
-If such predictions succeed, the order of a scan or the memory of earlier presses reveals the place.
+Such predictions can succeed only if the order of a scan, the memory of earlier presses, or a magnetic tip reveals the
+place.
 """
 
 from pathlib import Path
@@ -20,7 +21,8 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
-CHANCE_MAX_PCT = 15.0  # The chance level is 1 in 64. Predictions between neighbouring places score a little more.
+# A random guess is right in 1 of 64 cases. Predictions between neighbouring places are right a little more often.
+CHANCE_MAX_PCT = 15.0
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
@@ -48,13 +50,13 @@ def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
 
 
-def test_memory_of_the_previous_press_reveals_places_in_snake_order(tmp_path):
+def test_field_memory_of_the_previous_press_reveals_the_place_in_a_snake_scan(tmp_path):
     found = score_scan(tmp_path, snake=True, memory=0.1)
     assert found["scan"] == 100.0
     assert found["noload"] > 95.0
 
 
-def test_order_of_a_snake_scan_reveals_places_even_without_memory(tmp_path):
+def test_number_of_an_indentation_reveals_its_place_in_a_snake_scan(tmp_path):
     found = score_scan(tmp_path, snake=True, memory=0.0)
     assert found["scan"] == 100.0
     assert found["noload"] < CHANCE_MAX_PCT
@@ -106,13 +108,13 @@ def test_scan_in_random_order_reveals_no_place(tmp_path):
     assert max(score_scan(tmp_path, snake=False, memory=0.1).values()) < CHANCE_MAX_PCT
 
 
-def test_numbers_of_indentations_count_from_0_in_each_pass():
+def test_indentations_are_numbered_from_0_in_each_pass():
     press = np.array([7, 7, 8, 20, 21, 21], np.int32)
     one = readings(indentation=press, pass_i=np.array([0, 0, 0, 1, 1, 1], np.int32))
     assert number_in_pass(one).tolist() == [0, 0, 1, 0, 1, 1]
 
 
-def test_rows_keep_their_numbers_if_others_are_excluded():
+def test_indentations_keep_their_numbers_if_rows_without_a_place_are_excluded():
     lost = np.array([0, np.nan, 2, 3, np.nan, 5], np.float32)
     one = readings(x_mm=lost, noload_uT=np.arange(18, dtype=np.float32).reshape(6, 3))
     scan = gather_scan([one], ALL)
@@ -120,7 +122,7 @@ def test_rows_keep_their_numbers_if_others_are_excluded():
     assert scan.noload_uT[:, 0].tolist() == [0, 6, 9, 15]
 
 
-def test_rows_before_contact_are_in_the_order_of_gathered_rows():
+def test_readings_before_contact_are_in_the_order_of_the_training_rows():
     def made(name: str, first: float) -> Readings:
         x_mm = first + np.arange(6, dtype=np.float32)
         return readings(name, x_mm=x_mm, noload_uT=np.tile(x_mm[:, None], 3))

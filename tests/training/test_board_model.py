@@ -1,6 +1,6 @@
-"""Tests of a universal model that is made for another board than the paper's.
+"""Tests of a universal model that is made for a board other than the paper's.
 
-Tested are its file, its accuracy on simulated skins, and what is refused.
+The tests cover the file of the model, its accuracy on simulated skins, and errors for invalid input.
 """
 
 import re
@@ -136,7 +136,7 @@ def test_readings_of_another_number_of_chips_are_refused(made):
         square.zero(np.zeros(12)).predict(np.zeros((1, 15)))
 
 
-def test_chips_are_in_the_order_and_axes_of_the_layout(made):
+def test_fields_of_the_model_have_the_order_and_axes_of_chips_in_the_layout(made):
     model = load_universal(file=made)
     tables, layout = model.tables, model.layout
     strongest = np.abs(tables.mean_uT[..., 5, :]).reshape(-1, 4, 3).max(axis=(0, 2))

@@ -17,8 +17,8 @@ Card = dict[str, Any]
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
     """Return a model card with one skin per board.
 
-    All scores follow from the place error, so that settings with a smaller place error have the worse accuracy and
-    force error.
+    All scores are computed from the place error, such that settings with a smaller place error have a worse accuracy
+    and a larger force error.
     """
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
@@ -58,7 +58,7 @@ def names(chosen: dict[str, Any]) -> dict[str, str]:
     return {stage: one["recipe_name"] for stage, one in chosen.items()}
 
 
-def test_smallest_place_error_is_chosen_with_the_base_of_adaptation():
+def test_settings_with_the_smallest_place_error_are_chosen():
     chosen = choose(CARDS)
     assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
     assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
@@ -102,7 +102,8 @@ def test_settings_are_compared_by_the_mean_over_boards():
 
 
 def test_scores_of_adapted_skins_are_averaged_over_boards():
-    # Board b0 has two skins (0.2, 0.4), b1 has one (0.9). The mean is (0.3 + 0.9) / 2, not the mean over three skins.
+    # Board b0 has two skins with the errors 0.2 and 0.4, and board b1 has one skin with the error 0.9. The expected
+    # mean is (0.3 + 0.9) / 2, and not the mean over three skins.
     skins = [
         adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
@@ -130,7 +131,7 @@ def test_networks_with_other_inputs_or_experiments_are_not_candidates(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
-def test_steps_and_base_are_not_settings():
+def test_chosen_settings_exclude_the_number_of_steps_and_the_base_network():
     for one in choose(CARDS).values():
         assert "steps_n" not in one["settings"]
         assert "base" not in one["settings"]
@@ -154,7 +155,7 @@ def test_choice_without_candidates_is_refused(cards, stage):
         choose(cards)
 
 
-def test_record_lists_boards_skins_and_settings():
+def test_record_of_the_choice_lists_boards_skins_and_settings():
     cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
     record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
     assert record["physics"] == "abc"
@@ -169,7 +170,7 @@ def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
 
 
-def test_candidates_must_have_the_same_number_of_steps():
+def test_choice_raises_if_candidates_differ_in_the_number_of_steps():
     slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]

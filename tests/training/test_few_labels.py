@@ -121,12 +121,12 @@ def test_there_is_one_entry_per_method_fold_and_number_of_labels():
     assert entry == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
 
 
-def test_names_of_jobs_are_unique():
+def test_all_jobs_of_the_study_have_different_names():
     names = [one.name for _, one in all_entries(STUDY, NETWORKS)]
     assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
 
 
-def test_entries_of_a_fold_have_the_same_test_and_training_rows():
+def test_all_entries_of_a_fold_have_its_test_and_training_rows():
     for entry, one in all_entries(STUDY, NETWORKS):
         assert (one.test == entry.fold.test).all()
         assert (one.train == entry.fold.train).all()
@@ -181,7 +181,7 @@ def test_labelled_pokes_are_drawn_for_each_fold():
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
-def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
+def test_smaller_set_of_labels_is_part_of_each_larger_set(seed, labels_n):
     tested_study = study(seed, labels_n=labels_n)
     tasks = few.classical_jobs(tested_study)
     rows = {(entry.fold.name, entry.labels_n): {*task.few_labels} for entry, task in tasks if "ridge" in task.name}
@@ -216,7 +216,7 @@ def test_scaler_ignores_labels_of_the_new_board():
         for name, values in pooled[entry.method.removesuffix(", adapted"), entry.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        # The labels themselves are used for training.
+        # Although the scaler ignores the labels, they are used for training.
         assert (other.few_labels.inputs != prepared.few_labels.inputs).any()
         assert len(prepared.few_labels.inputs) == READINGS_N * entry.labels_n
 
@@ -228,7 +228,7 @@ def test_fine_tuning_starts_from_the_network_of_its_fold():
         assert (base.method, base.inputs, base.fold, base.labels_n) == (entry.method, entry.inputs, entry.fold, 0)
 
 
-def test_only_listed_networks_are_adapted():
+def test_only_networks_listed_in_the_settings_are_adapted():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
         # All rows of the pool are on a line, because each of the 8 places on the 3 x 3 grid has a neighbour.

@@ -1,4 +1,4 @@
-"""Tests of the final model, which stage train_multi trains on all boards."""
+"""Tests of the final model, which stage train_multi trains on all boards of a scene."""
 
 from dataclasses import replace
 

@@ -1,3 +1,5 @@
+"""Tests of model cards, which describe trained networks and their scores."""
+
 import json
 
 import numpy as np
@@ -45,7 +47,7 @@ def test_model_card_describes_the_data_for_training_and_tests():
     assert "tuning" not in result
 
 
-def test_card_describes_the_network():
+def test_model_card_describes_the_network():
     (one,) = train_stack([pooled()], example_data())
     result = card(pooled())
     assert result["architecture"] == {name: list(values.shape) for name, values in one.weights.items()}

@@ -17,7 +17,8 @@ from tests.models.example_jobs import recipe
 
 STEPS_N = 300
 SCALING = {"paper": "standard", "released": "released"}
-TARGET_RANGE = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])  # The minimum and maximum of x (mm), y (mm) and F (N).
+# These are the minimum and maximum of x (mm), y (mm) and F (N).
+TARGET_RANGE = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])
 
 
 def train_network(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:

@@ -29,7 +29,7 @@ def model() -> Universal:
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
     """Return simulated skins near the nominal one, whose presses are at lattice points.
 
-    Errors of the law are proportional to the field.
+    Errors of the law (the simulation that gives the field change of a press) are proportional to the field.
     """
     tables, rng = model.tables, rng_for(0, "shipping")
     place_i = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))

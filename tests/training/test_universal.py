@@ -43,7 +43,7 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 FRAME = Frame(np.tile(QUARTER, (5, 1, 1)), (8.0, 7.0), mirrored=True)
 
 
-def test_converting_places_to_labels_and_back_changes_nothing():
+def test_places_and_fields_are_converted_to_the_axes_of_the_model():
     label_mm = np.array([[8.0, 7.0], [9.0, 10.0]])
     np.testing.assert_allclose(FRAME.place(label_mm), [[0, 0], [1, -3]])
     np.testing.assert_allclose(FRAME.label(FRAME.place(label_mm)), label_mm)
@@ -52,7 +52,7 @@ def test_converting_places_to_labels_and_back_changes_nothing():
 
 
 def test_recorded_readings_are_grouped_by_press():
-    # The readings of four presses. The third press has no force, and the last one is on another board.
+    # These are the readings of four presses. The third press has no force, and the last press is on another board.
     counts = [2, 150, 1, 3]
     press = np.repeat(np.arange(4), counts)
     board = np.where(press == 3, "other", "own")
@@ -113,7 +113,7 @@ def test_calibrated_likelihood_powers_give_intervals_that_cover_90_percent():
     assert best_powers((1.0, 0.5, 0.1), found) == (0.5, 0.5)
 
 
-def test_larger_misfit_widens_intervals_without_changing_estimates(nominal):
+def test_larger_misfit_widens_intervals_but_keeps_estimates(nominal):
     (fitting, _), (misfitting, tested) = (
         calibrate_to_skin_with(nominal, error) for error in (unchanged, scaled_channels)
     )
@@ -146,7 +146,7 @@ def test_errors_of_held_out_labels_lower_the_likelihood_power(exact_and_wrong_la
     assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 
-def test_single_label_is_held_out(exact_and_wrong_labels):
+def test_single_label_is_predicted_without_using_it(exact_and_wrong_labels):
     exact, misled = exact_and_wrong_labels
     (found,) = lower_by_labels(misled, 1, [Powers(0.3, 0.3)])
     (without,) = estimate(exact.with_labels(0), exact.pool.db_uT[:1], [Powers(0.3, 0.3)])

@@ -1,6 +1,6 @@
 """A synthetic skin for tests.
 
-Its fields are a simple formula, so no simulation is needed; its design is that of the real skin.
+Its fields are given by a simple formula, so that no simulation is needed. Its design is that of the real skin.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
-# Forces at which the tables give fields. Few forces suffice, because the formula is smooth in the force.
+# The tables give the fields at these forces. Few forces are enough, because the formula is smooth in the force.
 FORCES_N = np.geomspace(0.55, 9.5, 6)
 NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
 REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300

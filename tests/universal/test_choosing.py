@@ -8,7 +8,8 @@ from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expecte
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, make_tables
 
-PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # places and forces at lattice points
+# These are places and forces at lattice points.
+PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,8 @@ def test_expected_gain_equals_the_variance_removed_by_a_press(skin):
     at_mm, at_log_N = (part[at_force] for part in hypotheses.at)
     force_N = np.exp(hypotheses.log_N[3:4])
     press_uT = np.linalg.norm(hypotheses.mean_uT[at_force[i]])
-    # Covariance between the fields of a press at place i and the fields at all places, for all pairs of channels.
+    # This is the covariance between the fields of a press at place i and the fields at all places, for all pairs of
+    # channels.
     correlation = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
     covariance = slope @ skin.cov @ slope[i].T + correlation[:, None, None] * skin.error_cov
     press_covariance = covariance[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)

@@ -25,7 +25,7 @@ def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: fl
     return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network, prior_line())
 
 
-def test_mean_place_of_evenly_spread_presses_is_zero_and_labels_reduce_this_shift():
+def test_shift_to_the_middle_of_evenly_spread_presses_is_reduced_by_labels():
     """The first result is the shift that moves the mean place to the middle of the skin.
 
     Labels make this shift smaller.
@@ -50,7 +50,9 @@ def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
 
 
 def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
-    """Without a field change, all places are equally likely for the map, so the place comes from the network."""
+    """If there is no field change, all places are equally likely according to the map, so the network determines the
+    place.
+    """
     place_mm = np.array([[3.0, 2.0], [-4.0, 1.0]])
     db_uT = fields_uT(place_mm, np.array([2.0, 3.0]))
     right = evaluation(skin, db_uT, place_mm).combined(1.0)
@@ -70,7 +72,7 @@ def test_lower_likelihood_power_widens_intervals_without_changing_estimates(skin
     assert (lower.sd_mm > full.sd_mm).all()
 
 
-def test_shifted_places_are_moved_back_onto_the_area_of_the_grid():
+def test_shift_that_moves_places_back_onto_the_grid_area_is_found():
     octagon_mm = RNG.uniform(-8, 8, (2000, 2))
     octagon_mm = octagon_mm[inside(octagon_mm)]
     errors = []
@@ -81,13 +83,13 @@ def test_shifted_places_are_moved_back_onto_the_area_of_the_grid():
             moved_mm = shift_onto_area(Estimate(place_mm, np.full((65, 2), 0.5), nan, nan, nan), sd_mm=1.0)
             errors.append(moved_mm + shift_mm)
     rms_mm = np.sqrt(np.mean(np.square(errors)))
-    # For comparison: the standard error of the mean of 65 random places in the octagon, by which a shift to the mean
-    # would be wrong.
+    # For comparison, this is the standard error of the mean of 65 random places in the octagon. A shift that moves the
+    # mean place to the middle would be wrong by this distance.
     mean_mm = 4.4 / np.sqrt(65)
     assert rms_mm < 0.8 * mean_mm
 
 
-def test_shift_of_the_map_moves_all_estimated_places(skin):
+def test_shifting_the_map_shifts_all_estimated_places(skin):
     place_mm, by_mm = np.array([[3.0, 2.0], [-4.0, 1.0], [0.0, -3.0]]), np.array([0.3, -0.2])
     db_uT = fields_uT(place_mm, np.full(3, 2.0))
     before = skin.evaluator.estimate(db_uT)

@@ -98,7 +98,7 @@ def test_conditioning_on_three_days_equals_conditioning_of_a_joint_gaussian(skin
     np.testing.assert_array_equal(found.current[0], found.mean[:3])
 
 
-def test_days_between_which_nothing_changes_equal_a_single_day(skin_map, monkeypatch):
+def test_calibration_over_several_unchanged_days_equals_that_of_a_single_day(skin_map, monkeypatch):
     place_mm, force_N, db_uT, days_ago = labelled_presses()
     at_once = condition_on_labels(skin_map, place_mm, force_N, db_uT)
     # With a correlation of exactly 1, the covariance of the slides cannot be inverted.
@@ -112,7 +112,7 @@ def test_days_between_which_nothing_changes_equal_a_single_day(skin_map, monkeyp
     np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)
 
 
-def test_beginning_a_new_day_resets_only_the_slide(skin_map):
+def test_beginning_a_new_day_resets_the_slide_and_no_other_parameter(skin_map):
     known = condition_on_labels(skin_map, *labelled_presses()[:3])
     after, (mean, cov) = replace(known, labelled=None), begin_day(known).current
     np.testing.assert_array_equal(mean[:2], after.mean[:2])
@@ -148,7 +148,7 @@ def first_day(skin, tmp_path):
     return rest_uT, file
 
 
-def test_presses_of_a_new_day_show_whether_the_slide_has_changed(skin, first_day):
+def test_model_finds_from_presses_of_a_new_day_whether_the_slide_has_changed(skin, first_day):
     rest_uT, file = first_day
     same_uT, changed_uT = pokes(skin)[:5] + rest_uT, pokes(skin, OTHER_SLIDE)[:5] + rest_uT
     assert load_universal(file).slide is None
@@ -233,7 +233,7 @@ def test_files_in_the_third_format_are_read_as_calibrations_of_one_day(skin, fir
         np.testing.assert_allclose(found, value, rtol=1e-5)
 
 
-def test_too_many_or_invalid_days_are_refused(first_day, monkeypatch):
+def test_files_with_too_many_or_invalid_days_raise(first_day, monkeypatch):
     rest_uT, file = first_day
     with pytest.raises(SchemaError, match="new_day: there is no calibration of an earlier day"):
         load_universal(new_day=True)
@@ -257,7 +257,7 @@ def test_too_many_or_invalid_days_are_refused(first_day, monkeypatch):
     assert later.presses_n == 22
 
 
-def test_file_holds_as_many_days_and_labels_as_are_allowed_for_64_chips(tmp_path):
+def test_file_can_hold_the_greatest_number_of_days_and_labels_for_64_chips(tmp_path):
     channels_n, file = 3 * 64, tmp_path / "full.safetensors"
     full = CalibrationData.at_rest(np.zeros(channels_n))
     pressed_uT = np.ones((FULL_SET_N, channels_n))
@@ -279,7 +279,7 @@ def test_wrong_axes_of_the_labels_of_a_new_day_are_found(skin, first_day):
     for shift in ({}, OTHER_SLIDE):
         pressed_uT = pokes(skin, shift)[[0, 3, 6, 9, 12]] + rest_uT
         later = load_universal(file, new_day=True).zero(rest_uT, keep=True).see(pokes(skin, shift) + rest_uT)
-        assert later.label_frame is None  # There is no label of the later day yet.
+        assert later.label_frame is None  # Labels of the later day have not been passed yet.
         assert later.label(place_mm, None, pressed_uT).label_frame.log_odds < 0
         assert later.slide.same == (not shift)
         assert later.label(place_mm * [1, -1] + [0, 16], None, pressed_uT).label_frame.log_odds > 5
@@ -310,8 +310,8 @@ def test_middle_of_the_skin_found_on_the_first_day_is_kept_on_a_new_day(skin, tm
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "first.safetensors"
     inner_uT, changed_uT = pokes(skin)[[5, 6, 9, 10]] + rest_uT, pokes(skin, OTHER_SLIDE) + rest_uT
     found_mm = []
-    # All presses of the first day are on one side of the skin. With `even`, their mean place is nevertheless taken as
-    # the middle of the skin, which shifts the estimates. The new day must keep this shift.
+    # All presses of the first day are on one side of the skin. Argument `even` nevertheless takes their mean place as
+    # the middle of the skin, which shifts the estimates. The model must keep this shift on the new day.
     for even in (
         False,
         True,

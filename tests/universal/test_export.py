@@ -153,7 +153,7 @@ def check_equal(model: Universal, found: dict[str, np.ndarray], changes: dict[st
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
 @pytest.mark.parametrize("kind", LABELS_N)
-def test_c_code_equals_python(kind):
+def test_estimates_of_the_c_code_equal_those_of_python(kind):
     found = run_c(kind)
     check_equal(coarse(kind), found, readings(kind))
     db_uT, quiet_uT = with_nan(readings(kind)), sign(kind) * quiet() - coarse(kind).noload_uT
@@ -167,13 +167,13 @@ def test_c_code_equals_python(kind):
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
-def test_c_code_in_single_precision_equals_python():
+def test_estimates_of_c_code_in_single_precision_equal_those_of_python():
     kind = "few forces, moving, two networks"
     check_equal(coarse(kind), run_c(kind, "-DRESKIN_SINGLE", "-Wdouble-promotion"), readings(kind))
 
 
 @pytest.mark.parametrize("kind", LABELS_N)
-def test_onnx_model_equals_python(tmp_path, kind):
+def test_estimates_of_the_onnx_model_equal_those_of_python(tmp_path, kind):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     model, changes = coarse(kind), readings(kind)
     model.export_onnx(tmp_path / "skin.onnx", sign(kind) * quiet())
@@ -186,7 +186,7 @@ def test_onnx_model_equals_python(tmp_path, kind):
             np.testing.assert_allclose(found[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-def test_onnx_export_of_the_whole_shipped_model_equals_python(tmp_path):
+def test_estimates_of_the_whole_shipped_model_in_onnx_equal_those_of_python(tmp_path):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     model, changes = load_universal().zero(quiet()), {"presses": presses(50)[2]}
     model.export_onnx(tmp_path / "skin.onnx")

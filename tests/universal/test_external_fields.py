@@ -14,8 +14,8 @@ from tests.universal.test_shipped import PLACES_MM, pokes
 
 UNIFORM_uT = to_chips(np.tile(100.0 * np.array([[0.0, 1.0, 0.0], [0.6, 0.0, -0.8], [-1.0, 0.0, 0.0]]), 5))
 
-# Index of the force of all pokes. Their field changes then have norms of 220 to 410 uT; the norm of each uniform field,
-# over all channels, is 224 uT.
+# This is the index of the force of all pokes. At this force, field changes have norms of 220 to 410 uT over all
+# channels. The norm of each uniform field is 224 uT.
 FORCE_I = 4
 
 
@@ -33,13 +33,13 @@ def moved_mm(model: Universal, b_uT: np.ndarray) -> np.ndarray:
     return np.linalg.norm(after_mm - before_mm, axis=2)
 
 
-def test_with_the_option_a_uniform_field_of_100_uT_does_not_move_estimates():
+def test_uniform_field_of_100_uT_does_not_move_estimates_with_option_external_uT():
     with_mm, without_mm = moved_mm(*nominal(100.0)), moved_mm(*nominal(0.0))
     assert with_mm.max() < 0.2
     assert without_mm.max() > 1.0
 
 
-def test_with_the_option_estimates_in_changing_fields_are_more_accurate():
+def test_estimates_in_changing_fields_are_more_accurate_with_option_external_uT():
     places = np.column_stack([np.random.default_rng(0).uniform(3, 13, (40, 2)), np.full(40, 1.0)])
     noload_uT, b_uT, _ = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     uniform_uT = 100 * np.random.default_rng(1).standard_normal((40, 3))
@@ -50,7 +50,8 @@ def test_with_the_option_estimates_in_changing_fields_are_more_accurate():
         return float(np.median(np.linalg.norm(found[:, :2] - places[:, :2], axis=1)))
 
     assert error_mm(100.0, moving_uT) < error_mm(0.0, moving_uT)
-    # If there are no external fields, the option makes estimates less accurate, because it discards information.
+    # If there are no external fields, the option makes estimates less accurate, because a part of each field change is
+    # attributed to external fields.
     assert error_mm(0.0, b_uT) < error_mm(100.0, b_uT)
 
 
@@ -83,7 +84,7 @@ def test_estimated_external_field_is_close_to_the_true_one():
     assert np.linalg.norm(cleaned_uT[1] - cleaned_uT[0], axis=1).max() < 0.1 * np.linalg.norm(uniform_uT)
 
 
-def test_model_without_the_option_makes_no_allowance_for_external_fields():
+def test_model_makes_no_allowance_for_external_fields_without_option_external_uT():
     skin = new_map(make_tables())
     db_uT = np.random.default_rng(0).normal(0, 300, (3, 15))
     assert skin.evaluator.without_external(db_uT, skin.evaluator.evaluate(db_uT)) is db_uT
@@ -92,7 +93,7 @@ def test_model_without_the_option_makes_no_allowance_for_external_fields():
     assert "external" not in repr(load_universal())
 
 
-def test_calibration_file_can_be_used_with_the_option(tmp_path):
+def test_calibration_file_can_be_used_with_option_external_uT(tmp_path):
     """The calibration is saved without the option, and loaded with it."""
     model, b_uT = nominal(0.0)
     model.see(b_uT).save(tmp_path / "skin.safetensors")
@@ -116,7 +117,7 @@ def test_suppressor_removes_uniform_fields_given_along_the_axes_of_the_chips():
     assert np.linalg.norm(shrunk_uT, axis=1).max() < 2 * 4.0
 
 
-def test_single_precision_suffices_for_the_largest_field():
+def test_chi2_in_single_precision_is_accurate_for_the_largest_external_field():
     """chi^2 for the largest external field equals chi^2 in double precision, up to 0.1 or 1 %."""
     model, b_uT = nominal(EXTERNAL_MAX_uT)
     db_uT, skin = to_board(b_uT - model.noload_uT), model.skin

@@ -81,7 +81,8 @@ def test_estimator_with_the_smaller_residuals_is_selected(noise, expected):
 
 @pytest.fixture(scope="module")
 def calibrated() -> list[tuple]:
-    """Calibrate the shipped model to simulated skins whose errors of the law are large.
+    """Calibrate the shipped model to simulated skins with large errors of the law, which gives the field change of a
+    press.
 
     Each skin is calibrated with 0, 1 and 20 labels. Returns, for each skin and number of labels: this number, the
     errors of the log forces, and their estimated standard deviations.
@@ -114,7 +115,7 @@ def test_labels_reduce_force_errors(calibrated):
     assert rms[LABELS_N] < 0.9 * rms[0]
 
 
-def test_scatter_is_estimated_from_residuals():
+def test_scatter_of_forces_is_estimated_from_residuals():
     log_N = np.log(np.geomspace(0.5, 8, 200))
     for scatter_sd in (0.1, 1.0):
         residual = scatter_sd * rng_for(4, "force line").standard_normal(200)
@@ -169,7 +170,7 @@ def test_held_out_labels_do_not_affect_the_model_that_predicts_them(labels_n):
     assert model.line.mean[0] != before.mean[0]
 
 
-def test_known_weight_corrects_near_forces_by_the_map_and_far_forces_by_the_line():
+def test_known_weight_corrects_forces_near_its_place_and_far_from_it():
     """The map (the model of the fields of a skin) is corrected near the label only, the calibration line everywhere."""
     model, weight_N = load_universal(), 4.0
     rest_uT = to_chips(model.tables.rest_uT[None])

@@ -23,7 +23,7 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 @pytest.fixture(autouse=True)
 def small_lattice(monkeypatch):
-    # For speed, the search covers only places within 2.8 mm of the middle.
+    # To save time, the search covers only places within 2.8 mm of the middle.
     monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])
 
 
@@ -31,7 +31,7 @@ def fields_uT() -> np.ndarray:
     return simulate_uT(TRUE, COARSE_SETUP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
 
 
-def test_search_recovers_places_and_forces():
+def test_search_recovers_places_and_forces_of_simulated_presses():
     found = search(chart(TRUE, COARSE_SETUP), fields_uT())
     # The tolerance is a quarter of the lattice's pitch. The search takes a single step from the nearest lattice point,
     # with the slopes at this point, so it is not exact between lattice points.
@@ -40,7 +40,7 @@ def test_search_recovers_places_and_forces():
     assert found.residual.max() < 0.1
 
 
-def test_residuals_of_lattice_points_are_zero():
+def test_residual_is_zero_for_simulated_presses_at_lattice_points():
     known = chart(TRUE, COARSE_SETUP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
@@ -48,7 +48,7 @@ def test_residuals_of_lattice_points_are_zero():
     assert np.median(search(known, -fields_uT()).residual) > 0.5
 
 
-def test_slopes_equal_finite_differences():
+def test_slopes_of_residuals_equal_finite_differences():
     two = _JointFit(TRUE, COARSE_SETUP, fields_uT()[:2], at_rest_uT(TRUE, COARSE_SETUP).ravel())
     presses = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
     values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], presses.ravel()])

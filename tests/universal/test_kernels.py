@@ -1,4 +1,7 @@
-"""Tests of the compiled loops over hypotheses (place, force) against NumPy and, for Gaussians, closed forms."""
+"""Tests of the compiled loops over hypotheses.
+
+A hypothesis is a place with a force. References are NumPy and, for Gaussian distributions, closed forms.
+"""
 
 import numpy as np
 import pytest
@@ -40,7 +43,7 @@ def spread(of_place: np.ndarray, about_mm: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_means_equal_sums_over_all_hypotheses(power):
+def test_compiled_means_equal_sums_over_all_hypotheses(power):
     place_mm, sd_mm, force_N = means(*with_best(total()), AT, power)
     of_place = probabilities(power).sum(axis=2)
     # The tolerance covers hypotheses below e^-25 of the maximum, which the compiled loop omits.
@@ -50,7 +53,7 @@ def test_means_equal_sums_over_all_hypotheses(power):
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_product_equals_numpy_product_of_map_and_normal_distributions(power):
+def test_compiled_product_of_map_and_network_equals_that_of_numpy(power):
     rng = rng_for(1, "answers")
     normals = np.column_stack(
         [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
@@ -77,7 +80,7 @@ def test_product_of_two_gaussians_has_the_closed_form():
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
 
 
-def test_place_that_the_map_excludes_can_still_be_estimated_by_the_network():
+def test_network_can_place_a_press_where_the_map_is_certain_of_another_place():
     """Each place keeps a minimum probability, so a network that is certain of another place determines the estimate."""
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0

@@ -42,7 +42,7 @@ def test_layouts_of_the_project_can_be_simulated(name):
     assert 10 < np.abs(db_uT[1]).max() < 50_000
 
 
-def test_areas_are_scaled_and_only_octagons_lose_their_corners():
+def test_grid_is_scaled_to_the_area_and_octagons_exclude_its_corners():
     wide = law.Area(12.0, 6.0)
     np.testing.assert_array_equal(grid(wide), grid() * [1.5, 0.75])
     inner_mm = np.random.default_rng(0).uniform(-1, 1, (500, 2)) * [12.0, 6.0]
@@ -56,7 +56,7 @@ def test_areas_are_scaled_and_only_octagons_lose_their_corners():
     assert len(lattice_mm(law.Area(40.0, 40.0))) == 28
 
 
-def test_cells_of_the_quadrature_are_larger_on_larger_skins():
+def test_larger_skin_has_larger_cells_of_the_quadrature():
     large = TEXT.replace("size_mm: [20.0, 20.0]", "size_mm: [20.0, 40.0]")
     assert large != TEXT
     assert read_text(large).setup().rule == Quadrature(1.6e-3, 5)

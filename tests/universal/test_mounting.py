@@ -1,4 +1,4 @@
-"""Tests of how the model finds the orientation of a skin on its board, and of the axes of the labels' places."""
+"""Tests of how the model finds the orientation of a skin on its board, and whether the axes of labels are wrong."""
 
 from functools import cache, partial
 
@@ -27,7 +27,7 @@ PLACES_MM = np.array([[5.0, 1.0], [-2.0, 6.0], [-4.0, -3.0], [1.0, -5.0]])
 
 @cache
 def skins() -> Population:
-    """Draw simulated skins on the first call. At import, every test worker would draw them."""
+    """Draw simulated skins on the first call. If they were drawn at import, every test worker would draw them."""
     return draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, SKINS_N, rng_for(0, "mounted"))
 
 
@@ -124,10 +124,11 @@ def test_each_no_load_reading_determines_the_orientation_unless_the_user_states_
     assert load_universal().zero(-rest_uT, turned=True).zero(rest_uT, keep=True).mounting.turned
 
 
-def test_skin_is_not_assumed_turned_on_weak_evidence():
+def test_skin_is_assumed_turned_only_if_the_evidence_is_strong():
     weak_uT = -0.1 * skins().rest_uT[0].astype(float)
     found = find_mounting(TABLES, weak_uT)
-    assert 0 < -found.log_odds < LOG_ODDS_MIN  # The turned orientation is more probable, but not by enough.
+    # The turned orientation is more probable, but the log odds are below the limit at which a skin is assumed turned.
+    assert 0 < -found.log_odds < LOG_ODDS_MIN
     assert not found.turned
 
 
@@ -198,13 +199,13 @@ def test_warning_names_the_wrong_axes_of_labels(frame):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )  # fmt: skip
-def test_each_wrong_choice_of_axes_has_its_name(given, name):
+def test_wrong_axes_of_labels_are_found_and_named(given, name):
     estimate = Estimate(PLACES_MM, np.full((4, 2), 0.6), np.ones(4), np.ones(4), np.full(4, np.nan))
     found = find_label_frame(estimate, np.array([given(*place_mm) for place_mm in PLACES_MM]))
     assert found.name == name
 
 
-def test_frames_are_all_symmetries_of_a_square():
+def test_possible_label_axes_are_the_eight_symmetries_of_a_square():
     matrices = np.array([*frames().values()])
     np.testing.assert_array_equal(matrices @ matrices.transpose(0, 2, 1), np.tile(np.eye(2), (8, 1, 1)))
     assert len(np.unique(matrices.reshape(8, 4), axis=0)) == 8
@@ -224,7 +225,7 @@ def test_axes_of_too_few_labels_are_not_checked():
     assert load_universal().zero(rest_uT).label(place_mm[few], force_N[few], b_uT[few]).label_frame is None
 
 
-def test_mirrored_labels_raise_a_warning_in_the_model_and_live():
+def test_mirrored_labels_raise_a_warning_in_python_and_on_the_live_page():
     rest_uT, b_uT, place_mm, force_N = skin(2)
     mirrored_mm = place_mm[:6] * (-1, 1) + (16, 0)
     model = load_universal().zero(rest_uT).label(mirrored_mm, force_N[:6], b_uT[:6])

@@ -1,4 +1,7 @@
-"""Tests of the network, whose estimates depend on a set of presses: any number of presses (also none), in any order."""
+"""Tests of the network, whose estimates depend on a set of presses.
+
+The set may have any number of presses, or none, in any order.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ def test_order_of_presses_does_not_matter():
     assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
 
-def test_masked_press_is_ignored():
+def test_network_ignores_masked_presses():
     network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
     presses = torch.from_numpy(PRESSES_uT[None].astype(np.float32))
     kept = (torch.arange(20) < 5).float()[None]
@@ -40,7 +43,7 @@ def test_inputs_are_the_direction_and_the_log_length_of_field_changes():
     torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
 
 
-def test_disagreement_of_networks_adds_to_the_variance():
+def test_variance_of_several_networks_includes_their_disagreement():
     one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
     both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
     np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
@@ -49,7 +52,7 @@ def test_disagreement_of_networks_adds_to_the_variance():
 
 
 @pytest.mark.parametrize("chips_n", [1, 5])
-def test_weights_fit_any_number_of_chips(chips_n):
+def test_network_can_be_built_for_any_number_of_chips(chips_n):
     weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
     assert predict(
         [weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], PRESSES_uT[:, : 3 * chips_n]
@@ -57,7 +60,7 @@ def test_weights_fit_any_number_of_chips(chips_n):
 
 
 @pytest.mark.parametrize("presses_n", [0, 20])
-def test_numpy_equals_pytorch(presses_n):
+def test_network_in_numpy_equals_that_in_pytorch(presses_n):
     weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
     found = predict([weights], READ_uT, REST_uT, PRESSES_uT[:presses_n])
     read, rest, presses = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, PRESSES_uT))

@@ -26,7 +26,7 @@ from tests.universal.skins import SETUP
 COARSE = replace(SETUP, rule=COARSE_RULE)
 
 
-def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
+def test_drawn_skins_do_not_depend_on_how_many_are_drawn(monkeypatch):
     # Only one thickness and one tip are simulated, because the tables for each combination take seconds.
     monkeypatch.setattr(population, "THICKNESSES", {1.0: 1.0})
     monkeypatch.setattr(population, "TIPS", {1.0: 1.0})
@@ -39,12 +39,12 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     weighed = draw_population(
         NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(DEFAULT_FORCES, weight_N=5.0)
     )
-    # If a press with a known weight is added, the other presses stay the same.
+    # The other presses must stay the same if a press with a known weight is added.
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
 
-def test_parameters_have_the_given_spreads_and_bounds():
+def test_drawn_parameters_have_the_given_spreads_and_bounds():
     rng = rng_for(1, "laws")
     laws = [draw_law(NOMINAL, NOMINAL_SPREADS, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):

@@ -1,6 +1,6 @@
 """Tests of likelihood powers and of the variance inflation from cross-validated labels.
 
-A likelihood is raised to a power below 1 if the model's errors are correlated, so that intervals are not too narrow.
+A likelihood is raised to a power below 1, so that intervals are not too narrow if errors of the model are correlated.
 """
 
 import numpy as np
@@ -25,14 +25,14 @@ def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
 
 
 @pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])
-def test_every_label_is_held_out_once(labels_n):
+def test_cross_validation_holds_out_every_label_once(labels_n):
     parts = folds_of_labels(labels_n)
     assert sorted(i for _, held_out in parts for i in held_out) == list(range(labels_n))
     assert all(sorted([*kept, *held_out]) == list(range(labels_n)) for kept, held_out in parts)
     assert all(len(held_out) for _, held_out in parts)
 
 
-def test_variance_inflation_of_normal_residuals_is_one_and_of_doubled_residuals_four():
+def test_variance_inflation_is_1_for_normal_residuals_and_4_for_doubled_ones():
     off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
     assert variance_inflation(off) == pytest.approx(1, abs=0.01)
     assert variance_inflation(2 * off) == pytest.approx(4, rel=0.01)

@@ -9,14 +9,14 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal.map import NOISE, SHARED, fit_residual, kernel, no_residual
 
-# The places are so far apart that errors at them are not correlated.
+# The places are so far apart that errors at different places are not correlated.
 APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])
 FORCE_N = np.ones(3)
 ERRORS = rng_for(0, "missed").standard_normal((3, 15))
 
 
 @pytest.mark.parametrize("boards_n", [1, 2, 5])
-def test_prediction_from_boards_with_equal_errors_is_the_shared_part(boards_n):
+def test_errors_that_all_boards_share_are_predicted_for_a_new_board(boards_n):
     found = fit_residual([APART_MM] * boards_n, [FORCE_N] * boards_n, [ERRORS] * boards_n).at(APART_MM, np.zeros(3))
     # Expected: the conditional mean of a normal variable, given n equal values. Each value has the variance 1 + NOISE.
     # The covariance of two boards is SHARED, and so is the covariance of each board with the new board.
@@ -24,7 +24,7 @@ def test_prediction_from_boards_with_equal_errors_is_the_shared_part(boards_n):
     np.testing.assert_allclose(found, part * ERRORS, rtol=1e-9)
 
 
-def test_predicted_error_is_zero_far_from_presses_and_without_boards():
+def test_predicted_error_is_zero_far_from_presses_or_without_boards():
     far_mm = np.array([[100.0, 100.0]])
     assert np.abs(fit_residual([APART_MM], [FORCE_N], [ERRORS]).at(far_mm, np.zeros(1))).max() < 1e-9
     assert (no_residual(15).at(far_mm, np.zeros(1)) == 0).all()

@@ -85,7 +85,7 @@ def test_readings_with_a_wrong_number_of_channels_are_refused(skin):
     for b_uT, got in ((np.zeros((2, 12)), r"shape \(2, 12\)"), (np.zeros(14), "14 numbers")):
         with pytest.raises(SchemaError, match=f"b_uT has {got}.* 15 numbers per reading"):
             skin.predict(b_uT)
-    # The types of these arguments are wrong. Without type checks, a user's program can pass them.
+    # These arguments have wrong types, which a program without type checks can pass.
     for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):
         with pytest.raises(SchemaError, match="b_uT: .* is not an array of numbers"):
             inspect.unwrap(check_shape)(b_uT)
@@ -165,7 +165,7 @@ def test_repr_of_models_is_one_line(skin):
     assert "chips_m=[5, 3]" in repr(board)
 
 
-def test_presses_one_by_one_calibrate_nearly_as_presses_together(skin):
+def test_calibration_with_presses_one_by_one_is_close_to_that_with_all_at_once(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
     at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean
@@ -175,7 +175,7 @@ def test_presses_one_by_one_calibrate_nearly_as_presses_together(skin):
     assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
-def test_inconsistent_labels_lower_the_likelihood_power_until_new_labels_replace_them(skin):
+def test_inconsistent_labels_lower_the_likelihood_power_until_they_are_replaced(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
@@ -312,7 +312,7 @@ def repeated_labels(labels_n):
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
-def test_saved_skin_keeps_presses_over_the_area_and_which_forces_are_known(skin, tmp_path):
+def test_saved_skin_gives_equal_estimates_if_some_forces_are_unknown(skin, tmp_path):
     rest_uT, read_uT = to_chips(skin.tables.rest_uT[None]), pokes(skin)
     skin.zero(rest_uT).see(rest_uT + np.tile(read_uT, (4, 1)), area=True)
     skin.label(PLACES_MM[:2], None, rest_uT + read_uT[:2])

@@ -72,9 +72,10 @@ def test_presses_on_the_tabulated_skin_are_located_within_1_mm(skin):
     assert np.abs(np.log(found.force_N / force_N)).mean() < 0.3
 
 
-def test_labels_override_the_law(skin):
+def test_labelled_places_are_estimated_even_if_they_contradict_the_law(skin):
     place_mm, force_N, db_uT = presses()
-    # The labels contradict the law: each place is labelled with the field of the opposite place.
+    # The labels contradict the law (the simulated field changes), because each place is labelled with the field of the
+    # opposite place.
     wrong_uT = db_uT[::-1] * 0.9
     labelled = [12, 32, 50]
     found = condition_on_labels(skin, place_mm[labelled], force_N[labelled], wrong_uT[labelled]).evaluator.estimate(
@@ -112,7 +113,7 @@ def test_mean_of_evenly_spread_presses_determines_the_origin_of_the_places(skin)
     assert np.linalg.norm((found.mean - shifted)[:2]) < 0.5 * np.linalg.norm(shifted)
 
 
-def test_covariance_that_is_not_positive_definite_is_refused(skin):
+def test_evaluator_raises_if_a_covariance_is_not_positive_definite(skin):
     broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
     with pytest.raises(SchemaError, match="covariances of .* hypotheses .places and forces. are not positive definite"):
         _ = broken.evaluator

@@ -20,14 +20,15 @@ def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
         np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
         moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
         np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
-    # Expected slope of the amplitude. Fields are proportional to the amplitude, and the spread is that of its
-    # logarithm. Therefore the relative finite difference for a step is exp(STEP * spread) - 1, divided by STEP.
+    # This is the expected slope with respect to the amplitude. Fields are proportional to the amplitude, and its spread
+    # is that of the logarithm. Therefore the relative finite difference for a step is exp(STEP * spread) - 1, divided
+    # by STEP.
     grown = (np.exp(STEP * 0.2) - 1) / STEP
     np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
 
 
-def test_mean_law_averages_boards_but_keeps_the_designed_seat():
+def test_mean_law_has_mean_parameters_of_boards_and_the_designed_seat():
     """The seat (the position of the skin on the board) is random on each board, so its mean is not used."""
     weak, strong = replace(NOMINAL, amplitude=1.0, seat_x_mm=0.4), replace(NOMINAL, amplitude=4.0, gap_mm=2.0)
     found = mean_law([weak, strong])
@@ -36,7 +37,7 @@ def test_mean_law_averages_boards_but_keeps_the_designed_seat():
 
 
 @pytest.mark.parametrize("spreads", [RIG_SPREADS, NOMINAL_SPREADS])
-def test_perturbing_a_parameter_and_back_changes_nothing(spreads):
+def test_perturbing_a_parameter_forward_and_back_restores_it(spreads):
     assert set(spreads) <= set(asdict(NOMINAL))
     assert set(LOGARITHMIC) <= set(spreads)
     for name, spread in spreads.items():

@@ -46,11 +46,11 @@ def test_random_errors_of_the_law_have_the_given_size():
     assert off_uT.std() == pytest.approx(30.0, rel=0.05)
     same_mm = np.zeros((400, 20, 2), np.float32)
     together_uT = add_error(db_uT, same_mm, np.zeros((400, 20), np.float32), (0.3, 0.3), rng)
-    # Presses at equal places with equal forces have equal errors.
+    # Presses at equal places with equal forces must have equal errors.
     assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01
 
 
-def test_number_of_conditioning_presses_varies_from_none_to_all():
+def test_number_of_presses_shown_to_the_network_varies_from_none_to_all():
     kept_n = draw_kept(4000, rng_for(4, "kept")).sum(axis=1)
     assert (kept_n == 0).mean() == pytest.approx(0.25, abs=0.03)
     assert kept_n[kept_n > 0].min() == 1

@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
-COPY = "b3_s0"  # A copy of skin b0_s0, which is labelled as a skin of another board.
+COPY = "b3_s0"  # This skin is a copy of skin b0_s0, but is labelled as a skin of another board.
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded_scene(
@@ -132,7 +132,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # Stages write their costs to the working folder.
+    monkeypatch.chdir(tmp_path)  # The stages write a file with their run times to the working folder.
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 
@@ -188,7 +188,7 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
     assert f"tiny: {len(checks)} checks found no leak. In addition, 1 known" in capsys.readouterr().err
 
 
-def test_settings_that_affect_only_speed_need_no_record_of_their_choice(scene):
+def test_audit_needs_no_record_of_the_choice_if_settings_affect_only_speed(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in run_audit(scene))
@@ -300,7 +300,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, se
             "train_triplet", "not chosen by the study: the study chose no recipe for this stage",
         ),
     ],
-    ids=["another rate", "no choice"],
+    ids=["recipe with another rate", "no chosen recipe"],
 )  # fmt: skip
 def test_recipe_that_differs_from_the_chosen_settings_is_reported(scene, chosen, stage, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
@@ -321,7 +321,7 @@ def test_recipe_that_differs_from_the_chosen_settings_is_reported(scene, chosen,
     ],
     ids=["a network trained on the board", "test pokes", "pokes of a training skin"],
 )
-def test_adaptation_of_a_wrong_network_or_to_wrong_pokes_is_detected(scene, change, sentence):
+def test_wrong_network_or_wrong_pokes_in_an_adaptation_are_detected(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
     data = load_scene_data(scene)

@@ -29,7 +29,7 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # The noise of x, y and z in the lab recordings.
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # These are the noise levels of x, y and z in the lab recordings.
 UNSEEN = ("lobo", "sensors", "transfer")
 
 
@@ -105,14 +105,14 @@ FIRST_SKIN = LABELS.skin[LABELS.board == "b0"] == "b0_s0"
     ],
     ids=["a skin of the board", "five indentations of a skin", "one reading"],
 )
-def test_training_rows_from_the_test_side_are_detected(leak, named):
+def test_rows_of_the_test_side_that_are_used_for_training_are_detected(leak, named):
     checks = run_audit(moved_to_train(leak), LABELS, DB_uT)
     assert not passes(checks)
     assert failing(checks) == named
     assert checks[1].found == "1 of 1 test boards are also in training: b0"
 
 
-def test_reading_on_both_sides_of_a_split_within_a_skin_is_detected():
+def test_reading_used_for_both_training_and_testing_is_detected():
     rows = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides("single_random", "repeat0", rows[:100], NONE, rows[99:])
     assert failing(run_audit(fold, LABELS, DB_uT)) == ["readings", "indentations"]
@@ -130,7 +130,7 @@ def test_leak_of_the_papers_random_split_is_reported_as_known():
 
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
-def test_press_with_readings_on_both_sides_is_detected(experiment):
+def test_press_whose_readings_are_partly_training_and_partly_test_rows_is_detected(experiment):
     rows = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides(experiment, "b0_s0", rows[: 20 * READINGS_N], NONE, rows[20 * READINGS_N :])
     assert failing(run_audit(fold, LABELS, DB_uT)) == []
@@ -139,7 +139,7 @@ def test_press_with_readings_on_both_sides_is_detected(experiment):
     assert not passes(run_audit(split_indentation, LABELS, DB_uT))
 
 
-def test_pool_for_adaptation_must_be_untested_presses_of_held_out_skins():
+def test_tested_presses_and_training_skins_in_the_adaptation_pool_are_detected():
     fold = held_out(LABELS)
     pool, test = fold.test[: 10 * READINGS_N], fold.test[10 * READINGS_N :]
     assert failing(run_audit(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
@@ -160,7 +160,7 @@ def with_copy(
 
 
 @pytest.mark.parametrize(("sd_uT", "factor"), [(0, 1), (3, 1), (5, 1), (5, 1.05), (3, 0.9), (0, 1.3)])
-def test_copy_of_another_skin_with_noise_or_another_factor_is_detected(sd_uT, factor):
+def test_noisy_or_scaled_copy_of_another_skin_is_detected(sd_uT, factor):
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=sd_uT, factor=factor)
     checks = run_audit(held_out(LABELS), LABELS, planted)
     assert failing(checks) == ["copies"]
@@ -169,7 +169,7 @@ def test_copy_of_another_skin_with_noise_or_another_factor_is_detected(sd_uT, fa
     assert not passes(checks)
 
 
-def test_copied_capture_is_detected_among_others():
+def test_single_copied_capture_of_a_skin_with_several_captures_is_detected():
     copy_rows, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
     few = copy_rows[: 8 * READINGS_N]
     capture = LABELS.capture.astype("U20")
@@ -182,7 +182,7 @@ def test_copied_capture_is_detected_among_others():
     assert not check.holds
 
 
-def test_copy_is_detected_if_only_a_sample_of_presses_is_compared(monkeypatch):
+def test_copy_is_detected_although_only_a_sample_of_presses_is_compared(monkeypatch):
     monkeypatch.setattr(audit, "PAIRS_MAX_N", 12_000)
     monkeypatch.setattr(audit, "SAMPLE_MIN_N", 1)
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
@@ -213,7 +213,7 @@ def test_fields_rotated_by_ten_degrees_are_not_a_copy():
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_skins_whose_fields_are_within_the_noise_cannot_be_checked_for_copies():
+def test_audit_reports_that_skins_with_too_weak_fields_were_not_checked_for_copies():
     checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
     assert checks[-1].found == "not checked, because no field change exceeds 153 µT: b0_s1"
@@ -228,14 +228,14 @@ def test_skins_whose_fields_are_within_the_noise_cannot_be_checked_for_copies():
 def test_result_of_the_audit_does_not_depend_on_the_order_of_rows(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    new_index = np.argsort(order)  # Maps the old index of each row to its new index.
+    new_index = np.argsort(order)  # This array maps the old index of each row to its new index.
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=new_index[fold.train], test=new_index[fold.test])
     assert run_audit(moved, shuffled, db_uT[order]) == run_audit(fold, LABELS, db_uT)
 
 
-def test_nearest_ray_has_the_smallest_angle_to_the_row(monkeypatch):
+def test_nearest_field_is_the_one_with_the_most_similar_direction(monkeypatch):
     # The pairs are processed in several chunks, because a chunk holds only 100 pairs.
     monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)
     rng = rng_for(2, "rays")
@@ -248,7 +248,7 @@ def test_nearest_ray_has_the_smallest_angle_to_the_row(monkeypatch):
         assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)
 
 
-def test_lab_recordings_pass_and_a_planted_copy_fails(shared_data):
+def test_audit_passes_lab_recordings_but_detects_a_copy_that_is_planted_in_them(shared_data):
     frames = {
         board: pd.concat([pd.read_csv(shared_data / f"lab/{board}_depth{i}.csv").assign(depth_i=i) for i in (1, 3)])
         for board in ("board1", "board2")
@@ -269,7 +269,7 @@ def test_lab_recordings_pass_and_a_planted_copy_fails(shared_data):
 
 
 @pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
-def test_fold_with_an_empty_side_or_an_unknown_experiment_is_refused(experiment):
+def test_audit_raises_if_a_fold_has_no_test_rows_or_an_unknown_experiment(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "one side of the fold has no rows: 720 to train on, 0",
@@ -292,7 +292,7 @@ def scaler_check(arrays, fold: Sides, db_uT: np.ndarray, scaling: str):
 @pytest.mark.parametrize("scaling", list(FIT))
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_scaler_of_training_rows_passes(scaling, draw):
+def test_scaler_fitted_to_the_training_rows_passes(scaling, draw):
     fold = held_out(LABELS)
     train = rng_for(draw, "order").permutation(fold.train)
     assert scaler_check(FIT[scaling](DB_uT[train], TARGET[train]).arrays(), fold, DB_uT, scaling).holds
@@ -332,7 +332,7 @@ def test_scaler_that_differs_only_by_rounding_passes():
     assert scaler_check(rounded, fold, DB_uT, "standard").holds
 
 
-def test_scaler_fitted_to_both_sides_is_detected_even_if_it_is_close():
+def test_scaler_fitted_to_all_rows_is_detected_although_it_differs_by_less_than_1e_7():
     fold = held_out(LABELS)
 
     def fit(db_uT, target):
@@ -347,7 +347,7 @@ def test_scaler_fitted_to_both_sides_is_detected_even_if_it_is_close():
     assert not check.holds
 
 
-def test_scaler_with_nan_fails_and_scaler_without_an_array_is_refused():
+def test_scaler_with_nan_fails_the_check_and_a_missing_array_raises():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
@@ -369,7 +369,7 @@ def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 
-def test_settings_chosen_with_another_seed_pass():
+def test_settings_that_were_chosen_in_a_run_with_another_seed_pass():
     assert failing(choice_checks()) == []
     assert failing(choice_checks(source="recorded")) == []
 
@@ -396,7 +396,7 @@ def test_recipe_that_differs_from_the_chosen_settings_is_reported(recipe, found)
     assert checks[-1].found == f"not chosen by the study: {found}"
 
 
-def test_missing_record_of_the_choice_is_reported_and_a_broken_one_is_refused():
+def test_missing_choice_is_reported_and_a_choice_without_skins_raises():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
     assert checks[-1].found == "not chosen by the study: the study chose no recipe for this stage"

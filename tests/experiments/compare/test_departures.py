@@ -48,18 +48,18 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(real):
     assert find_departure([real], SECTION, DESIGN) is None
 
 
-def test_exchanged_chips_are_named(real):
+def test_exchanged_chips_are_reported(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
     assert find_departure([swapped], SECTION, DESIGN) == "Contrary to the scene, chips 1 and 2 are exchanged."
 
 
-def test_mirrored_labels_are_named(real):
+def test_mirrored_labels_are_reported(real):
     mirrored = replace(real, y_mm=16 - real.y_mm)
     assert find_departure([mirrored], SECTION, DESIGN) == "Contrary to the scene, the labels are mirrored along y."
 
 
-def test_captures_with_missing_data_have_no_departure(real):
+def test_no_departure_is_reported_without_places_or_with_too_few_presses(real):
     unknown = np.full(len(real), np.nan, np.float32)
     few = select(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
@@ -69,14 +69,14 @@ def test_captures_with_missing_data_have_no_departure(real):
         find_departure([fewer_chips], SECTION, DESIGN)
 
 
-def test_orientation_is_found_without_forces(real):
+def test_mirrored_labels_are_reported_although_forces_are_unknown(real):
     unknown = np.full(len(real), np.nan, np.float32)
     assert find_departure([replace(real, Fz_N=unknown)], SECTION, DESIGN) is None
     mirrored = replace(real, Fz_N=unknown, y_mm=16 - real.y_mm)
     assert find_departure([mirrored], SECTION, DESIGN) == "Contrary to the scene, the labels are mirrored along y."
 
 
-# The layout of a square board with four chips, as the file of a scene states it.
+# This is the layout of a square board with four chips, as it is written in the file of a scene.
 SQUARE = read_yaml(FOLDER / "reskin.yaml") | {
     "name": "square",
     "centre_mm": [10.0, 12.0],

@@ -41,8 +41,8 @@ SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"]
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
-# The tolerances are the errors of a fit to 50 presses with 3 uT of noise. Those of gap and amplitude are large, because
-# an error of one compensates an error of the other.
+# The tolerances are the errors of a fit to 50 presses with 3 uT of noise. The tolerances of gap and amplitude are
+# large, because an error of the gap can be compensated by an error of the amplitude.
 TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 ROTATIONS = chip_rotations(SECTION)
 
@@ -92,20 +92,20 @@ def test_recording_that_agrees_with_the_scene_has_no_departure(recorded):
     assert sentence(recorded) == "Labels, chips and skin are oriented as the scene states."
 
 
-def test_exchanged_chips_are_named(recorded):
+def test_exchanged_chips_are_reported(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
     assert sentence(swapped) == "Contrary to the scene, chips 1 and 2 are exchanged."
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_axis_along_which_all_chips_are_mirrored_is_named(recorded, axis):
+def test_axis_along_which_all_chips_are_mirrored_is_reported(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
         f"Contrary to the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
-def test_rotated_chip_is_named(recorded):
+def test_rotated_chip_is_reported(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
@@ -114,7 +114,7 @@ def test_rotated_chip_is_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
+def test_axis_along_which_labels_are_mirrored_is_reported(recorded, axis):
     place_mm = recorded.place_mm.copy()
     place_mm[:, axis] = 16.0 - place_mm[:, axis]
     assert sentence(replace(recorded, place_mm=place_mm)) == (
@@ -122,7 +122,7 @@ def test_axis_along_which_labels_are_mirrored_is_named(recorded, axis):
     )
 
 
-def test_skin_with_exchanged_poles_is_named(recorded):
+def test_skin_with_exchanged_poles_is_reported(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
     assert sentence(flipped) == "Contrary to the scene, the skin is flipped: every field has the opposite sign."
 
@@ -146,7 +146,7 @@ def test_flipped_checkerboard_skin_equals_the_skin_rotated_by_a_quarter_turn():
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
-def test_law_without_slide_equals_the_nominal_skin():
+def test_fields_of_the_law_without_slide_equal_those_of_the_nominal_skin():
     plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
@@ -159,13 +159,13 @@ def test_law_without_slide_equals_the_nominal_skin():
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
-def test_presses_beyond_the_greatest_depth_are_counted_and_computed_at_this_depth():
+def test_presses_deeper_than_the_greatest_depth_get_the_field_of_this_depth():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
     layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    # The slide is switched off. Otherwise, the field would change with the force even at a constant depth.
+    # The skin does not slide here, because the slide would change the field with the force even at a constant depth.
     without_slide = replace(TRUE, away_um_mm=0.0)
     held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
     # A skin with half the modulus is indented as deeply by half the force.
@@ -174,12 +174,12 @@ def test_presses_beyond_the_greatest_depth_are_counted_and_computed_at_this_dept
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 
 
-def test_presses_beyond_the_force_curve_of_the_nominal_skin_are_counted():
+def test_presses_harder_than_the_largest_force_of_the_nominal_skin_are_counted():
     known_N, _ = law._nominal_curve(SETUP)
     assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
 
 
-def test_cosine_explained_part_and_growth_of_simple_fields():
+def test_measures_of_agreement_have_the_expected_values_for_simple_fields():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
     assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
@@ -240,7 +240,7 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
 
 
 @pytest.mark.skipif(not FULL, reason="slow: run `make bench`")
-def test_fit_to_a_third_of_the_places_predicts_all_places(real):
+def test_simulation_fitted_at_a_third_of_the_places_agrees_at_all_places(real):
     # Parameters are fitted to a third of the places (22 of 65 in each of three recordings). With them, the simulation
     # must agree with the presses at all places.
     third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
@@ -268,7 +268,7 @@ def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_is_estimated_from_recordings_and_from_simulations(real):
+def test_field_memory_is_5_to_8_percent_in_recordings_and_as_set_in_the_simulation(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
         fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]

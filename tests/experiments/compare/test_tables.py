@@ -46,7 +46,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_table_compares_simulations_with_bounds():
+def test_table_says_whether_each_simulation_is_within_the_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
@@ -58,7 +58,7 @@ def test_table_compares_simulations_with_bounds():
         assert words in table.attrs["meaning"]
 
 
-def test_table_for_one_board_with_equal_forces_has_no_growth_and_no_second_fit():
+def test_table_omits_growth_and_second_fit_for_one_board_with_equal_forces():
     alone = copy.deepcopy(BOARD)
     for section in (alone, alone["nominal"]):
         del section["growth"]

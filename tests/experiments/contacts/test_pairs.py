@@ -1,6 +1,6 @@
 """Tests of readings of two contacts, which are made by adding the field changes of two presses.
 
-Further tests are about predictions for such readings, and about thresholds for detecting them.
+Other tests check predictions for such readings, and the thresholds above which a reading counts as two contacts.
 """
 
 from dataclasses import replace
@@ -90,7 +90,7 @@ def contacts_of(*rows):
     return np.array(rows, np.float32)
 
 
-def test_prediction_is_compared_with_two_known_contacts():
+def test_distances_and_forces_of_a_prediction_are_relative_to_both_contacts():
     weaker, stronger = contacts_of([0, 0, 1], [0, 0, 1]), contacts_of([4, 0, 3], [0, 8, 3])
     predicted = contacts_of([3, 0.5, 4], [0, 5, 2])
     numbers = compare_prediction(weaker, stronger, predicted)
@@ -104,7 +104,7 @@ def test_prediction_is_compared_with_two_known_contacts():
 
 
 @given(st.floats(-1, 2), st.floats(-5, 5))
-def test_perpendicular_offset_does_not_change_the_position_along_the_line(share, aside_mm):
+def test_moving_a_prediction_sideways_keeps_its_position_along_the_line_of_contacts(share, aside_mm):
     weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
     predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
@@ -120,13 +120,13 @@ def test_perpendicular_offset_does_not_change_the_position_along_the_line(share,
         (["b0", "b0", "b0"], ["s0", "s0", "s0"], [0, 1, 2], [2], "pass"),
     ],
 )
-def test_thresholds_are_fitted_to_another_board_or_skin_or_pass(boards, skins, passes, aside, what):
+def test_rows_for_thresholds_are_of_another_board_or_else_another_skin_or_pass(boards, skins, passes, aside, what):
     fit, kept, unit = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
     assert (kept.tolist(), unit) == (aside, what)
     assert sorted([*fit, *kept]) == [0, 1, 2]
 
 
-def test_thresholds_from_a_single_pass_of_one_skin_are_refused():
+def test_fitting_thresholds_raises_if_all_rows_are_of_one_pass_of_one_skin():
     with pytest.raises(ParamsError, match="of a single board, skin and pass"):
         keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
 
@@ -135,7 +135,7 @@ def scores(name, shift=0.0, n=400):
     return {"odd": rng_for(0, "scores", name).normal(shift, 1, n)}
 
 
-def test_thresholds_depend_only_on_contacts_that_are_set_aside():
+def test_detection_threshold_does_not_depend_on_the_tested_single_contacts():
     aside, double = scores("aside"), {0.0: scores("same"), 4.0: scores("four", 2)}
     one = detection_rates(aside, scores("single"), double, 0.1)
     other = detection_rates(aside, scores("single", 5), double, 0.1)
@@ -143,14 +143,14 @@ def test_thresholds_depend_only_on_contacts_that_are_set_aside():
     assert detection_rates(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
 
 
-def test_overall_roc_area_excludes_pairs_at_one_place():
+def test_overall_roc_area_excludes_pairs_whose_contacts_are_at_the_same_place():
     single, separated = scores("single"), scores("four", 2)
     found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: separated}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]
     assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
 
 
-def test_nested_numbers_are_averaged_over_boards():
+def test_numbers_in_nested_dicts_are_averaged_over_boards():
     trees = [{"a": {"b": 1.0}, "c": 4.0}, {"a": {"b": 3.0}, "c": 6.0}]
     assert summarise_nested(trees) == {
         "a": {"b": {"mean": 2.0, "n": 2, "sd": pytest.approx(np.sqrt(2)), "values": [1.0, 3.0]}},

@@ -23,8 +23,8 @@ def scene_data():
     rows = tables.rows(boards, [f"{board}_s0" for board in boards])
     force_N = rng_for(0, "forces").uniform(0.5, 3, len(boards))
     places_mm = np.tile(points_mm(), (12, 1))
-    # Each of nine channels reads the force, multiplied by a weight that falls with the distance between the contact and
-    # a place of the channel.
+    # Each of nine channels has a place. It reads the force of a contact, multiplied by a weight that falls with the
+    # distance between the contact and this place.
     spots_mm = np.array([[x, y] for x in (2, 8, 14) for y in (2, 8, 14)])
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
@@ -69,7 +69,7 @@ def test_predicted_place_is_between_the_contacts_and_nearer_to_the_stronger_one(
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
-def test_disagreement_between_networks_is_undefined_for_one_network():
+def test_disagreement_of_networks_is_omitted_if_there_is_only_one_network():
     assert "networks disagree" not in NUMBERS["auc"]
     numbers, _ = evaluate_board(
         DATA, FOLD, SECTION, [nearest_neighbour(DATA), lambda db_uT: nearest_neighbour(DATA)(-db_uT)]

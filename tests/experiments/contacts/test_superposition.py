@@ -60,7 +60,7 @@ def test_superposition_error_falls_with_distance_and_rises_with_depth():
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]
 
 
-def test_field_of_two_contacts_is_caused_by_both():
+def test_field_of_two_distant_contacts_is_nearly_the_sum_of_both_fields():
     a_m, b_m = (-5e-3, 0, DEPTH_M), (5e-3, 1e-3, DEPTH_M)
     together_T = pressed_T(a_m, b_m)
     for one_m in (a_m, b_m):
@@ -71,6 +71,6 @@ def test_field_of_two_contacts_is_caused_by_both():
 def test_moments_rotated_by_two_contacts_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
     length, before = (np.linalg.norm(vectors, axis=1) for vectors in (moments, SKIN.moments_A_m2))
-    # The tolerance is that of interpolation between two rotated vectors, which follows a chord. The result is too short
-    # by up to the squared angle divided by 8.
+    # The interpolation between two rotated vectors follows a chord instead of an arc, so its result is too short by up
+    # to the squared angle divided by 8. The tolerance allows for this.
     np.testing.assert_allclose(length, before, rtol=0.05)

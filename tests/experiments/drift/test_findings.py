@@ -1,3 +1,8 @@
+"""Tests of the verdicts on the paper's findings about drift.
+
+A policy says when no-load readings are taken: once at the start (initial), regularly, or before each contact.
+"""
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,7 +18,7 @@ LATE = {
     "network_board": ["b0", "b1", "b2", "b3"],
 }  # fmt: skip
 CONTACTS_N = [5000, 10_000, 15_000, 20_000]
-BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # Relative differences between the errors of four networks, one per board.
+BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # The errors of four networks, one per board, differ by these fractions.
 
 
 def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True) -> dict[str, np.ndarray]:
@@ -40,7 +45,7 @@ def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
     return {name: one["verdict"] for name, one in findings_by_name(networks, late).items()}
 
 
-def test_all_findings_are_supported_by_errors_like_those_of_the_paper():
+def test_all_findings_are_supported_if_errors_are_like_those_of_the_paper():
     assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
     assert all(one["holds"] for one in findings_by_name(PAPER).values())
 
@@ -61,9 +66,9 @@ def test_finding_is_contradicted_by_significant_opposite_errors(finding, changed
 
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
-def test_finding_is_undecided_if_boards_disagree(finding):
-    # Factors of the difference between two policies, one per board. Their mean agrees with the paper, but one has the
-    # opposite sign.
+def test_finding_is_undecided_if_one_board_contradicts_the_others(finding):
+    # On each board, the difference between two policies is multiplied by one of these factors. The mean of the factors
+    # agrees with the finding of the paper, but one factor has the opposite sign.
     signs = (-1.0, 1.2, 0.3, 0.1)
     near = errors(0.2, 0.01)
     disagreeing = {
@@ -81,7 +86,7 @@ def test_findings_from_a_single_network_have_no_verdict():
     assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
 
 
-def test_findings_from_networks_of_one_board_have_no_verdict_over_boards():
+def test_findings_have_a_verdict_over_networks_only_if_all_networks_are_of_one_board():
     one_board = findings_by_name(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in one_board.values()} == {SUPPORTED}
@@ -113,8 +118,9 @@ def test_no_load_policies_are_compared_by_the_mean_over_all_windows():
     assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
-def test_errors_common_to_two_policies_cancel_in_paired_differences():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # Errors of each network that are equal under both policies.
+def test_errors_that_two_policies_share_do_not_affect_their_paired_difference():
+    # These errors are added to those of each network under both policies.
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]
     regular = {name: values + shared for name, values in PAPER["regular"].items()}
     each_contact = {name: values + shared for name, values in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE] == SUPPORTED
@@ -128,7 +134,7 @@ def test_errors_common_to_two_policies_cancel_in_paired_differences():
     ("bias_N", "se_N", "networks_N", "verdict"),
     [
         (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], SUPPORTED),
-        # The bias is only two standard errors, where the standard error is that over indentations.
+        # The bias is less than two standard errors over indentations.
         (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),
         (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
         (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),
@@ -163,7 +169,7 @@ def test_growth_of_errors_equals_the_slope_of_numpys_linear_fit(values):
     assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)
 
 
-def test_text_of_a_finding_has_both_policies_their_difference_and_its_interval():
+def test_text_of_a_finding_states_both_errors_and_the_interval_of_their_difference():
     first, offset, third, late = (one["measured"] for one in findings_by_name(PAPER).values())
     assert first.startswith("MSE_xy, mean over windows: initial 1.75, regular 0.215, difference +1.5 [")
     assert "MSE_xy, growth in 10,000 contacts: initial 1, regular 0.02, difference +0.98 [" in first

@@ -75,7 +75,7 @@ def drift_section(scene: dict[str, Any]) -> Drift:
     return scene["settings"].section(Drift, "drift")
 
 
-def test_on_a_drifting_skin_the_no_load_reading_from_the_start_has_the_largest_errors(scene, tmp_path):
+def test_errors_are_largest_with_the_no_load_reading_from_the_start_if_the_skin_drifts(scene, tmp_path):
     drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
@@ -93,7 +93,7 @@ def test_on_a_drifting_skin_the_no_load_reading_from_the_start_has_the_largest_e
     assert off_uT["regular"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(ranks**2.0)), rel=1e-3)
     last = {policy: numbers[policy][-1]["mse_xy_mm2"] for policy in off_uT}
     assert last["initial"] > 2 * max(last["regular"], last["each"])
-    # The skin does not soften, so all of the force is left.
+    # The skin does not soften, so the force at a given depth stays at 100 % of the early force.
     assert numbers["late"]["force_left_pct"] == pytest.approx(100)
     assert numbers["late"]["indentations_n"] == len(results["drawn"]["late"]["true_N"]) == 30
     assert len(numbers["late"]["network_bias_N"]) == 2
@@ -140,7 +140,7 @@ def test_captures_of_unknown_order_or_too_few_contacts_are_refused(scene, tmp_pa
     assert not (tmp_path / ".reskin").exists()
 
 
-def test_variation_recovers_the_drift_and_the_gain_of_a_skin(scene, tmp_path):
+def test_experiment_variation_recovers_the_known_drift_and_gain_of_skins(scene, tmp_path):
     wear = write(tmp_path / "wear", capture("s0-wear"))
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
@@ -150,7 +150,7 @@ def test_variation_recovers_the_drift_and_the_gain_of_a_skin(scene, tmp_path):
     assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
     # The plotted visits are those within the first 200 contacts.
     assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)
-    # The relative tolerance is for temperatures, which are in single precision.
+    # The relative tolerance allows for temperatures in single precision.
     assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)
     for place in results["numbers"]["places"]:
         # There are three passes. Two of them visit the place within the first 200 contacts.
@@ -158,7 +158,7 @@ def test_variation_recovers_the_drift_and_the_gain_of_a_skin(scene, tmp_path):
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
         # The tolerance is the rounding of fields of 1000 uT to single precision.
         assert place["time"]["db_change_uT"] < 1e-3
-        assert place["skins"]["skins"] == ["s0", "s1"]  # The first skin of each board.
+        assert place["skins"]["skins"] == ["s0", "s1"]  # Only the first skin of each board is plotted.
         # The second skin has 1.5 times the field of the first, so the two fields differ by half the weaker one. The
         # spread is relative to the rms of both fields.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
@@ -179,12 +179,12 @@ def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
     return (further.noload_uT - line.noload_uT)[::2].astype(float)
 
 
-def test_added_random_walk_starts_after_the_training_contacts_and_grows_with_their_root():
+def test_added_random_walk_grows_with_the_root_of_the_contacts_after_training():
     walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
     assert np.abs(walk[:AFTER_N]).max() == 0
     for contacts_n in (1, 16, 256):
         rms_uT = np.sqrt((walk[AFTER_N - 1 + contacts_n] ** 2).mean())
-        # The tolerance is for an rms over 300 walks.
+        # The tolerance allows for the sampling error of an rms over 300 random walks.
         assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)
 
 

@@ -1,3 +1,5 @@
+"""Tests of the tables and figures of experiment drift."""
+
 import re
 import xml.etree.ElementTree as ET
 
@@ -45,7 +47,7 @@ DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_table_has_a_row_per_window_with_all_policies_beside_each_other(source):
+def test_table_has_one_row_per_window_and_columns_for_each_policy(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
     assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02000 ± 0.00040"] * 2
@@ -89,7 +91,7 @@ def test_note_states_the_time_per_contact():
     assert "The times of the contacts are not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
-def test_note_states_over_what_standard_deviations_are_taken():
+def test_note_says_whether_standard_deviations_are_over_seeds_or_skins():
     text = to_markdown(tables(numbers(), "simulated")["drift"])
     assert "± is the standard deviation over 2 network seeds, all tested on the same contacts." in text
     text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])

@@ -1,3 +1,5 @@
+"""Tests of the scores of experiment drift in windows, which are groups of successive contacts of a skin."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -54,7 +56,7 @@ def test_errors_in_a_window_have_a_mean_and_a_standard_deviation_over_skins_and_
     assert row["contacts_n"] == 5000
 
 
-def test_without_forces_there_is_no_force_error_and_for_one_network_no_standard_deviation():
+def test_window_of_one_network_without_forces_has_no_force_error_and_no_spread():
     true = predictions().true.copy()
     true[:, 2] = np.nan
     [row] = window_means(score_windows([predictions(true=true)]), "each")
@@ -111,7 +113,7 @@ def test_remaining_force_compares_readings_at_equal_places_and_depths(left, orde
     assert force_left(early, late) == pytest.approx(100 * left, rel=1e-6)
 
 
-def test_remaining_force_without_repeated_places_is_unknown():
+def test_remaining_force_is_unknown_if_no_place_is_visited_twice():
     assert force_left(readings_at([[0, 0, 1]], [1]), readings_at([[0, 0, 2]], [1])) is None
     assert force_left(readings_at([[0, 0, np.nan]], [1]), readings_at([[0, 0, np.nan]], [1])) is None
 
@@ -158,7 +160,7 @@ def test_forces_in_the_late_window_are_kept_per_seed_and_plotted_for_the_first_s
     assert plotted == points(contact_forces([high]))
 
 
-def test_last_window_has_standard_deviations_over_seeds():
+def test_standard_deviation_of_the_last_window_is_over_the_seeds_of_each_skin():
     networks = [predictions(skin=skin, seed_i=seed_i) for skin in ("s0", "s1") for seed_i in (0, 1, 2)]
     mse_N2 = np.array([score(one.true, one.predicted)["mse_f_N2"] for one in networks]).reshape(2, 3)
     found = last_window(score_windows(networks), "each")["mse_f_N2"]
@@ -180,7 +182,7 @@ def test_recording_without_clock_has_no_time_per_contact():
     assert pace([timed_readings([0, 1], [np.nan, np.nan])]) == {}
 
 
-def test_field_sizes_exclude_rows_without_contact():
+def test_size_of_contact_fields_is_computed_from_rows_in_contact_only():
     rng = rng_for(0, "field")
     noload_uT = rng.normal(0, 1.5, (4000, 15)).astype(np.float32) + np.linspace(0, 100, 4000, dtype=np.float32)[:, None]
     x_mm = np.where(np.arange(4000) % 2, 3, np.nan).astype(np.float32)

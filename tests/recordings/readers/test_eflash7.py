@@ -12,13 +12,13 @@ from reskin.recordings.readers import eflash7
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 2
-STEP_uT = 2.4  # The smallest step (LSB) of the recorded chips along x and y.
+STEP_uT = 2.4  # The readings of the recorded chips along x and y are multiples of this step (LSB).
 FIELDS = [f"mag{chip}_{axis}" for chip in range(CHIPS_N) for axis in "xyz"]
 NAMES = ["timestamp", "position", "x_pos", "y_pos", "fx", "fy", "fz", "tx", *FIELDS]
 NAMES_OF_TWO = ["timestamp", "fz", "ty", "pos1_x", "pos1_y", "pos2_x", "pos2_y", *FIELDS]
 HEADER = make_header(layout="eflash7", chips_n=CHIPS_N, contacts_before_n=7)
-# The field of each row, in steps. The rows are: no touch, a touch, no touch, and a touch that begins with a row of
-# zeros (None).
+# These are the fields of the rows, in steps. In order of the rows, there is no touch, a touch, no touch, and a touch
+# that begins with a row of zeros (None).
 LEVELS = [0, 1, 0, 1, 0, 1, 40, 80, 41, 2, 1, None, 90]
 GAUGE_N = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, -0.9, -1.9, -0.9, 0.1, 0.1, -0.4, -2.4]
 
@@ -54,7 +54,7 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_rows_from_the_first_touch_on_become_readings(tmp_path: Path) -> None:
+def test_readings_begin_with_the_first_touch(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.t_s.tolist() == [100.6, 100.7, 100.8, 100.9, 101.0, 101.2]
     np.testing.assert_allclose(readings.b_uT[:, 0], STEP_uT * np.array([41, 81, 42, 3, 2, 91]), rtol=1e-6)
@@ -77,7 +77,7 @@ def test_row_numbers_of_faults_count_the_rows_of_the_file(tmp_path: Path) -> Non
     assert account["fault_failed_read_first_row"] == account["fault_failed_read_last_row"] == len(ONE)
 
 
-def test_zeros_of_one_chip_are_counted_apart_from_zeros_of_all_chips(tmp_path: Path) -> None:
+def test_rows_of_zeros_are_counted_separately_for_one_chip_and_for_all_chips(tmp_path: Path) -> None:
     one_chip = ",".join([*ONE[-1].split(",")[:-3], "0.0", "0.0", "0.0"])
     _, account = eflash7.read(write(tmp_path, [*ONE[:-1], one_chip]), HEADER, DEFAULT_POLICY)
     assert (account["fault_zeros_of_all_chips_dropped_n"], account["fault_zeros_dropped_n"]) == (1, 1)
@@ -107,14 +107,14 @@ def test_numbered_places_have_no_coordinates(tmp_path: Path) -> None:
         assert all(account[f"place_{n}_rows_n"] == account["rows_n"] for n in places)
 
 
-def test_recording_of_two_places_has_only_the_normal_force(tmp_path: Path) -> None:
+def test_sideways_forces_are_unknown_if_two_places_are_touched_at_once(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.Fx_N).all()
     assert readings.Fz_N.max() == np.float32(2.5)
     assert account["force_sign_unknown_rows_n"] == 0
 
 
-def test_gaps_and_repeated_rows_are_counted(tmp_path: Path) -> None:
+def test_missing_and_repeated_rows_are_counted(tmp_path: Path) -> None:
     rows = [*ONE[:10], ONE[9].replace("100.9", "103.9"), *[row.replace("101.", "104.") for row in ONE[10:]]]
     _, account = eflash7.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
     assert (account["gap_rows_n"], account["repeated_rows_n"]) == (1, 1)

@@ -47,9 +47,10 @@ def scan(folder: Path, passes_n: int = 3) -> Path:
 
 
 def strokes(folder: Path, strokes_n: int = 3) -> Path:
-    """Return strokes at one place, each after a new baseline.
+    """Return strokes at one place.
 
-    A stroke goes down and up in five rows. In the top rows, the gauge has no new weight.
+    Each stroke follows a new baseline, and goes down and up in five rows. In the rows at the top, the gauge has no new
+    weight.
     """
     stroke = [(288.0, -1.0), (284.0, 100.0), (280.0, 1000.0), (284.0, 150.0), (288.0, -1.0)]
     places = [[315.0, -100.0, z, weight] for z, weight in stroke] * strokes_n
@@ -70,7 +71,7 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def test_coordinates_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
+def test_coordinates_of_places_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
@@ -103,7 +104,7 @@ def test_new_stroke_begins_at_a_new_baseline(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
-def test_weights_in_grams_become_newtons_and_missing_ones_nan(tmp_path: Path) -> None:
+def test_weights_in_grams_are_converted_to_newtons(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, DEFAULT_POLICY)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
     # The tolerance is that of single precision, which has seven digits.
@@ -156,7 +157,7 @@ def test_missing_file_is_reported(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", eflesh.FILES)
 @pytest.mark.parametrize("cell", ["nan", "-inf", "", "1,5", "x"])
-def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_error_names_the_line_of_a_cell_that_is_not_a_number(tmp_path: Path, name: str, cell: str) -> None:
     edit(scan(tmp_path) / name, 3, 2, cell)
     message = error_of(tmp_path)
     assert name in message
@@ -191,7 +192,7 @@ def test_clock_that_runs_backwards_is_refused(tmp_path: Path) -> None:
     assert "time does not increase in line 3" in error_of(tmp_path)
 
 
-def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_number_of_chips_than_its_header_is_refused(tmp_path: Path) -> None:
     message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 16" in message
     assert "the file has 7 columns" in message

@@ -19,8 +19,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# Labels of one pass: two rows at the corner without contact (one still has the label of the last place), then presses.
-# One press is too weak for the gauge.
+# These are the labels of one pass. It begins with two rows without contact at the corner, one of which still has the
+# label of the last place. Then follow the presses. One press is too weak for the gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
@@ -35,7 +35,10 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """Return the text X, Y, Z, T of a chip. From one row to the next, the field rises by one step (LSB)."""
+    """Return the text X, Y, Z, T of a chip.
+
+    The field of each row is one step (LSB) larger than that of the row before.
+    """
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 
@@ -78,7 +81,7 @@ def test_every_row_becomes_a_press_of_its_pass(tmp_path: Path) -> None:
     assert readings.temperature_degC[0].tolist() == [28.5, 29.5, 30.5]
 
 
-def test_rows_with_a_force_are_in_contact_and_others_have_no_place(tmp_path: Path) -> None:
+def test_rows_without_a_force_have_no_contact_and_no_place(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()
@@ -145,7 +148,7 @@ def header_with_lateness(rows_late: str) -> Header:
 def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: int) -> Path:
     """Write a recording whose fields grow with the force.
 
-    The fields are `late_n` rows late: they belong to the label of an earlier row.
+    The fields are `late_n` rows late, which means that the field in a row belongs to the label of an earlier row.
     """
     write(folder, truths)
     force = [truths[max(i - late_n, 0)][2] for i in range(len(truths))]
@@ -275,7 +278,7 @@ def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: 
     return folder
 
 
-def test_chip_with_power_on_settings_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_has_power_on_settings(tmp_path: Path) -> None:
     message = error_of(recording_with_resets(tmp_path, {1}, range(24)))
     assert "chip 1 must be the LSB of the other chips" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
@@ -287,7 +290,7 @@ def test_recording_in_which_all_chips_have_power_on_settings_is_refused(tmp_path
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_chip_that_loses_its_settings_during_the_recording_is_named(tmp_path: Path) -> None:
+def test_error_names_a_chip_that_loses_its_settings_during_the_recording(tmp_path: Path) -> None:
     # There are 2400 rows, which the reader checks in two blocks.
     message = error_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
     assert "from row 1201: the LSB of chip 1 must" in message
@@ -315,7 +318,7 @@ def test_file_of_labels_is_found_by_its_name(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("cell", ["nan", "-inf", "1e30", "1,5", "x"])
 @pytest.mark.parametrize("name", ini.FILES)
-def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_error_names_the_line_of_a_cell_that_is_not_a_number(tmp_path: Path, name: str, cell: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     edit(path, 3, f"{cell} {path.read_text().splitlines()[2].partition(' ')[2]}")
     message = error_of(tmp_path)
@@ -324,7 +327,7 @@ def test_cell_that_is_not_a_number_is_named(tmp_path: Path, name: str, cell: str
 
 
 @pytest.mark.parametrize("name", ini.FILES)
-def test_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
+def test_error_names_the_line_of_a_missing_or_extra_cell(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     line = path.read_text().splitlines()[2]
     for broken in (f"{line} 1", line.rpartition(" ")[0]):
@@ -340,7 +343,7 @@ def test_files_with_different_numbers_of_rows_are_refused(tmp_path: Path) -> Non
     assert f"8 in {ini.READINGS} and 7 in {ini.TRUTHS}" in error_of(tmp_path)
 
 
-def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_number_of_chips_than_its_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns instead of 20" in message
     assert "the file has 12 columns" in message

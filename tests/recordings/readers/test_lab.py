@@ -116,7 +116,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     assert readings.noload_uT[:, 0].tolist() == [100, 100, 90]
 
 
-def test_column_order_does_not_matter(tmp_path: Path) -> None:
+def test_columns_of_the_file_may_be_in_any_order(tmp_path: Path) -> None:
     names = NAMES.split(",")
     order = np.roll(np.arange(len(names)), 4)
     reordered = [",".join(np.array(line.split(","))[order]) for line in PRESSES]
@@ -161,14 +161,14 @@ def test_recording_is_copied_under_the_name_that_the_reader_expects(tmp_path: Pa
         (8, row(0, "noload", 90.0), "indent 0 begins again in line 8"),
     ],
 )
-def test_row_that_cannot_be_read_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
+def test_error_names_the_line_that_cannot_be_read(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
     rows = list(PRESSES)
     rows[line_n - 2] = broken
     assert expected in error_of(write(tmp_path, *rows))
 
 
 @pytest.mark.parametrize("missing", ["indent", "phase", "x_mm", "T0", "By1", "Fz"])
-def test_missing_column_is_named(tmp_path: Path, missing: str) -> None:
+def test_error_names_the_missing_column(tmp_path: Path, missing: str) -> None:
     column = NAMES.split(",").index(missing)
     lines = [",".join(cell for i, cell in enumerate(line.split(",")) if i != column) for line in [NAMES, *PRESSES]]
     assert f"no column {missing}" in error_of(write(tmp_path, *lines[1:], names=lines[0]))
@@ -226,7 +226,7 @@ def test_real_recording_converted_to_gauss_is_refused(tmp_path: Path, shared_dat
     assert "convert the fields to uT" in message
 
 
-def test_number_of_chips_other_than_in_the_header_is_refused(tmp_path: Path) -> None:
+def test_file_with_another_number_of_chips_than_its_header_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
     assert "2 chips, but the header says 5" in message
 

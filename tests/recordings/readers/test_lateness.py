@@ -1,6 +1,7 @@
-"""Tests that a row which is missing in one of the two files of layout `ini` is detected, without false alarms.
+"""Tests that a row which is missing in one of the two files of layout `ini` is detected, and that complete files raise
+no alarm.
 
-After the missing row, each field is paired with the label of a neighbouring row.
+After the missing row, each field would be paired with the label of a neighbouring row.
 """
 
 import re
@@ -18,8 +19,9 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
-AT_END_ROWS_N = 100  # A row that is lost less than this number of rows from the start or the end may remain undetected.
-ROW_OFF_MAX = 15  # The tolerance of the reported row number. In 60 cases of public recordings, it is off by at most 5.
+AT_END_ROWS_N = 100  # A missing row that is nearer to the start or the end than this may remain undetected.
+# The reported row number may be wrong by this much. In 60 cases of public recordings, it is wrong by at most 5.
+ROW_OFF_MAX = 15
 LATE_N = 1
 
 
@@ -30,13 +32,14 @@ def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, 
     """
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    # The number of rows at each place. The first row is without contact, and the depth increases in the following ones.
+    # Each place has this number of rows. The first row is without contact, and the depth increases in the following
+    # rows.
     presses_n = rng.integers(3, 8, len(places_mm))
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
     label = np.column_stack([places_mm[of_place], force_N])
-    label[force_N == 0, :2] = 10  # In rows without contact, the recorder writes this place.
+    label[force_N == 0, :2] = 10  # The recorder writes this place in rows without contact.
     one_pass_uT = rng.normal(0, 18, (len(places_mm), 15))[of_place] * np.sqrt(force_N)[:, None]
     label, b_uT = (np.tile(one, (passes_n, 1))[: 100 * passes_n] for one in (label, one_pass_uT))
     drift_uT = np.linspace(0, 60, len(label))[:, None]
@@ -55,7 +58,7 @@ def change_of(b_uT: np.ndarray, label: np.ndarray):
 
 @settings(max_examples=25)
 @given(st.integers(AT_END_ROWS_N, 1200 - AT_END_ROWS_N), st.booleans(), st.integers(0, 5))
-def test_missing_row_in_either_file_is_found(row, in_fields, seed):
+def test_missing_row_is_found_in_the_file_of_readings_and_in_that_of_labels(row, in_fields, seed):
     b_uT, label = synthetic_recording(seed)
     assert len(label) == 1200
     change = change_of(without_row(b_uT, row), label) if in_fields else change_of(b_uT, without_row(label, row))
@@ -71,7 +74,7 @@ def test_complete_recording_raises_no_alarm(seed, passes_n, further_late_n):
     assert change_of(np.roll(b_uT, further_late_n, axis=0), label) is None
 
 
-def test_recordings_that_cannot_show_a_missing_row_raise_no_alarm():
+def test_no_alarm_is_raised_if_fields_or_forces_do_not_depend_on_the_press():
     b_uT, label = synthetic_recording()
     assert change_of(np.zeros_like(b_uT), label) is None
     assert change_of(rng_for(0, "noise").normal(0, 5, b_uT.shape), label) is None
@@ -97,7 +100,7 @@ def test_ini_recording_with_a_missing_row_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_public_recordings_have_no_missing_row_and_deleted_rows_are_found(shared_data: Path, name):
+def test_public_recordings_raise_no_alarm_unless_a_row_is_deleted(shared_data: Path, name):
     folder = shared_data / "ini"
     label = np.loadtxt(folder / f"truths_{name}.txt")
     values = np.loadtxt(folder / f"b20_{name}.txt").reshape(len(label), -1, 4)

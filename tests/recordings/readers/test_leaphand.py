@@ -21,7 +21,10 @@ HEADER = make_header(layout="leaphand", options={"pad": "2"}, contacts_before_n=
 
 
 def numbers(rows_n: int = ROWS_N, pads_n: int = PADS_N) -> np.ndarray:
-    """Return rows of a hand. In the first row, it is in another pose. Then it rests for five rows, then it moves."""
+    """Return rows of a hand.
+
+    In the first row, the hand is in another pose. Then it rests for five rows, and after these it moves.
+    """
     steps = rng_for(0, "leaphand").integers(-20, 20, (rows_n, leaphand.CHANNELS_N * pads_n))
     joints = np.tile(2000 + 100 * np.arange(leaphand.JOINTS_N * pads_n), (rows_n, 1))
     joints[0] -= 300

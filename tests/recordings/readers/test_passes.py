@@ -70,7 +70,7 @@ def test_recording_without_contact_is_one_pass() -> None:
 
 
 def passes_naively(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
-    """Return the reference: of all periods, the shortest one after which the places repeat."""
+    """Return the expected passes, by trying all periods and using the shortest one after which the places repeat."""
     rows_n = len(place_mm)
     touched = np.flatnonzero(contact).tolist()
     pairs = pairwise(touched)

@@ -1,6 +1,6 @@
 """Tests of the reader of layout `table`, which reads CSV and Parquet tables.
 
-Tested are unknown quantities, and errors that name the line.
+The tests cover quantities that are unknown, and errors that name the wrong line.
 """
 
 import re
@@ -105,7 +105,7 @@ def test_quantities_of_empty_columns_are_unknown(tmp_path):
     assert account["ignored_columns_n"] == 0
 
 
-def test_no_load_rows_may_be_numbered(tmp_path):
+def test_no_load_rows_may_have_indentation_numbers_of_their_own(tmp_path):
     rows = table().assign(indentation=np.repeat(np.arange(12), [3, 4] * 6))
     readings, _ = read(tmp_path, rows)
     assert readings.indentation.tolist() == np.repeat(np.arange(6), 4).tolist()
@@ -117,7 +117,7 @@ def test_parquet_table_is_read_like_csv(tmp_path):
     np.testing.assert_array_equal(one.noload_uT, other.noload_uT)
 
 
-def test_no_load_rows_may_have_no_place(tmp_path):
+def test_no_load_rows_may_have_empty_places(tmp_path):
     rows = table().assign(operator="me", note="")
     rows.loc[rows.phase == "noload", ["x_mm", "y_mm", "Fz_N"]] = np.nan
     readings, account = read(tmp_path, rows)
@@ -143,11 +143,11 @@ def with_cell(rows: pd.DataFrame, row_i: int, column: str, value: object) -> pd.
 
 
 MISTAKES = {
-    "a word for a number": (lambda t: with_cell(t, 9, "Bx1", "high"), "Bx1 in line 11"),
-    "an empty field": (lambda t: with_cell(t, 4, "By0", ""), "By0 in line 6"),
-    "an unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
-    "no place": (lambda t: t.drop(columns="x_mm"), "x_mm"),
-    "a chip without z": (lambda t: t.drop(columns="Bz1"), "Bz1"),
+    "text instead of a number": (lambda t: with_cell(t, 9, "Bx1", "high"), "Bx1 in line 11"),
+    "empty field": (lambda t: with_cell(t, 4, "By0", ""), "By0 in line 6"),
+    "unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
+    "no column of places": (lambda t: t.drop(columns="x_mm"), "x_mm"),
+    "no z column of a chip": (lambda t: t.drop(columns="Bz1"), "Bz1"),
     "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
     "no contact": (lambda t: t[t.phase == "noload"], "no row has phase contact"),
     "millitesla": (
@@ -187,7 +187,7 @@ def test_recording_converted_by_the_script_in_the_docs_equals_that_of_layout_efl
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
 
 
-def test_template_of_a_table_is_its_header_line(tmp_path):
+def test_command_template_writes_the_header_line_of_a_table(tmp_path):
     out = tmp_path / "mine.csv"
     done = CliRunner().invoke(app, ["template", str(out), "--chips", "3"])
     assert done.exit_code == 0, done.output

@@ -1,4 +1,4 @@
-"""Tests that every reader refuses random bytes, files without rows, and truncated lines."""
+"""Tests that every reader raises an error for random bytes, files without rows, and truncated lines."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -17,7 +17,8 @@ from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
-# The step (LSB) and the typical field in uT of real boards: two with ReSkin skins, eFlesh, and eFlesh at another gain.
+# For each real board, these are the step (LSB) and the typical field in uT. Two boards have ReSkin skins, one has
+# eFlesh, and one has eFlesh at another gain of the chips.
 BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
 
 
@@ -57,7 +58,7 @@ def test_strong_fields_in_gauss_are_recognised_by_the_step_of_the_chips() -> Non
 
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
-def test_fields_without_a_known_step_must_be_as_strong_as_the_earths_field(usual_uT: float) -> None:
+def test_fields_without_a_detectable_step_are_accepted_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
     constant = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
     check_fields(constant, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
@@ -141,7 +142,7 @@ def test_each_layout_has_a_reader() -> None:
     assert set(READERS) == set(get_args(ReaderLayout))
 
 
-def test_quantities_that_were_not_recorded_are_nan() -> None:
+def test_readings_have_nan_for_quantities_that_were_not_recorded() -> None:
     readings = make_readings(
         make_header(chips_n=2), np.array([True, False]), indentation=np.zeros(2), pass_i=np.zeros(2),
         b_uT=np.ones((2, 6)), noload_uT=np.ones((2, 6)), n_contacts=np.zeros(2),
