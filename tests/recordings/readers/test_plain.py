@@ -149,15 +149,15 @@ MISTAKES = {
     "no column of places": (lambda t: t.drop(columns="x_mm"), "x_mm"),
     "no z column of a chip": (lambda t: t.drop(columns="Bz1"), "Bz1"),
     "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
-    "no contact": (lambda t: t[t.phase == "noload"], "no row has phase contact"),
-    "millitesla": (
+    "no row in contact": (lambda t: t[t.phase == "noload"], "no row has phase contact"),
+    "fields in millitesla": (
         lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}),
         "convert the fields to uT",
     ),
-    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse the sign of Fz_N"),
-    "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
-    "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
-    "a press twice": (
+    "wrong sign of forces": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse the sign of Fz_N"),
+    "misspelt column name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
+    "missing force in one row": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
+    "number of an indentation used twice": (
         lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)),
         "indentation 0 begins again in line 19",
     ),
