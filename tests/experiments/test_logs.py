@@ -67,7 +67,9 @@ def test_log_that_begins_with_a_contact_is_refused():
     t_s, b_uT, _ = make_log(0.2)
     with pytest.raises(CaptureError, match=r"log: the start without contact lasts .* less than 0\.5 s"):
         quiet_start(t_s, b_uT, where="log")
-    with pytest.raises(CaptureError, match=r"log: the log has 40 readings \(0\.16 s\); 0\.5 s or more"):
+    with pytest.raises(
+        CaptureError, match=r"log: the log has 40 readings \(0\.16 s\), but it must begin with at least 0\.5 s"
+    ):
         quiet_start(t_s[:40], b_uT[:40], where="log")
 
 
