@@ -37,8 +37,8 @@ def predict(
 ) -> dict[str, Any]:
     """Estimate the contacts in a log, and write them to a CSV file.
 
-    The file has one row for each frame of the log without a fault, with the columns t_s, x_mm, y_mm, F_N and contact.
-    In rows without contact, x_mm, y_mm and F_N are empty.
+    The file has the columns t_s, x_mm, y_mm, F_N and contact, and one row for each frame of the log, except frames with
+    a fault. In rows without contact, x_mm, y_mm and F_N are empty.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def predict(
     dict
         A summary of the log (see `reskin.logs.describe`), and counts of dropped frames. For the universal model, there
         are further entries. Two of them count doubtful readings in contact: those whose misfit is above `MISFIT_MAX`,
-        and those whose force is at a limit of the model's range. The others state whether the skin is turned by 90
-        degrees, and the warnings of the model.
+        and those whose force is at a limit of the model's range. Another entry states whether the skin is turned by 90
+        degrees, and the last one lists the model's warnings.
     """
     files = [] if model is None else [model] if isinstance(model, Path) else list(model)
     models = read_models(files, external_uT, new_day=new_day)

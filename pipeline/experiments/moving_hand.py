@@ -95,7 +95,7 @@ class MovingHand(Strict):
     # Field changes of recorded presses are multiplied by each of these factors, to get weaker or stronger touches.
     touch_scales: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
     detected_fraction: Fraction
-    places_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # values of the option, for places
+    places_uT: Annotated[tuple[Size_uT, ...], Field(min_length=1)]  # sizes of the external field in tests of places
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     draws_n: Count  # number of draws of presses and labels, for each board
     readings_n: Count  # number of tested readings in each draw
@@ -104,7 +104,7 @@ class MovingHand(Strict):
     turned_uT: Size_uT  # size of the field in which a simulated skin is turned
     magnet_uT: Size_uT  # rms of a component of the magnet's field at its smallest distance
     magnet_mm: tuple[Annotated[float, Field(ge=20)], Annotated[float, Field(ge=20)]]  # smallest and largest distance
-    presses: Compare  # orientation of the boards with presses, and their skin
+    presses: Compare  # skin and orientation of the boards on which presses were recorded
 
     @model_validator(mode="after")
     def _check(self) -> "MovingHand":

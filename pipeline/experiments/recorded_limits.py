@@ -621,7 +621,7 @@ class PowerLaw:
 
     - exponent: b, which is the same at all places of a board.
     - factor_uT: a, with one value for each place of the board.
-    - r2: fraction of the variance of log |dB| among the presses at the same place that the power law explains.
+    - r2: fraction of variance that the power law explains: of the variance of log |dB| among presses at the same place.
     """
 
     exponent: float

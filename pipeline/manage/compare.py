@@ -162,7 +162,8 @@ def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any],
 def _labels(rows: Sequence[Any]) -> list[str]:
     """Return a label for each row, which consists of the first texts and counts of the row.
 
-    As few texts and counts are used as make all labels different. Labels that are still equal are numbered.
+    The labels are as short as possible: the first text or count alone, if this makes all labels different; otherwise
+    the first two, and so on. Labels that are still equal are numbered.
     """
     if not all(isinstance(row, Mapping) for row in rows):
         return [str(i) for i in range(len(rows))]

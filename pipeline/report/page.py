@@ -254,7 +254,7 @@ def index(
             if numbers["provenance"]["source"] == source
         ]
         if entries:
-            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))  # scenes that hold out boards first
+            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))  # first the scenes that test on held-out boards
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
 

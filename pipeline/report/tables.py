@@ -146,7 +146,7 @@ QUANTITIES = {
     "force_max_N": "force, largest, N",
 }
 PAIRED = (
-    "Both models of a difference are scored on the same test rows. On each skin, scores are averaged over networks, "
+    "A difference compares two models on the same test rows. On each skin, scores are averaged over networks, "
     "and the second model's mean is subtracted from the first model's mean. These differences are averaged over the "
     "skins of a board. [low, high] is the 95 % interval over n boards (Student's t). With fewer than four boards there "
     "is no interval, and (a; b) are the values of the boards. If the second model is the single-sensor network, only "
@@ -161,8 +161,8 @@ FINAL_MEANING = (
 SKINS_MEANING = (
     "Each cell has the mean over skins, then the smallest and the largest value of a skin in brackets, then the "
     "number of skins in parentheses. The field change of a reading is the length of the vector that contains the "
-    "changes of all channels. The field change of a skin at a force is the median over its readings whose force "
-    "differs from this force by at most 20 %. A dash (–) means that there are too few such readings."
+    "changes of all channels. For example, the field change at 1 N is the median over those readings of the skin whose "
+    "force is from 0.8 N to 1.2 N (1 N ± 20 %). A dash (–) means that there are too few such readings."
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
 HELD_OUT = "model, tested on held-out boards"  # heading of the first column of a summary

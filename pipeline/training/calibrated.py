@@ -90,7 +90,7 @@ def score_fold(
     """Calibrate the model to each skin of the held-out board; score it for every number of labels.
 
     The calibration to a skin uses its no-load field and the presses of the fold's pool, which are reserved for
-    calibration. All presses are used without labels; the given number of them is used with labels, too.
+    calibration. The field changes of all these presses are used; of the first n presses, the labels are used, too.
     """
     points = []
     presses, tested = pool_rows(data, fold), data.rows.skin[fold.test]

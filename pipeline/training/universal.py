@@ -110,9 +110,10 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Divide the likelihood powers of the nominal variant by the misfit of this pool's presses; limit them to 1.
+        """Adapt the likelihood powers of the nominal variant to the misfit of this pool's presses.
 
-        `powers` are the likelihood powers for a misfit of 1.
+        A likelihood power is the exponent of a likelihood, 1 or less, which reduces overconfidence. `powers` are those
+        for a misfit of 1. They are divided by the misfit, and results above 1 are replaced by 1.
         """
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
@@ -120,7 +121,8 @@ class PoolCalibration:
         """Return this calibration with a reordered pool, in which the presses with indices `first` come first."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
-        # Condition the networks again, because the last bits of their sums over the pool depend on its order.
+        # Condition the networks again. A network adds up the features of all presses of the pool, and the rounding of
+        # this sum depends on the order of the presses.
         presses = replace(self.presses, data=CalibrationData(self.presses.data.rest_uT, pool.db_uT, pool.db_uT))
         return replace(self, presses=presses, pool=pool, pool_mm=self.pool_mm[order])
 

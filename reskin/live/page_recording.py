@@ -147,8 +147,8 @@ class PageRecording:
             )
         if self._labels is None:  # a capture without labels has no probe log
             self._labels = ProbeLogWriter(self._part)
-            # The times of the labels and of the arriving bytes are from the same clock. A single mark, which has the
-            # same time for both, therefore suffices to align them.
+            # The times of the labels and of the arriving bytes are from the same clock. To align them, it is therefore
+            # enough to state for one moment that both clocks show the same time.
             clock = Clock(kind="arrivals", rate_hz=None, marks=((self._begun_s, self._begun_s),))
             options = self._header.options | {"labels": "page"}
             self._change_header(clock=clock, options=options)

@@ -404,9 +404,10 @@ class Session:
         self._labelled = f"press {_place(press.label)}: {'; '.join(done) or 'neither recorded nor used'}"
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Return the next binary message, and the number of the newest bin.
+        """Return the next binary message for the page, and the number of the newest bin.
 
-        The message contains the bins from `after_bin` on. It is empty if no data have arrived yet.
+        A bin is a short interval of time; the page draws one point per bin. The message contains the bins from
+        `after_bin` on. It is empty if no data have arrived yet.
         """
         with self._lock:
             if self.traces is None:

@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Lower limit that is assumed for |dB|, the norm of the field change, so that its logarithm is finite. The limit is well
-# below the noise of the norm: with 3 uT per channel, this noise is about 15 uT for 15 channels. The logarithm of
-# the limit, in uT, is 0. Therefore, all inputs are 0 if the field change is 0.
+# Lower limit that is assumed for |dB|, the norm of the field change, so that its logarithm is finite. Noise
+# alone has a larger norm: for 15 channels with a noise of 3 uT each, the norm is about 12 uT (3 times the square root
+# of 15). The logarithm of the limit, in uT, is 0. Therefore, all inputs are 0 if the field change is 0.
 DB_FLOOR_uT = 1.0
 # Lower limit of the scales. It avoids a division by zero for channels that are constant in the training rows.
 SCALE_FLOOR = np.float32(1e-6)

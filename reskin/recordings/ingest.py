@@ -412,7 +412,11 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the times of arrival; raise if they list more bytes than the stream has, as when the stream was cut."""
+    """Read the times of arrival of the bytes.
+
+    Raises `CaptureError` if more bytes arrived than the file of the stream contains, because then a part of the file is
+    missing.
+    """
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

@@ -295,7 +295,7 @@ class ForceGauge:
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
         """Read samples from the gauge, and pass them to the function `use`, until the recording stops.
 
-        Raises `CaptureError` if the gauge is unplugged before.
+        Raises `CaptureError` if the gauge is unplugged during the recording.
         """
         while not context.stop.is_set():
             try:

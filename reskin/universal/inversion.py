@@ -33,7 +33,9 @@ BLOCK_N = 500  # readings are processed in blocks of this number, which limits t
 
 @dataclass(frozen=True)
 class Chart:
-    """Field changes that a law gives on a lattice of places and forces, in which places and forces are searched.
+    """A table of field changes for a lattice (grid) of places and forces, in which the place of a reading is searched.
+
+    The field changes are computed with a law, the formula for the field change at a place and a force (law.py).
 
     `slope_uT` is the change of the field change per lattice step in x, in y and in log force.
     """

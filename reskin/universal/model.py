@@ -336,7 +336,8 @@ class PressCalibration:
     def spread(self) -> "PressCalibration":
         """The calibration from which the shift of places is computed.
 
-        This is the latest calibration, of this or an earlier day, whose presses are spread evenly or over the area.
+        This is the latest calibration, of this or an earlier day, for which the user has stated where the presses are:
+        that they are spread evenly around the centre, or that they cover the whole area.
         """
         known = len(self.data.even_uT) or len(self.data.area_uT)
         return self if known or self.earlier is None else self.earlier.spread
@@ -344,10 +345,11 @@ class PressCalibration:
     def with_labels(self, labels: LabelledPresses, *, few: bool | None = None) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them.
 
-        `labels` are the labelled presses since the last change of the slide. Labels from before this change are added
-        to them. If `few` is True, the line of forces corrects the forces of a second map, which is not conditioned on
-        the presses with known forces. Otherwise these forces would be used twice: for the map, and for the line. By
-        default, `few` is True if 1 to `FEW_N` - 1 forces are known.
+        `labels` are the labelled presses since the skin last changed the way in which it slides on the board. Labels
+        from before this change are added to them. If `few` is True, a second map is made that is not conditioned on the
+        presses with known forces. Far from these presses, forces are estimated with the second map, and a straight line
+        that is fitted to the known forces corrects them. With the first map, the known forces would be used twice: for
+        the map, and for the line. By default, `few` is True if 1 to `FEW_N` - 1 forces are known.
         """
         by_day = self.labels_by_day(labels)
         days_ago = np.repeat(np.arange(len(by_day)), [len(day) for day, _ in by_day])
@@ -494,8 +496,8 @@ class PriorModel:
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
     """Condition a map on presses at unknown places.
 
-    If the data contain evenly spread presses, the map is then also conditioned on the fact that the mean of their
-    places is the centre.
+    If the data contain presses that are spread evenly over the skin, the mean of their places is the centre of the
+    skin. The map is then also conditioned on this.
     """
     skin = noload_map
     if len(data.presses_uT):

@@ -139,11 +139,11 @@ def test_readings_of_a_rising_press_lag_behind_the_field():
     # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart. Each reading must therefore be between two
     # readings of the slow press.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
-    assert (moving_uT[1:] >= low_uT - 1).all()  # The tolerance in uT is more than one step of x, y and z.
+    assert (moving_uT[1:] >= low_uT - 1).all()  # The tolerance of 1 uT is more than the resolution of the chips.
     assert (moving_uT[1:] <= high_uT + 1).all()
 
 
-def test_true_forces_of_a_walk_have_times_on_the_clock_of_the_log():
+def test_times_of_true_forces_start_at_the_first_frame_of_the_log():
     capture = capture_of("log", WALK)
     assert capture.card_rate_hz == 250.0
     log = capture.probe

@@ -403,7 +403,7 @@ def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     for file in trials.glob("*.safetensors"):
         file.unlink()
 
-    def finished() -> int:  # whether a stack of three training runs has written its last file
+    def finished() -> int:  # more than 0 if all three networks of a stack (trained together) have been written
         stacks = Counter(file.stem.rpartition("-")[0] for file in trials.glob("*.safetensors"))
         return sum(written_n for written_n in stacks.values() if written_n == 3)
 

@@ -80,7 +80,7 @@ def test_product_of_two_gaussians_has_the_closed_form():
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
 
 
-def test_network_can_place_a_press_where_the_map_is_certain_of_another_place():
+def test_estimate_follows_a_more_certain_network_against_the_map():
     """Each place keeps a minimum probability, so a network that is certain of another place determines the estimate."""
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0

@@ -486,15 +486,15 @@ def quadrature(
     allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
     used, cells, layers = rules
     narrower = f"cells of {cells.cell_m / milli:g} mm instead of {used.cell_m / milli:g} mm"
-    few = f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol"
+    subject = "skin represented by dipoles (quadrature), pressed at "
+    subject += f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol and at all depths"
     return [
-        Check(DB, f"skin as dipoles (quadrature), {few}, all depths", narrower, norm_error(found_T, cells_T), "1", 0.02,
-              TOTAL_ERROR),
-        Check(DB, f"skin as dipoles (quadrature), {few}, each channel of each poke", narrower,
+        Check(DB, subject, narrower, norm_error(found_T, cells_T), "1", 0.02, TOTAL_ERROR),
+        Check(DB, f"{subject}: largest error of a channel", narrower,
               float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed error", 1.0,
               f"The allowed error is 2 % of the poke's field change, or {unseen_uT:g} uT if that is more. An error "
               f"of {unseen_uT:g} uT is not visible in readings, because it is a third of a chip's noise."),
-        Check(DB, f"skin as dipoles (quadrature), {few}, all depths",
+        Check(DB, subject,
               f"{layers.layers_n} layers instead of {used.layers_n}", norm_error(found_T, layers_T), "1", 0.005,
               "Gauss quadrature over the height converges fast. The allowed error is therefore a quarter of the error "
               "that is allowed for the cells."),
@@ -509,9 +509,12 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
     depths_m = descent(depth_m + skin.depth_zero_m, REFERENCE_STEPS_N)
     moved = [follow_dipoles(skin, place_m, depths_m) for place_m in places_m]
     truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
-    return Check(DB, f"tables, depth steps and field formula, {kind} depth ({depth_m / milli:g} mm)",
-                 f"each dipole moved in {REFERENCE_STEPS_N} steps without tables, rotated by SVD; magpylib's fields",
-                 norm_error(found_T, truth_T), "1", 0.02, TOTAL_ERROR)  # fmt: skip
+    subject = f"simulation with tables of the deformation and few depth steps, {kind} depth ({depth_m / milli:g} mm)"
+    reference = (
+        f"simulation without tables: each dipole is moved in {REFERENCE_STEPS_N} steps and rotated by SVD, and "
+        "magpylib computes the fields"
+    )
+    return Check(DB, subject, reference, norm_error(found_T, truth_T), "1", 0.02, TOTAL_ERROR)
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:

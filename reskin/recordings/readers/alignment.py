@@ -186,8 +186,8 @@ def _likely_periods(
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Choose the moves at multiples of the golden ratio modulo 1. They are spread evenly over the recording, but unlike
-    # equally spaced moves, their places do not repeat with the period of a grid.
+    # Choose the moves at multiples of the golden ratio modulo 1, which are spread evenly over the recording. Equally
+    # spaced moves would be worse: on a grid of places, they could all be at the same few places.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:

@@ -81,7 +81,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Return each row as the single reading of an indentation.
+    """Return the readings: each row of the recording is one indentation, of which there is only this reading.
 
     The no-load field is the baseline that the recorder subtracted. It is computed as the raw field minus the field
     change, which are in two files.
