@@ -254,7 +254,8 @@ def index(
             if numbers["provenance"]["source"] == source
         ]
         if entries:
-            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))  # first the scenes that test on held-out boards
+            # Scenes that are tested on held-out boards come first.
+            entries.sort(key=lambda entry: (entry.efforts is None, entry.scene))
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("page.index.html").render(kinds=kinds, levels=LEVELS, brackets=IN_BRACKETS)
 
