@@ -113,7 +113,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 def _rate(readings: Readings) -> dict[str, float]:
     """Return the median rate of readings within a stop, in Hz, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
-    known_s = between_s[between_s > 0]  # also excludes NaN, the time in a capture without a clock
+    known_s = between_s[between_s > 0]  # captures without a clock have NaN as times, which this excludes
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 

@@ -87,8 +87,8 @@ class CalibrationSize(NamedTuple):
 class PopulationSettings(Strict):
     """Settings section `population`.
 
-    - skins_n: one network is trained for each of these numbers of simulated skins. All networks share one population
-      of skins, of which each network uses the first skins.
+    - skins_n: numbers of simulated skins, for each of which one network is trained. One population of skins is drawn,
+      and a network for n skins is trained on the first n skins of the population.
     - steps_n: number of steps of each training run.
     - unlabelled_n: numbers of unlabelled presses to which the model is calibrated.
     - labels_n: numbers of labelled presses to which the model is calibrated.

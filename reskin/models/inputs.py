@@ -18,7 +18,8 @@ from jaxtyping import Float32
 DB_FLOOR_uT = 1.0
 # Lower limit of the scales. It avoids a division by zero for channels that are constant in the training rows.
 SCALE_FLOOR = np.float32(1e-6)
-# Scale of the inputs in standard deviations. The network that the paper's authors released has about this scale.
+# For the released network's scale, field changes are divided by this number times their standard deviation. The inputs
+# of the network that the paper's authors released have about the resulting size.
 RELEASED_INPUT_SDS = np.float32(5.0)
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
