@@ -267,7 +267,7 @@ def scale(**factors: float) -> Callable[[list[str]], list[str]]:
         (edit(3, 3, "four"), r"row 5: y_mm must be a number; got 'four'"),
         (edit(3, 5, "99"), r"line 5: x_low_mm is above x_high_mm"),
         (edit(3, 9, "-1"), r"line 5: F_sd_N is negative"),
-        (edit(3, 0, "t.tiny,x"), r"row 5: 11 columns, but row 1 has 10"),
+        (edit(3, 0, "t.tiny,x"), r"row 5: the row has 11 columns, but row 1 has 10"),
         (scale(x=1e-3, y=1e-3), r"the presses have x_mm from 0 to 16 and .* Are they in m or cm instead of mm\?"),
         (scale(x=1e3, y=1e3), r"the median place is \(2250, 2250\), but the presses have .* Are places in mm"),
         (scale(x=0.0), r"with the same origin as the labels"),

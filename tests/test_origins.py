@@ -102,14 +102,14 @@ def test_only_needed_files_are_transferred(tmp_path, home, scratch):
 def test_missing_commit_is_an_error(tmp_path, home, scratch):
     repositories.commit(home, FILES)
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
-    assert_error(f"the repository does not have commit {'0' * 40}, at which", url, "0" * 40, scratch)
+    assert_error(f"the repository does not have commit {'0' * 40}, from which", url, "0" * 40, scratch)
 
 
 def test_shallow_clone_without_the_commit_is_an_error(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     repositories.git(tmp_path, "clone", "--quiet", "--depth=1", home.as_uri(), "shallow")
-    assert_error("a clone that was made with --depth", str(tmp_path / "shallow"), first, scratch)
+    assert_error("an incomplete clone that was made with --depth", str(tmp_path / "shallow"), first, scratch)
 
 
 @pytest.mark.parametrize("filters", [True, False])
