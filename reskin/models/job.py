@@ -30,7 +30,10 @@ COLLAPSED = 0.05
 # with the modules that are imported.
 CODE_MODULES = (
     "reskin.seeds",
-    *(f"reskin.models.{name}" for name in ("batches", "inputs", "job", "losses", "network", "reproducible", "train")),
+    *(
+        f"reskin.models.{name}"
+        for name in ("batches", "inputs", "job", "losses", "network", "optimiser", "reproducible", "train")
+    ),
 )
 LIBRARIES = ("torch", "numpy", "scipy")
 REPEATS_N = 25

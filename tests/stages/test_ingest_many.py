@@ -70,7 +70,7 @@ def test_capture_is_read_again_if_its_cached_file_is_damaged(run, capsys):
     (cached,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
     cached.write_text("c9")
     assert run() == ["c1"]
-    assert f"{cached.name} has changed since it was written" in capsys.readouterr().err
+    assert f"{cached.name} are damaged, because the file has changed since it was written" in capsys.readouterr().err
     assert run() == []
 
 
