@@ -214,7 +214,7 @@ def test_capture_without_labels_is_an_error(tmp_path):
         preparing.native(folder, labels(), None, ())
 
 
-def test_marks_are_added_to_the_clock(tmp_path):
+def test_times_given_as_marks_are_written_to_the_header(tmp_path):
     header, _ = preparing.native(native_folder(tmp_path / "run1"), labels(), None, preparing.parse_marks(["1.5,2e1"]))
     assert header.clock.marks == ((0.0, 0.0), (1.5, 20.0))
 

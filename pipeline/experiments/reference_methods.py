@@ -331,7 +331,8 @@ def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]
 
 INVERSION = "physics inversion"
 CENTRED = f"{INVERSION}, centred"
-# The two estimators of the universal model, a map of simulated fields and a network, and the combination of both.
+# The universal model has two estimators: a map of simulated fields, and a network. The names of results begin with
+# these texts: of the map alone, of the network alone, and of both together.
 UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")
 ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 

@@ -395,7 +395,10 @@ def evaluate_detection(
 
 
 def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
-    """Return random sums of two test rows of single touches, for every pair of places, as in experiment `contacts`."""
+    """Return simulated double touches for every pair of places, made as in experiment `contacts`.
+
+    Each is the sum of the field changes of two single touches, which are drawn at random from the test rows.
+    """
     tested = [block.test.db_uT for block in blocks]
     pairs = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])

@@ -122,7 +122,7 @@ def answers(numbers: Results) -> Answers:
 
 
 def rms(mse: Stat | None) -> Stat | None:
-    """Return the square root of a mean squared error, with its interval or the values of its boards.
+    """Return the root mean squared error for a mean squared error, with an interval or with one value per board.
 
     If the values of boards are known, the square root of each value is computed, and the mean is the mean of these
     roots. The result has no standard deviation, because the standard deviation of the square roots cannot be computed

@@ -45,7 +45,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def name_marks(figure: Any) -> Titles:
-    """Set an id for each line and scatter of a figure; return the titles of their marks, by id."""
+    """Set an id for each line and scatter of a figure; return the texts that their marks show on hover, by id."""
     titles = {}
     for i, axes in enumerate(figure.axes):
         for j, (artist, texts) in enumerate(_titled_artists(axes)):
@@ -83,7 +83,7 @@ def _group_end(text: str) -> int:
 
 
 def _titled_artists(axes: Any) -> Iterator[tuple[Any, list[str]]]:
-    """Yield the lines and scatters of a panel with the titles of their marks."""
+    """Yield the lines and scatters of a panel, each with the texts that its marks show on hover."""
     x, y = _value_format(axes, "x"), _value_format(axes, "y")
     barred = {container.lines[0]: container for container in axes.containers if hasattr(container, "has_yerr")}
     caps = {cap for container in barred.values() for cap in container.lines[1]}

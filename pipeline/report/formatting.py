@@ -246,7 +246,10 @@ class Model:
 
 
 def models(numbers: Results) -> dict[str, Model]:
-    """Return the rows of table 2 in the paper's order; titles say so if networks had only one training skin."""
+    """Return the rows of table 2 in the paper's order.
+
+    If networks had only one training skin, the title of their row says so.
+    """
     titles = TABLE_2_ROWS | {"control": CONTROL}
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
         pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"

@@ -383,7 +383,10 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
 def runtime_numbers(
     trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
 ) -> dict[str, Any]:
-    """Return the cost of each stage, and the results of experiment runtime (`study`) with times on this machine."""
+    """Return the cost of each stage, and the results of the experiment named `runtime` with times on this machine.
+
+    `study` has the results of the experiment, and `seconds` has the times.
+    """
     numbers: dict[str, Any] = {
         "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
     }  # fmt: skip
@@ -398,7 +401,10 @@ def runtime_numbers(
 
 
 def _stage_cost(cost: Row) -> dict[str, float]:
-    """Return the cost of computing a stage, including all its training runs, and the cost of its last run."""
+    """Return the cost of computing a stage from scratch, and the cost of its last run.
+
+    The last run may have reused training runs.
+    """
     trainings_s = cost["trainings_s"].values()
     return {
         "computed_s": cost["other_s"] + sum(trainings_s),

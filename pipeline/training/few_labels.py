@@ -144,7 +144,7 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
     """Draw labelled indentations from the fold's pool (see `adaptation_jobs`); return their rows by number of labels.
 
-    A larger number of labels includes all indentations of every smaller number.
+    The indentations for a smaller number of labels are also among those for every larger number.
     """
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)

@@ -272,8 +272,8 @@ def parse_fault(text: str) -> Fault:
     match = re.fullmatch(r"([a-z0-9-]+)(?:@(\d{1,6}(?:\.\d+)?)(?:\+(\d{1,6}(?:\.\d+)?))?)?", text)
     if match is None or match[1] not in FAULTS:
         raise ParamsError(
-            f"--fault: {repr(text)[:40]} is not NAME[@START_S[+DURATION_S]] with one of {', '.join(FAULTS)}. "
-            "Try: --fault stuck@3+1"
+            f"--fault: {repr(text)[:40]} is not a fault. Write NAME, NAME@START_S or NAME@START_S+DURATION_S, such as "
+            f"stuck@3+1, where NAME is one of {', '.join(FAULTS)}."
         )
     return Fault(match[1], float(match[2] or START_S), float(match[3] or DURATION_S))
 

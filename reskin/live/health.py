@@ -33,6 +33,7 @@ ACTIVE_S = 2.0  # an alarm remains active for this time after its last occurrenc
 RESIDUAL_FRACTION_MAX = 0.2
 # Smallest external field that raises an alarm. It is about as strong as the earth's field.
 COMMON_MIN_uT = 50.0
+RESET = "resolution differs from the other chips: the chip was probably reset"
 READINGS_REPEAT = f"over {100 * REPEATED_MAX:.0f} % of readings repeat: the board sends faster than its chips convert"
 # If external fields are expected, only a field that is larger than this multiple of their expected size raises an
 # alarm.
@@ -150,7 +151,7 @@ class Health:
         self.note("the board's clock jumps", int(faults.clock_jump.sum()), now_s, "clock_jump")
         for window in faults.scale:
             reset = np.repeat(window.unusual[None], len(window.t_s), axis=0)
-            self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
+            self._note_chips(RESET, reset, now_s, "chip_reset")
 
     def _note_repeats(self, batch: Frames, faults: Faults, now_s: float) -> None:
         """Raise an alarm if single chips repeat their previous reading.

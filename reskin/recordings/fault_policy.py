@@ -30,7 +30,8 @@ USUAL_LSB = "the LSB of the other chips, and not the LSB of a chip with its powe
 
 Action = Literal["drop", "flag", "refuse"]
 DropOrRefuse = Literal["drop", "refuse"]  # actions for stray bytes between frames, which cannot be kept as readings
-FlagOrRefuse = Literal["flag", "refuse"]  # actions for faults for which no single reading could be dropped
+# Actions for faults that affect many readings. It would be of no use to drop single readings.
+FlagOrRefuse = Literal["flag", "refuse"]
 
 
 class FaultPolicy(Strict):

@@ -111,8 +111,8 @@ def export_lerobot(
 
     Raises
     ------
-    ReskinError : a file cannot be read; the files differ in their number of chips, in the labels that are known, or in
-        being simulated or recorded; or the times or the rate are missing
+    ReskinError : a file cannot be read, or has neither times nor a rate; or the files have different numbers of chips
+        or different kinds of labels; or some files are simulated and others recorded
     """
     if out.exists():
         raise ParamsError(f"--out: {out} exists. Choose another folder.")
@@ -300,7 +300,7 @@ def split(
     if recording.t_s is not None:
         step_s = np.diff(recording.t_s)
         if (~ends & (step_s < 0)).any():
-            raise CaptureError(f"{recording.where}: the times go backwards. Split the file at this time.")
+            raise CaptureError(f"{recording.where}: the times go backwards. Split the file where they go backwards.")
         ends = ends | (step_s > GAP_S)
     for rows in np.split(np.arange(len(recording.part)), np.flatnonzero(ends) + 1):
         kept, late_s = rows, 0.0

@@ -73,7 +73,7 @@ DEFAULT_FORCES = Forces(light_share=0.2)
 
 @dataclass(frozen=True)
 class Population:
-    """Simulated skins, and the presses on each skin, in the frame and along the axes of the board.
+    """Simulated skins, and the presses on each skin. Places and fields are along the axes of the board.
 
     The first `PLACES_N` presses of each skin are on the grid, one at each place.
     """

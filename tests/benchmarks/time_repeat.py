@@ -29,7 +29,8 @@ SKINS_N = 6  # one skin on each board
 EXPERIMENTS = ("single_random", "lobo", "triplet")
 TRAINING_SECTIONS = ("train_single", "train_multi", "train_triplet")
 RERUN_CODE = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
-# Variables that undo the settings of reskin/numerics.py, so that libraries choose instructions by the processor.
+# reskin/numerics.py sets variables so that libraries use the same instructions on all processors. These values undo
+# this: each library then uses the newest instructions that the processor has.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
     "OPENBLAS_CORETYPE": "SkylakeX", "OPENBLAS_NUM_THREADS": "2",

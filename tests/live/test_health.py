@@ -15,7 +15,7 @@ from tests.live.boards import make_script
 SCRIPT = make_script(pokes_n=2)
 ALARMS = {
     "failed-read": "chip 1: failed I2C reads",
-    "chip-reset": "chip 1: resolution differs from the other chips: reset",
+    "chip-reset": "chip 1: resolution differs from the other chips: the chip was probably reset",
     "stuck": "chip 1: stuck",
     "saturated": "chip 1: field at the end of the range",
     "int16-wrap": "chip 1: int16 overflow",
@@ -182,7 +182,7 @@ def test_frames_with_a_stuck_chip_are_invalid_unless_the_policy_flags_them():
         assert lost_n == pytest.approx(unused_n, abs=100)
 
 
-RESET, FAILED = "resolution differs from the other chips: reset", "failed I2C reads"
+RESET, FAILED = "resolution differs from the other chips: the chip was probably reset", "failed I2C reads"
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,8 @@ def find_change(
 
     The lags are estimated iteratively. With the current estimate, a line of field against force is fitted for each
     place. Then the rows are split into two parts with different lags, such that the fields are as near as possible to
-    these lines. Both steps are repeated. The columns of `label` are x in mm, y in mm and force in N. Rows of fields
-    that `sound` does not mark are ignored.
+    these lines. Both steps are repeated. The columns of `label` are x in mm, y in mm and force in N. Rows of `b_uT`
+    for which `sound` is False are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None

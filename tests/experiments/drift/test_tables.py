@@ -47,7 +47,7 @@ DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_table_has_one_row_per_window_and_columns_for_each_policy(source):
+def test_table_has_one_row_per_test_and_columns_for_each_no_load_policy(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
     assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02000 ± 0.00040"] * 2
