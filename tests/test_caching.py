@@ -5,6 +5,7 @@ It restores an object if an undamaged copy exists.
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,11 +25,19 @@ def md5(content: bytes) -> str:
     return hashlib.md5(content).hexdigest()
 
 
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory) -> Path:
+    """Return a folder in which git and DVC work."""
+    folder = tmp_path_factory.mktemp("empty")
+    subprocess.run(["git", "init", "-q"], cwd=folder, check=True)
+    subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], cwd=folder, check=True)
+    return folder
+
+
 @pytest.fixture
-def root(tmp_path, monkeypatch) -> Path:
+def root(empty, tmp_path, monkeypatch) -> Path:
     """Return a checkout with a folder of two files, a file and a recording, all of which are in DVC's cache."""
-    subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
-    subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], cwd=tmp_path, check=True)
+    shutil.copytree(empty, tmp_path, dirs_exist_ok=True)
     (tmp_path / "dvc.yaml").write_text("stages: {}\n")
     monkeypatch.chdir(tmp_path)
     folder = {"a.safetensors": b"weights", "a.json": b"card"}
