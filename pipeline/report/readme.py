@@ -52,8 +52,8 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of a training "
-    "skin and a tested skin. Our boards are simulated, and the paper's boards were recorded. An earlier version of the "
-    "simulation was tuned to row *Single-sensor* of the paper, so this row is not evidence. The paper does not state "
+    "skin and a tested skin. Our boards are simulated, the paper's were recorded. An earlier "
+    "simulation was tuned to row *Single-sensor*, so this row is not evidence. The paper does not state "
     "how large its forces are, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
@@ -281,7 +281,7 @@ def _touches(numbers: Numbers) -> str:
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
         f"The presses have forces of {ranges}. With the threshold of the live page, {share} of these presses are "
-        "missed. Some readings without touch are taken for a touch. How often this happens depends on when the no-load "
+        "missed. The rate of false touches depends on when the no-load "
         f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the "
         "live page)."
     )
@@ -328,7 +328,7 @@ def _time(times: Numbers) -> str:
     cpu_min = median(run["stages"]["cpu_s"] for run in runs) / 60
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
-        f"This takes {environment_min:.1f} min for the Python environment and {stages_min:.1f} min for the stages "
+        f"This takes {environment_min:.1f} min for the environment and {stages_min:.1f} min for the stages "
         f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB on disk, of which {environment_GB:.1f} GB are the "
         f"environment. These are medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
         f"{times['git']})."

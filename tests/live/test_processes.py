@@ -178,7 +178,7 @@ def test_invalid_options_are_errors_of_one_sentence(shell):
     assert "Traceback" not in errors
     for arguments, message in (
         (["nothing"], "must be the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
-        (["nothing", "--fault", "melted"], r"is not NAME\[@START_S\[\+DURATION_S\]\] with one of failed-read"),
+        (["nothing", "--fault", "melted"], "stuck@3.1, where NAME is one of failed-read"),
     ):
         with pytest.raises(ReskinError, match=message):
             CliRunner().invoke(app, ["emulate", *arguments], catch_exceptions=False)
