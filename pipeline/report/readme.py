@@ -51,8 +51,8 @@ MEASURED = "reskin/universal/measured.json"  # results of this model that the li
 SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F, N²", 2)}
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
-    "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of a training "
-    "skin and a tested skin. Our boards are simulated, the paper's were recorded. An earlier "
+    "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
+    "skins. Our boards are simulated, the paper's were recorded. An earlier "
     "simulation was tuned to row *Single-sensor*, so this row is not evidence. The paper does not state "
     "how large its forces are, so MSE_F may not be comparable."
 )
@@ -71,7 +71,7 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Each cell has the mean of both boards, then (board 1; board 2). All numbers are "
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Numbers are "
     "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to "
     "{presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
 )
@@ -329,8 +329,8 @@ def _time(times: Numbers) -> str:
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
         f"This takes {environment_min:.1f} min for the environment and {stages_min:.1f} min for the stages "
-        f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB on disk, of which {environment_GB:.1f} GB are the "
-        f"environment. These are medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
+        f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB, of which {environment_GB:.1f} GB are the "
+        f"environment. Medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
         f"{times['git']})."
     )
 
