@@ -280,7 +280,7 @@ def _touches(numbers: Numbers) -> str:
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
-        f"The presses have forces of {ranges}. With the threshold of the live page, {share} of these presses are "
+        f"Forces of the presses: {ranges}. With the threshold of the live page, {share} of these presses are "
         "missed. The rate of false touches depends on when the no-load "
         f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the "
         "live page)."
