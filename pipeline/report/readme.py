@@ -52,7 +52,7 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
-    "skins. Our boards are simulated, the paper's were recorded. An earlier "
+    "skins. Ours are simulated, the paper's were recorded. An earlier "
     "simulation was tuned to row *Single-sensor*, so this row is not evidence. The paper does not state "
     "how large its forces are, so MSE_F may not be comparable."
 )
@@ -328,7 +328,7 @@ def _time(times: Numbers) -> str:
     cpu_min = median(run["stages"]["cpu_s"] for run in runs) / 60
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
-        f"This takes {environment_min:.1f} min for the environment and {stages_min:.1f} min for the stages "
+        f"This takes {environment_min:.1f} min for the environment, {stages_min:.1f} min for the stages "
         f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB, of which {environment_GB:.1f} GB are the "
         f"environment. Medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
         f"{times['git']})."
