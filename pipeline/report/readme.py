@@ -54,7 +54,7 @@ SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
     "skins. Ours are simulated, the paper's were recorded. An earlier "
     "simulation was tuned to row *Single-sensor*, so this row is not evidence. The paper does not state "
-    "how large its forces are, so MSE_F may not be comparable."
+    "its forces, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
