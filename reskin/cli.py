@@ -50,14 +50,13 @@ ON_FAULT = (
     "NAME=drop hides them. The names of the faults are in section faults of params.yaml. The option can be repeated."
 )
 LABELS = (
-    "Source of the places of the presses. With grid:NXxNY:STEP_MM or line:N:STEP_MM, you are asked to press the places "
-    "of a grid or a line one by one. With the name of a CSV file, the places are read from this file, to which the "
-    "program of a robot appends them."
+    "Where the places of the presses come from. grid:NXxNY:STEP_MM and line:N:STEP_MM: the command asks you to press "
+    "the places of a grid or a line, one after the other. Name of a CSV file: a robot's program writes its presses to "
+    "this file, and the command reads them."
 )
 SCAN = (
-    "Order in which the places are pressed. With --labels grid or line, it is the order in which you are asked to "
-    "press them: random (default) or snake. Otherwise, it is any description of the order, which is only written to "
-    "the header of the capture."
+    "Order of the presses. With --labels grid or line, the command asks for the places in this order: random (default) "
+    "or snake. Otherwise, write any description. It is stored in the capture's header and has no other effect."
 )
 GAUGE = (
     "Port of a force gauge. The gauge must send lines of text with Fz, or with Fx Fy Fz, in N. If its baud rate is not "
