@@ -3,7 +3,9 @@
 The captures have the same wire format as those of recorded boards, so that all further stages treat both alike.
 """
 
+from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline.executors import make_executor
 from pipeline.settings import Settings
@@ -27,14 +29,26 @@ def simulate(settings: Settings, protocol: str, raw: Path) -> None:
     with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
         futures = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]
+        overruns: Counter[str] = Counter()
         for i, future in enumerate(futures, 1):
-            say(f"{settings.scene}: simulated {future.result()} ({i}/{len(pairs)})")
+            capture = future.result()
+            overruns.update(capture.overruns)
+            say(f"{settings.scene}: simulated {capture.name} ({i}/{len(pairs)}): {capture.protocol}")
+        if +overruns:
+            counts = ", ".join(f"{what}: {n}" for what, n in (+overruns).items())
+            say(f"{settings.scene}: in all simulated captures of protocol {protocol}: {counts}")
+
+
+class _Written(NamedTuple):
+    name: str  # of the capture
+    protocol: str  # a description
+    overruns: dict[str, int]  # maps each kind of value out of range to the number of such values
 
 
 def _write_capture(
     simulation: SimulationSettings, protocol: str, pair: tuple[str, str], seed: int, folder: Path
-) -> str:
+) -> _Written:
     board, skin = pair
     capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
-    header = write_capture(folder / capture.name, *to_files(capture, simulation))
-    return f"{capture.name} on {board}, {header.protocol}; {header.note}"
+    write_capture(folder / capture.name, *to_files(capture, simulation))
+    return _Written(capture.name, capture.protocol, capture.overruns)
