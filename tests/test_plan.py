@@ -222,18 +222,14 @@ import pathlib, sys
 out = pathlib.Path(sys.argv[-1])  # the output of a stage
 out.mkdir(parents=True, exist_ok=True)
 (out / "simulate").touch()  # the digest that stage simulate depends on
-if sys.argv[1] == "scenes":
-    from reskin.cli import main
-    main()
 """
 
 
 def test_dvc_checkout_keeps_outputs_of_other_scenes(tmp_path):
     root = copy_checkout(tmp_path)
     (root / "pipeline/__main__.py").write_text(STAND_IN)
-    run(root, "reskin", "scenes", "use", "ci")
-    run(root, "dvc", "repro", "simulate@ci")
-    run(root, "reskin", "scenes", "use", "quick")
-    run(root, "dvc", "repro", "simulate@quick")
+    for scene in ("ci", "quick"):
+        plan.use(root, [scene])
+        run(root, "dvc", "repro", f"simulate@{scene}")
     run(root, "dvc", "checkout", check=False)  # The command fails, because other stages of scene quick have never run.
     assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]

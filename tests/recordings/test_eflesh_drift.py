@@ -28,7 +28,7 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     io.write_readings(tmp_path / "indentations" / f"{readings.capture}.parquet", [readings], account)
     yaml = YAML(typ="safe")
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
-    settings["drift"]["training"]["steps_n"] = 300
+    settings["drift"]["training"]["steps_n"] = 150
     of_scene = Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,))
     drift(
         of_scene, of_scene.section(Drift, "drift"),
