@@ -27,7 +27,6 @@ from reskin.recordings.recorder import (
 )
 from reskin.recordings.stream_recorder import PortSettings
 from tests.board.signals import make_frames
-from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)
 LONG_S = 120.0  # time limit, long enough for a busy machine
@@ -44,7 +43,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     labels = ["--port", name, "--board", "b0", "--skin", "s0", "--out", out]
-    command = [ROOT / ".venv/bin/reskin", "record", *labels, *options]
+    command = [Path(sys.prefix) / "bin/reskin", "record", *labels, *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

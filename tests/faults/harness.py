@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -149,7 +150,7 @@ def _cwd(process: psutil.Process) -> Path | None:
 def make_template(folder: Path) -> tuple[Checkout, Result]:
     """Clone the last commit and run the small scene; return the clone and the result of `dvc repro`."""
     subprocess.run(["git", "clone", "--quiet", "--shared", str(ROOT), str(folder)], check=True)
-    (folder / ".venv").symlink_to(ROOT / ".venv")
+    (folder / ".venv").symlink_to(sys.prefix)
     scenes = folder / "pipeline/scenes"
     with (scenes / f"{SCENE}.yaml").open("w") as stream:
         YAML().dump(small_scene(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)

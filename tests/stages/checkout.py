@@ -4,6 +4,7 @@ import compileall
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -47,7 +48,7 @@ def copy_checkout(folder: Path) -> Path:
     shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")
     (folder / "data").mkdir()
     (folder / "data/captures.yaml").write_text("captures: {}\n")
-    (folder / ".venv").symlink_to(ROOT / ".venv")
+    (folder / ".venv").symlink_to(sys.prefix)  # the environment of this Python, for each version that is tested
     config = folder / ".dvc/config"
     config.write_text(config.read_text().replace("[core]", "[core]\n    no_scm = true"))
     return folder
