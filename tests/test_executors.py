@@ -11,7 +11,7 @@ from reskin.models import job
 from reskin.numerics import device
 
 
-def test_calls_run_in_another_process_with_executor_processes(monkeypatch):
+def test_executor_processes_runs_calls_in_another_process(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()

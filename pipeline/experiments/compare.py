@@ -802,7 +802,7 @@ def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -
                     axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **style)
                     axes.plot(*place_mm, marker="x", color="black")
                     for (x_mm, y_mm), (_, y_uT, z_uT) in zip(chips_mm, db_uT, strict=True):
-                        # On the side of the chip to which the arrow does not point.
+                        # The text is on that side of the chip to which the arrow does not point.
                         side_mm, va = (1.2, "bottom") if y_uT < 0 else (-1.2, "top")
                         axes.text(x_mm, y_mm + side_mm, f"{z_uT:+z.0f}", fontsize=6, ha="center", va=va)
             panels[2 * row_i][0].set_title(f"longest arrow {longest_uT:.0f} µT", fontsize=8, loc="left")

@@ -167,7 +167,7 @@ def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int,
             for labels_n in section.labels_n:
                 chosen = order[:labels_n]
                 for name, matrix in frames().items():
-                    # The places of the labels are given in wrong axes. Applying `matrix` to them gives the true places.
+                    # The model receives labels in wrong axes: the true places are multiplied by `matrix`.
                     place_mm = (skin.place_mm[chosen] - CENTRE_MM) @ matrix + CENTRE_MM
                     model.label(place_mm, skin.force_N[chosen], skin.rest_uT + skin.db_uT[chosen])
                     frame = model.label_frame
@@ -180,7 +180,9 @@ def label_rows(source: str, skins: Sequence[Skin], section: Mounting, seed: int,
 
 
 def accuracy_rows(board: BoardPresses, section: Mounting, seed: int) -> list[dict[str, Any]]:
-    """Score places on a recorded board, as recorded and turned, with and without the check of the orientation.
+    """Compute scores on a recorded board, as it was recorded and after turning the skin.
+
+    Both are computed with and without the check of the orientation.
 
     The calibration uses 65 unlabelled presses at random places. Labels are at places of one colour of a checkerboard,
     and tests at places of the other colour.

@@ -140,7 +140,7 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
-    """Summarise networks of experiment lobo: scores with registered positions over boards, and scores by board."""
+    """Summarise networks of experiment lobo: mean scores after registration of the places, and scores of each board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),

@@ -80,7 +80,9 @@ Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of on
 
 
 def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
-    """Fill in all pages and, if `write`, write them; return the pages that changed and the scenes that they show.
+    """Generate the variable parts of all pages. Return the names of pages that change, and of the scenes shown.
+
+    Changed pages are written only if `write` is True.
 
     The pages show the simulated scenes `paper` and `quick`, and every recorded scene with results in `reports/`.
     """

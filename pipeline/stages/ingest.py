@@ -76,7 +76,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
 
 
 def _is_whole(cached: Path) -> bool:
-    """Return whether a cached file is undamaged, which means that its content has the digest in its name.
+    """Return whether a cached file is undamaged: the digest of its content must equal the digest in its name.
 
     A damaged file is deleted, with a warning.
     """

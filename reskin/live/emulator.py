@@ -490,8 +490,8 @@ class TcpServer(EmulatedPort):
 def make_port(kind: str) -> EmulatedPort:
     """Create an emulated port.
 
-    The text `kind` is `pty` for a pseudo-terminal, the path of a link that is created to a pseudo-terminal, `tcp` for a
-    TCP server, or `tcp:NUMBER` for a TCP server with this port number.
+    The text `kind` is one of these: `pty` makes a pseudo-terminal; a path makes a pseudo-terminal and a link to it at
+    this path; `tcp` makes a TCP server; `tcp:NUMBER` makes a TCP server with this port number.
     """
     name, _, number = kind.partition(":")
     if kind == "pty":

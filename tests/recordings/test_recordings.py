@@ -24,7 +24,7 @@ SCREW = "ini/b20_artillery_AFG_board2_50_screw.txt"
 
 
 def ingest(reader: ModuleType, recording: Path, folder: Path, **changed: object) -> tuple[Readings, dict[str, int]]:
-    """Copy a recording into the folder of a capture as `reskin add` does. Return its readings and their account."""
+    """Copy a recording into a capture as `reskin add` does; return its readings and the counts of dropped rows."""
     files = reader.collect(recording)
     for name, source in files.items():
         shutil.copyfile(source, folder / name)

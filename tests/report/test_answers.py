@@ -130,7 +130,7 @@ def test_answer_states_the_numbers_of_boards_and_skins_if_the_protocol_is_missin
     assert answers(numbers).tested.startswith("Tested on 6 simulated boards with 18 skins")
 
 
-def test_scene_without_held_out_boards_has_no_answer_on_new_skins():
+def test_scene_without_held_out_boards_does_not_say_how_well_new_skins_work():
     alone = {name: value for name, value in all_experiments("recorded").items() if name != "table2"}
     found = answers(alone)
     assert (found.place.level, found.force.level, found.efforts) == (UNTESTED, UNTESTED, ())

@@ -67,7 +67,7 @@ def test_presses_cover_the_grid_and_stay_on_the_skin():
     assert inside(grid()).all()
 
 
-def test_random_density_of_filler_scales_fields_and_varies_along_the_skin(monkeypatch):
+def test_fields_are_proportional_to_the_density_of_filler_which_varies_along_the_skin(monkeypatch):
     place_mm, force_N = np.array([[1.0, 2.0]]), np.array([3.0])
     twice = replace(COARSE.rest, moments_A_m2=2 * COARSE.rest.moments_A_m2)
     plain_uT = simulate_uT(NOMINAL, COARSE, place_mm, force_N)

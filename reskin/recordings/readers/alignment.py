@@ -141,13 +141,13 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
     return int(before_i), int(after_i), int(row)
 
 
-# The period is the number of rows of a pass. To find it, moves are compared. A move is a change of place between two
-# contacts, and consists of the two rows before and after the change. A move can be compared if the two rows that are
-# one period later are in contact too. A period is accepted if the places are the same one period later, for at least
-# this fraction of the moves that can be compared.
+# The period is the number of rows of a pass. To find it, moves are compared. A move is a change of place from one
+# contact to the next: the last row before the change, and the first row in contact after it. A move can be compared if
+# both rows that are one period later are in contact too. A period is accepted if, for at least this fraction of the
+# compared moves, the places one period later are the same.
 AGREEMENT_MIN = 0.95
-# At least this fraction of all moves must be comparable. It is far below 1: if the period is half of the recording,
-# only half of the moves are followed by rows one period later, and some of these rows may be without contact.
+# At least this fraction of all moves must be comparable. The fraction is far below 1 for two reasons. If the period is
+# half of the recording, only half of the moves have rows one period later. Some of these rows may be without contact.
 COMPARED_MIN = 0.25
 # Most periods are excluded quickly with a sample of this many moves. If fewer than PROBES_MIN_N moves of the sample can
 # be compared for a period, the sample does not exclude this period.

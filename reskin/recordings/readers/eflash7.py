@@ -61,7 +61,7 @@ class _Table:
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of a recording: the CSV file itself."""
+    """Return the only file of a recording, which is the CSV file that the user names."""
     if not recording.is_file():
         raise CaptureError(
             f"{recording}: not a file. A recording of layout eflash7 is one CSV file: add each file separately."

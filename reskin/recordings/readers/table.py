@@ -232,7 +232,7 @@ def _number_presses(
     with each touch, and whenever the place changes within a touch.
     """
     if "indentation" in numbers:
-        rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
+        rows = np.flatnonzero(contact)  # in rows without contact, the values of column `indentation` are ignored
         number = numbers["indentation"][rows]
         begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
         firsts, counts = np.unique(number[begins], return_counts=True)
