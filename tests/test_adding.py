@@ -74,9 +74,7 @@ def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **arguments: st
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    found = [
-        path for path in root.rglob("*") if path.is_file() and ".dvc/" not in str(path) and ".venv" not in str(path)
-    ]
+    found = [path for path in root.rglob("*") if path.is_file() and ".dvc/" not in str(path)]
     return {str(path.relative_to(root)): path.read_bytes() for path in found if "__pycache__" not in str(path)}
 
 

@@ -27,6 +27,7 @@ from reskin.recordings.recorder import (
 )
 from reskin.recordings.stream_recorder import PortSettings
 from tests.board.signals import make_frames
+from tests.stages.checkout import PROGRAMS
 
 FRAMES = make_frames(200, 5, seed=0)
 LONG_S = 120.0  # time limit, long enough for a busy machine
@@ -43,7 +44,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     labels = ["--port", name, "--board", "b0", "--skin", "s0", "--out", out]
-    command = [Path(sys.prefix) / "bin/reskin", "record", *labels, *options]
+    command = [PROGRAMS / "reskin", "record", *labels, *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

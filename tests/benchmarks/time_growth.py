@@ -30,7 +30,7 @@ from reskin import io
 from reskin.config import read_yaml
 from reskin.recordings.header import HEADER_FILE, make_header, write_capture
 from tests.benchmarks.pages import MEASURED
-from tests.stages.checkout import ROOT, copy_checkout, variables
+from tests.stages.checkout import PROGRAMS, ROOT, copy_checkout, variables
 
 SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
 STEPS_N = 100  # Steps per training run. They are few, because the cost of a step does not depend on the number of rows.
@@ -39,7 +39,7 @@ READINGS_N = 40  # Readings per recorded capture. They are few, so that the over
 
 def time_command(folder: Path, *words: str) -> dict[str, float]:
     """Run a program; return CPU and wall seconds, including child processes, and the largest peak memory."""
-    command, start_s = [str(folder / ".venv/bin" / words[0]), *words[1:]], time.monotonic()
+    command, start_s = [str(PROGRAMS / words[0]), *words[1:]], time.monotonic()
     log = folder / "said.txt"
     with log.open("w") as output:
         started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=output, stderr=subprocess.STDOUT)

@@ -5,7 +5,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -55,7 +54,6 @@ class Checkout:
     def start(self, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
         """Start a command in a new process group; its output is written to a file."""
         env = variables(self.folder, **environment)
-        env["PATH"] = f"{self.folder / '.venv/bin'}{os.pathsep}{env['PATH']}"
         with self._output.open("wb") as output:
             return subprocess.Popen(
                 arguments, cwd=self.folder, env=env, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
@@ -150,7 +148,6 @@ def _cwd(process: psutil.Process) -> Path | None:
 def make_template(folder: Path) -> tuple[Checkout, Result]:
     """Clone the last commit and run the small scene; return the clone and the result of `dvc repro`."""
     subprocess.run(["git", "clone", "--quiet", "--shared", str(ROOT), str(folder)], check=True)
-    (folder / ".venv").symlink_to(sys.prefix)
     scenes = folder / "pipeline/scenes"
     with (scenes / f"{SCENE}.yaml").open("w") as stream:
         YAML().dump(small_scene(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)

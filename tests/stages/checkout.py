@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+PROGRAMS = Path(sys.prefix) / "bin"  # the programs of the environment that runs the tests
 NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", "mlruns", ".ci"} | {
     ".mypy_cache", ".ruff_cache", ".import_linter_cache", ".pytest_cache", ".hypothesis",
 }  # fmt: skip
@@ -48,7 +49,6 @@ def copy_checkout(folder: Path) -> Path:
     shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")
     (folder / "data").mkdir()
     (folder / "data/captures.yaml").write_text("captures: {}\n")
-    (folder / ".venv").symlink_to(sys.prefix)  # the environment of this Python, for each version that is tested
     config = folder / ".dvc/config"
     config.write_text(config.read_text().replace("[core]", "[core]\n    no_scm = true"))
     return folder
@@ -63,15 +63,15 @@ def copy_without_code(checkout: Path, folder: Path) -> Path:
 def variables(folder: Path, **environment: str) -> dict[str, str]:
     """Return environment variables with which programs use the code and the MLflow store of the copy."""
     inherited = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
-    # The virtual environment is first, so that `python` in the commands of stages is the project's Python.
-    path = f"{folder / '.venv/bin'}{os.pathsep}{inherited['PATH']}"
+    # `python` in the commands of stages is then the Python that runs the tests.
+    path = f"{PROGRAMS}{os.pathsep}{inherited['PATH']}"
     return {**inherited, **ENVIRONMENT, "PYTHONPATH": str(folder), "PATH": path, **environment}
 
 
 @contextmanager
 def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
     """Yield a function that runs stages (default: all) in forks of a preloaded process and returns the output."""
-    command = [str(folder / ".venv/bin/python"), "tests/stages/warm.py"]
+    command = [sys.executable, "tests/stages/warm.py"]
     with subprocess.Popen(
         command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env=variables(folder),
@@ -96,7 +96,7 @@ def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
 
 def run(folder: Path, *arguments: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a program of the virtual environment in the copy; return its output."""
-    arguments = (str(folder / ".venv/bin" / arguments[0]), *arguments[1:])
+    arguments = (str(PROGRAMS / arguments[0]), *arguments[1:])
     env = variables(folder, **environment)
     done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, env=env, check=False)
     if check and done.returncode:

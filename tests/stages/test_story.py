@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -397,7 +398,7 @@ def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     models = story / "data/models/killed"
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci",
              "--folds", "data/models/ci/folds.json", "--models", str(models)]  # fmt: skip
-    command = [str(story / ".venv/bin/python"), "-m", "pipeline", "train_triplet", *arguments]
+    command = [sys.executable, "-m", "pipeline", "train_triplet", *arguments]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     trials = story / ".reskin/cells"
     for file in trials.glob("*.safetensors"):
