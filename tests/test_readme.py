@@ -125,7 +125,7 @@ def test_block_recorded_shows_the_scores_of_presses_at_random_places():
         == ("places without labels (checkerboard)", 65, "universal, simulated alone", "40")
     )
     mean, values = row["accuracy_pct"]["mean"], row["accuracy_pct"]["values"]
-    line = next(line for line in block.splitlines() if "we ship" in line and "within 1 mm" in line)
+    line = next(line for line in block.splitlines() if "shipped model" in line and "within 1 mm" in line)
     assert line.endswith(f"| {mean:.0f} ({values[0]:.0f}; {values[1]:.0f}) |")
 
 

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from pipeline.executors import InProcessExecutor
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.report.drawing import COLOURS, ERROR_COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 from pipeline.settings import SectionWithTraining, Settings, Training
@@ -262,7 +262,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         most_mm = numbers["p95_error_mm"]["mean"]
         size = float(np.clip(12_000 / len(drawn["x_mm"]), 10, 60))
         points = axes.scatter(
-            drawn["x_mm"], drawn["y_mm"], c=drawn["error_mm"], s=size, cmap="viridis", vmin=0.0, vmax=most_mm,
+            drawn["x_mm"], drawn["y_mm"], c=drawn["error_mm"], s=size, cmap=ERROR_COLOURS, vmin=0.0, vmax=most_mm,
             edgecolors="white", linewidths=0.3, zorder=3,
         )  # fmt: skip
         bar = figure.colorbar(points, label="place error, first seed / mm", extend="max", shrink=0.8)

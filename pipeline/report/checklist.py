@@ -247,14 +247,14 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if not pooled and row.ours.startswith(NEEDS_POOLING):
         return Judgement(notes=(ONE_SKIN,))
     if isinstance(ours, bool):
-        return Judgement(FEW_BOARDS, "true on the board that was measured", _yes(ours))
+        return Judgement(FEW_BOARDS, "true on the measured board", _yes(ours))
     if row.rule == "setting" or (row.rule == "input" and simulated):
         return Judgement(notes=(SETTING,))
     if row.rule == "view":
         return Judgement()
     if row.rule == "finding":
         met = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
-        return Judgement(ours["verdict"], "true for the networks that were trained", met)
+        return Judgement(ours["verdict"], "true for the networks trained here", met)
     if row.rule == "each":
         return _judge_each(ours)
     if row.rule in DIFFERENCES:

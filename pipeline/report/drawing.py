@@ -41,6 +41,8 @@ STYLE = {
 }
 # Okabe & Ito 2008: colours that colour-blind readers can distinguish; their yellow is omitted, as it is pale on white.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Colours of errors in maps: large errors are dark on a white page, and light on a dark page.
+ERROR_COLOURS = "viridis_r"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
+from pipeline.report.drawing import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
 from pipeline.report.layout import WIDTH_IN
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
@@ -96,7 +96,7 @@ def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str
     # Non-breaking spaces keep "n = 6" on one line.
     names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]
     row_in = max(0.5, 0.19 * max(name.count("\n") + 1 for name in names))  # so that neighbouring names do not touch
-    with drawing(4.7, 1.2 + row_in * len(rows) * len(metrics)) as figure:
+    with drawing(4.7, 1.2 + row_in * max(len(rows), 2) * len(metrics)) as figure:
         for axes, metric in zip(figure.subplots(len(metrics), 1, squeeze=False)[:, 0], metrics, strict=True):
             paper = [
                 {metric: dict(zip(("mean", "sd"), model.paper[metric], strict=True))} if metric in model.paper else {}
@@ -335,7 +335,7 @@ def error_grid(
             _draw_skin(axes, PAPERS_SKIN)
             ticks_mm = np.arange(0, GRID_MM + 1, TICK_MM)
             axes.set(xticks=ticks_mm, yticks=ticks_mm)
-        look = {"cmap": "viridis", "vmin": 0.0, "vmax": WORST_MM, "marker": "s", "linewidths": 0, "zorder": 1}
+        look = {"cmap": ERROR_COLOURS, "vmin": 0.0, "vmax": WORST_MM, "marker": "s", "linewidths": 0, "zorder": 1}
         points = axes.scatter(*places.T, c=mean_mm, s=size, **look)
         figure.colorbar(points, label="mean position error / mm", extend="max", shrink=0.8)
         if axes.get_legend_handles_labels()[0]:

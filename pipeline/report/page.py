@@ -41,7 +41,7 @@ BESIDE_N = 4  # a section compares at most this many results with the paper; the
 EFFORTS = "Scores on new skins, by model and by the data that the model needs from the new skin"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated, so no number on this page was measured on hardware.",
-    "recorded": "Every reading of this scene was recorded from hardware.",
+    "recorded": "Every capture of this scene was recorded from hardware. Results of simulated readings are marked.",
 }
 RESULTS = ("table-2", "figure-")  # the ids of those tables and figures of the paper that show results start with these
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
@@ -209,7 +209,7 @@ def efforts_table(name: str, answered: Answers) -> Table | None:
 
 
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
-    """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
+    """Render the page of one run (commit, machine, versions, times), to which the scene's page links.
 
     numbers: numbers.json joined with provenance.json. costs: texts of the other files in the folder of the page, by
     file name.
@@ -442,10 +442,10 @@ def _in_words(name: str) -> str:
 
 
 def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
-    """Join the columns that explain a verdict: criterion, p-value and notes."""
-    parts = {"criterion": "{}", "p (Holm)": "p = {} (Holm)", "note": "{}"}
+    """Join the columns that explain a verdict: criterion, whether our mean meets it, p-value and notes."""
+    parts = {"criterion": "{criterion}: {met}", "p (Holm)": "p = {p (Holm)} (Holm)", "note": "{note}"}
     why = [
-        "; ".join(text.format(row[name]) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
+        "; ".join(text.format_map(row) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
         for row in cells.to_dict("records")
     ]
     shown = cells.drop(columns=[*parts, "met", "paper in our interval", "stage"], errors="ignore")
@@ -469,7 +469,10 @@ def _width_rem(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> int:
 
 
 def _look(cells: "pd.Series[str]") -> str:
-    if all(NUMBER.fullmatch(cell) for cell in cells) and any(cell not in ("", "–") for cell in cells):
+    """Return the style of a column. Numbers with deviations are aligned left, like those with intervals."""
+    if all(NUMBER.fullmatch(cell) and "±" not in cell for cell in cells) and any(
+        cell not in NO_VALUE for cell in cells
+    ):
         return "number"
     return "text long" if cells.str.len().max() > LONG else "text"
 

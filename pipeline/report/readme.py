@@ -59,21 +59,21 @@ SIMULATED_MEANING = (
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
     "universal, boards of the rig": "simulation and the rig's other board",
-    "universal, simulated alone": "simulation (the universal model that we ship)",
+    "universal, simulated alone": "simulation (the shipped model)",
 }
 SHORT_NAMES = {
     "universal, boards of the rig": "model trained with the other board",
     "universal, simulated alone": "shipped model",
 }
-LABELS = {"0": "no label", "weight": "one known weight", "10": "10 labels", "40": "40 labels"}
+LABELS = {"0": "no label", "weight": "one known weight, mid-skin", "10": "10 labels", "40": "40 labels"}
 RECORDED_METRICS = {
     "accuracy_pct": ("within 1 mm in x and y, %", 0), "mse_f_N2": ("force error (rms), N", 1),
-    "r2_f": ("R² of force", 2),
+    "r2_f": ("R² of force (0: constant force)", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Numbers are "
-    "means over {draws_n} random draws of presses and labels. In all columns, the model is also calibrated to "
-    "{presses_n} presses at unknown places. Labels are spread over the skin. {halves}\n\n{touch}"
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Numbers "
+    "are means over {draws_n} random draws of presses and labels. In all columns, the model is first calibrated to "
+    "{presses_n} presses without labels. Labels are spread over the skin. {halves}\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -261,7 +261,7 @@ def _halves(numbers: Numbers) -> str:
     if not scores:
         return ""
     return (
-        "If all 40 labels are on one half of the skin, the following share of the presses on the other half is within "
+        "If all 40 labels are on one half of the skin, so many presses on the other half are within "
         f"1 mm: {', '.join(scores)}."
     )
 
@@ -276,9 +276,10 @@ def _touches(numbers: Numbers) -> str:
     if not by_baseline:
         return ""
     missed = max(100 - row["detected_pct"] for rows in by_baseline.values() for row in rows)
-    false = [
-        f"{baseline}, {max(row['false_alarm_pct'] for row in rows):.0f} %" for baseline, rows in by_baseline.items()
-    ]
+    false = []
+    for baseline, rows in by_baseline.items():
+        rates = sorted({f"{row['false_alarm_pct']:.0f}" for row in rows}, key=float)
+        false.append(f"{baseline}, {' to '.join(rates)} %")
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     share = f"at most {missed:.2g} %" if missed else "none"
     return (

@@ -11,10 +11,7 @@ from pipeline.report.paper import TABLE_2
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 # Places where no line break is allowed: between a number and its unit.
 UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
-MAPS = (
-    "Look for places with large errors, for example at the edge of the skin or between the chips. A colour means the "
-    "same error in all maps."
-)
+MAPS = "Colours show the mean error at each place of the skin. A colour means the same error in all maps."
 # The sentences that contain no results, by figure. They tell the reader what to look for in the figure.
 LOOK = {
     LABELS: "Each row is one method. Compare its mark for 0 labels with its mark for the most labels to see how much "
@@ -23,8 +20,8 @@ LOOK = {
     "colour of a line is the number of contacts before it.",
     "variation_skins.svg": "The indentations are equal on all skins, but the fields differ. A network has to cope with "
     "this difference if it is used on a new skin.",
-    "drift_wander.svg": "If a line falls from left to right, the field at rest drifts so fast that no-load readings "
-    "should be taken more often.",
+    "drift_wander.svg": "If the accuracy falls or an error rises from left to right, the field at rest drifts so fast "
+    "that no-load readings should be taken more often.",
     "sensitivity.svg": "At the difference in weight where a curve crosses the line of 95 %, 95 of 100 pairs of "
     "readings are ordered correctly.",
     "logs.svg": "Where the two lines of the force differ, the model misses a contact, reports a contact that does not "
@@ -49,8 +46,7 @@ LOOK = {
     "detected is where an extrapolated line crosses the threshold.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
     "places is still high.",
-    "worlds.svg": "If the lines in a column are steep, the factor of this column changes the scores much. The dashed "
-    "lines are the scores of the paper.",
+    "worlds.svg": "If the lines in a column are steep, the factor of this column changes the scores much.",
     "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "inference.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "
