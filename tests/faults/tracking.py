@@ -53,7 +53,7 @@ def refused(checkout: Checkout) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     first = checkout.run(*checkout.command("publish"), MLFLOW_TRACKING_URI=f"http://127.0.0.1:{port}")
-    return _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish"))
+    return _report(checkout, first, checkout.run("reskin", "publish"))
 
 
 BLACK_HOLE = "10.255.255.1"
@@ -149,7 +149,7 @@ def _signal_server_in_mid_run(checkout: Checkout, number: signal.Signals) -> Row
         first = checkout.end(publishing, start_s)
     written_n = _finished_n(checkout.folder / "team.db")
     with _mlflow_server(checkout, port):
-        row = _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
+        row = _report(checkout, first, checkout.run("reskin", "publish", MLFLOW_TRACKING_URI=uri))
     row.next_run += f", {written_n} runs were in the store before"
     return row
 
@@ -202,4 +202,4 @@ def locked_in_mid_run(checkout: Checkout) -> Row:
     with closing(sqlite3.connect(store, timeout=30)) as other:
         other.execute("BEGIN EXCLUSIVE")
         first = checkout.end(publishing, start_s)
-    return _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish"))
+    return _report(checkout, first, checkout.run("reskin", "publish"))
