@@ -117,7 +117,7 @@ def read_script(source: str, *, board: str | None = None, robot: bool = False) -
         By default, the skin is touched at random places.
     """
     folder = Path(source)
-    if (board is not None or robot) and source != NOMINAL_SOURCE:
+    if (board is not None or robot) and source != NOMINAL_SOURCE and folder.exists():
         raise ParamsError(f"{source}: --board and --robot can only be used with source {NOMINAL_SOURCE}. Omit them.")
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)

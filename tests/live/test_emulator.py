@@ -355,3 +355,5 @@ class TestRobot:
         for options in ({"board": "b1"}, {"robot": True}):
             with pytest.raises(ParamsError, match="can only be used with source nominal"):
                 read_script(str(tmp_path / "c0"), **options)
+            with pytest.raises(ParamsError, match="nominl: the source must be the folder of a capture"):
+                read_script("nominl", **options)
