@@ -261,7 +261,7 @@ def _halves(numbers: Numbers) -> str:
     if not scores:
         return ""
     return (
-        "If all 40 labels are on one half of the skin, so many presses on the other half are within "
+        "If all 40 labels are on one half of the skin, this share of presses on the other half is within "
         f"1 mm: {', '.join(scores)}."
     )
 
