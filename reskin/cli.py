@@ -6,6 +6,7 @@ imports its dependencies only when it runs, so that `reskin --help` is quick.
 
 import importlib
 import math
+import os
 import signal
 import sys
 import threading
@@ -393,8 +394,18 @@ def live(
             port or [found.port for found in find_boards()], models, description, fault_policy, skins=skin_folder,
             model_name=", ".join(file.name for file in model or ()), emulated=emulated,
         )  # fmt: skip
+        _warn_of_absent_ports(port or ())
         where = f"skins are saved in {skins.absolute()}, recordings in {CAPTURES.absolute()}"
         serve(sessions, host=host, http_port=http_port, say=typer.echo, where=where)
+
+
+def _warn_of_absent_ports(ports: Sequence[str]) -> None:
+    """Print a warning for each serial port that does not exist. The page waits for such a port."""
+    from reskin.board.port import found_ports, port_names
+
+    for port in ports:
+        if "://" not in port and port not in port_names() and not os.path.exists(port):
+            typer.echo(f"warning: {port}: no such port. The page waits for it. {found_ports()}", err=True)
 
 
 @app.command(rich_help_panel=RECORDINGS)

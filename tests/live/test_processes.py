@@ -109,6 +109,7 @@ def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_
     asyncio.run(watch_page(f"http://localhost:{http_port}/live"))
     page.send_signal(signal.SIGINT)
     assert page.wait(timeout=LONG_S) == 0
+    assert f"{link}: no such port. The page waits for it." in page.stderr.read()
 
 
 async def watch_page(address: str) -> None:
