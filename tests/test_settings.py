@@ -149,19 +149,22 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
-SIMULATING = {  # These experiments simulate skins themselves.
-    "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
-}  # fmt: skip
+WHOLE = {"contacts", "neglected_effects"}  # These experiments depend on the whole section `simulate` and all terms.
+WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # These read the boards of the scene.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
     (PARAMS, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
-    (SKIN, "skin.modulus_kPa=300.0", SIMULATE | FINGERPRINTED | SIMULATING),
-    (SKIN, "terms.ageing.settling=0.2", SIMULATE | SIMULATING),
+    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "runtime", "bound"}),
+    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient", "bound"}),
+    (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible", "contacts"}),
-    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *SIMULATING}),
+    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *WHOLE}),
+    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", *WHOLE}),
+    (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper", *WHOLE}),
+    (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS | WHOLE),
     (SCENE, "train_single.steps_n=10", {"train_single", "contacts"}),
     (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient", "contacts"}),
     (SCENE, "adapt.steps_n=4", {*ADAPTING, "contacts"}),
