@@ -142,4 +142,6 @@ def _held_out_likelihood(estimator: str, log_N: Float[np.ndarray, " m"], true_lo
 
 
 def _row(log_N: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    return np.column_stack([np.ones(len(log_N)), log_N - LOG_CENTRE_N])
+    row = np.ones((len(log_N), 2))
+    row[:, 1] = log_N - LOG_CENTRE_N
+    return row
