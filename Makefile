@@ -86,7 +86,9 @@ ui: $(STAMP)
 	MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false $(BIN)/mlflow ui --workers 1 --backend-store-uri sqlite:///mlflow.db
 
 bench: $(STAMP)
-	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks tests/stages tests/experiments tests/models tests/test_numerics.py tests/test_tutorial.py -s -q -p no:xdist
+	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest -s -q -p no:xdist tests/benchmarks \
+		tests/stages tests/experiments tests/models tests/live/test_gripper.py \
+		tests/recordings/readers/test_lateness.py tests/test_numerics.py tests/test_pyfunc.py tests/test_tutorial.py
 
 # Causes faults such as killed processes, full disks, truncated files and dead servers, each in a copy of a small
 # checkout whose stages have run.

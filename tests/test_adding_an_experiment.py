@@ -147,24 +147,22 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     }  # fmt: skip
 
 
-def test_edit_of_a_caption_reruns_the_report_and_edit_of_code_also_the_experiment(root, before):
-    captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
-    with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
-        after = state(root)
-    # Stage table2 depends on the captions of all tables.
-    assert stale_stages(before, after) == {
-        "table2@ci",
-        "report@ci",
+def test_edit_of_a_caption_reruns_the_stages_that_show_it_and_edits_of_comments_rerun_no_stage(root, before):
+    captions, io = "pipeline/experiments/shear.yaml", "reskin/io.py"
+    edits = {
+        captions: (root / captions).read_text().replace("title: ", "title: More ", 1),
+        io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1),
     }
+    with edited_files(root, edits):
+        after = state(root)
+    assert stale_stages(before, after) == {"table2@ci", "report@ci"}  # Table2 depends on the captions of all tables.
+
+
+def test_edit_of_code_reruns_its_experiment_and_the_report(root, before):
+    module = "pipeline/experiments/shear.py"
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci"}
-
-
-def test_edited_comments_rerun_no_stage(root, before):
-    io = "reskin/io.py"
-    with edited_files(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
-        assert stale_stages(before, state(root)) == set()
 
 
 def test_edited_comments_do_not_change_the_keys_of_cached_training_runs(tmp_path, monkeypatch):
