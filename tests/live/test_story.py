@@ -1,8 +1,6 @@
-"""Test of the whole path from an emulated board to live estimates: emulate, record, add, `dvc repro`, open."""
+"""Test of the path from an emulated board to live estimates: emulate, record, add, run stages, open."""
 
-import json
 import os
-import shutil
 from contextlib import closing
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import plan
+from reskin import io
 from reskin.board.wire import Frames
 from reskin.live.emulator import Script, encode_pieces, inject, parse_fault
 from reskin.models.trained import read_network
@@ -76,11 +75,10 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     seal(folder, header)
 
 
-def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path, empty_store):
+def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path):
     script, log = make_poke_script()
     root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
     (root / "robot.csv").write_text(probe.render(log))
-    shutil.copy(empty_store, root / "mlflow.db")
     with (root / "pipeline/scenes/pressed.yaml").open("w") as stream:
         YAML().dump(SCENE, stream)
     plan.use(root, [])
@@ -91,15 +89,15 @@ def test_recorded_board_becomes_a_model_that_estimates_live(tmp_path, empty_stor
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
         write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
+    # The report of a recorded scene is tested by tests/recordings/test_lab_story.py.
     with warm_stages(root) as run_stages:
-        run_stages()
+        run_stages("code", "ingest@pressed-run1", "split@pressed", "train_single@pressed")
 
-    numbers = json.loads((root / "reports/pressed/numbers.json").read_text())
-    assert numbers["provenance"]["source"] == "recorded"
-    assert numbers["capture"]["logged_indentations_n"] == POKES_N
-    assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
+    counts = io.read_ingest_counts(root / "data/indentations/pressed/run1.parquet")
+    assert counts["logged_indentations_n"] == POKES_N
+    assert counts["frames_n"] * 82 == counts["frame_bytes_n"]
     # When a terminal is opened or closed, bytes that wait there are discarded.
-    assert numbers["capture"]["frames_n"] > 0.7 * len(script)
+    assert counts["frames_n"] > 0.7 * len(script)
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = play_to_skin(script, [read_network(model)])
     t_s = np.concatenate([batch.t_s[batch.contact] for batch in readings])

@@ -69,6 +69,8 @@ def test_sentence_about_drift_gives_accuracies_with_one_decimal():
 
 def test_sentence_about_pokes_states_that_bars_are_not_intervals_of_the_difference():
     numbers = numbers_of("quick")
+    (pair,) = [pair for pair in numbers["paired"] if (pair["of"], pair["over"]) == ("adapted", "triplet")]
+    pair["accuracy_pct"] |= {"mean": 2.1, "ci95": [0.01, 4.17]}
     sentence = sentences(numbers)["sweep_pokes.svg"]
     assert sentence.endswith("two scores: this difference is +2.1 points [0.01, 4.17] from 0 to 390 pokes.")
     del numbers["paired"]
