@@ -4,7 +4,7 @@ A user writes a layout as a YAML file. The file `layouts/reskin.yaml` is an exam
 """
 
 import math
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -139,7 +139,7 @@ class BoardLayout(Strict):
         """Positions of the chips relative to the board's centre."""
         return np.array([(chip.x_mm, chip.y_mm) for chip in self.chips])
 
-    @cached_property
+    @property
     def turns_deg(self) -> tuple[float, ...]:
         """Rotation of each chip about z in degrees."""
         return tuple(float(chip.turn_deg) for chip in self.chips)
