@@ -22,7 +22,7 @@ from tests.benchmarks import FULL
 # No deadlines: the time of an example depends on the load of the machine. Each run has the same examples, so that tests
 # of unchanged code do not begin to fail. With `--hypothesis-profile=thorough`, many other examples are drawn.
 always = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
-settings.register_profile("same", max_examples=50, derandomize=True, **always)
+settings.register_profile("same", max_examples=25, derandomize=True, **always)
 settings.register_profile("thorough", max_examples=1000, **always)
 settings.load_profile("same")
 
