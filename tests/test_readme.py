@@ -13,20 +13,21 @@ from reskin import io
 from reskin.config import read_yaml
 from reskin.errors import ReskinError
 from tests.report.synthetic import all_experiments
-from tests.stages.checkout import ROOT, copy_checkout, run
+from tests.stages.checkout import ROOT, copy_checkout
 
 INPUTS = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
 FIGURE = "docs/img/headline.svg"
 
 
-def test_readme_shows_the_committed_results():
+def test_readme_shows_the_committed_results(monkeypatch):
     status = subprocess.run(
         ["git", "status", "--porcelain", "--", *INPUTS], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if status.returncode or status.stdout:
         pytest.skip("the results or scenes of this checkout are not committed; `reskin readme` would show them")
-    done = run(ROOT, "reskin", "readme", "--check", check=False)
-    assert done.returncode == 0, done.stderr
+    monkeypatch.chdir(ROOT)
+    done = CliRunner().invoke(app, ["readme", "--check"])
+    assert done.exit_code == 0, done.output
 
 
 def reskin(*arguments):

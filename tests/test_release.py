@@ -1,6 +1,5 @@
 """Tests of the release: files in the wheel, version, licences, required packages."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -8,6 +7,7 @@ import tomllib
 from importlib.metadata import PathDistribution
 from pathlib import Path
 
+import grimp
 import pytest
 from packaging.specifiers import SpecifierSet
 
@@ -115,11 +115,8 @@ def test_error_for_a_missing_package_names_the_extra_that_installs_it():
 
 
 def test_imported_packages_are_declared():
-    sources = [*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "reskin").rglob("*.py")]
-    nodes = [node for file in sources for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))]
-    modules = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    modules += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module and not node.level]
-    names = {module.partition(".")[0] for module in modules}
+    graph = grimp.build_graph("pipeline", "reskin", include_external_packages=True, cache_dir=None)
+    names = {module.partition(".")[0] for module in graph.modules}
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
