@@ -1,7 +1,8 @@
 """Settings of a scene: they come from the scene's file, from `params.yaml`, and from the library's nominal skin.
 
-Each file is read once. In `dvc.yaml`, the `params` of a stage must be the sections of settings that the stage parses;
-tests/test_settings.py checks this.
+Each file is read once. In `dvc.yaml`, the `params` of a stage must contain all settings on which its results depend.
+tests/test_settings.py checks this for the section of the stage and for the sections to which it refers. It does not
+check which parts of section `simulate` and of the nominal skin a stage uses.
 """
 
 import inspect
