@@ -403,9 +403,10 @@ def _warn_of_absent_ports(ports: Sequence[str]) -> None:
     """Print a warning for each serial port that does not exist. The page waits for such a port."""
     from reskin.board.port import found_ports, port_names
 
-    for port in ports:
-        if "://" not in port and port not in port_names() and not os.path.exists(port):
-            typer.echo(f"warning: {port}: no such port. The page waits for it. {found_ports()}", err=True)
+    absent = [port for port in ports if "://" not in port and not os.path.exists(port)]
+    known = {name.casefold() for name in port_names()} if absent else set()  # Windows ignores the case of names
+    if missing := [port for port in absent if port.casefold() not in known]:
+        typer.echo(f"warning: {', '.join(missing)}: no such port. The page waits for it. {found_ports()}", err=True)
 
 
 @app.command(rich_help_panel=RECORDINGS)

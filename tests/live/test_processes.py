@@ -21,7 +21,7 @@ import pytest
 from typer.testing import CliRunner
 
 from reskin import io
-from reskin.cli import app
+from reskin.cli import _warn_of_absent_ports, app
 from reskin.errors import ReskinError
 from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.preparing import CaptureNames, native
@@ -169,6 +169,14 @@ def test_recording_is_complete_if_the_board_is_unplugged(shell, tmp_path):
     wait_until(link.is_symlink)
     assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")
     assert (tmp_path / "run1" / HEADER_FILE).is_file()
+
+
+def test_live_warns_only_of_serial_ports_that_do_not_exist(tmp_path, capsys):
+    (tmp_path / "here").touch()
+    _warn_of_absent_ports([str(tmp_path / "here"), "socket://localhost:9"])
+    assert capsys.readouterr().err == ""
+    _warn_of_absent_ports([str(tmp_path / "here"), "/dev/absent1", "/dev/absent2"])
+    assert capsys.readouterr().err.startswith("warning: /dev/absent1, /dev/absent2: no such port. The page waits")
 
 
 def test_invalid_options_are_errors_of_one_sentence(shell):
