@@ -148,6 +148,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
 
 
 def test_edit_of_a_caption_reruns_the_stages_that_show_it_and_edits_of_comments_rerun_no_stage(root, before):
+    # Both edits are made at once, because each call of `state` takes seconds.
     captions, io = "pipeline/experiments/shear.yaml", "reskin/io.py"
     edits = {
         captions: (root / captions).read_text().replace("title: ", "title: More ", 1),
