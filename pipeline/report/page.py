@@ -491,5 +491,16 @@ def _fill(
         "title": section.title,
         "sentence": section.sentence,
         "tables": [lay_out(name, text, tables[name], ids) for name, text in captions.items() if name in tables],
-        "figures": [(figures[name], f"{text} ({source})") for name, text in section.figures.items() if name in figures],
+        "figures": [
+            (figures[name], _with_source(text, source)) for name, text in section.figures.items() if name in figures
+        ],
     }
+
+
+def _with_source(caption: str, source: str) -> str:
+    """Append the source of the data to a caption, unless the caption says which data are recorded or simulated.
+
+    >>> _with_source("Forces on the recorded hand, and on simulated skins", "recorded")
+    'Forces on the recorded hand, and on simulated skins'
+    """
+    return caption if "recorded" in caption and "simulated" in caption else f"{caption} ({source})"

@@ -353,6 +353,14 @@ def test_explanation_of_a_verdict_says_whether_our_mean_meets_the_criterion():
     assert table.rows == [("x", "5", "not judged", "above 9: no; few")]
 
 
+def test_text_between_backquotes_is_code_in_cells_and_notes():
+    table = pd.DataFrame({"field": ["limits"], "value": ["Load it with `reskin.load_universal()` < 1 s"]})
+    table.attrs["meaning"] = "Key `seeds` counts networks."
+    shown = render(surprise=table)
+    assert "with <code>reskin.load_universal()</code> &lt; 1 s" in shown
+    assert "Key <code>seeds</code> counts networks." in shown
+
+
 def test_notes_of_tables_are_shown(read):
     assert any("within 1 mm" in text for text in read.words)
 
