@@ -150,7 +150,7 @@ ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
 WHOLE = {"contacts", "neglected_effects"}  # These experiments depend on the whole section `simulate` and all terms.
-WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # These read the boards, but not all of it.
+WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),

@@ -498,7 +498,7 @@ def _fill(
 
 
 def _with_source(caption: str, source: str) -> str:
-    """Append the source of the data to a caption, unless the caption says which data are recorded or simulated.
+    """Append the source of the data to a caption, unless the caption itself names recorded and simulated data.
 
     >>> _with_source("Forces on the recorded hand, and on simulated skins", "recorded")
     'Forces on the recorded hand, and on simulated skins'
