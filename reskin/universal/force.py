@@ -74,8 +74,9 @@ class ForceLine:
 
     def apply(self, log_N: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Convert estimated log forces to calibrated log forces. Returns these and their standard deviations."""
-        row = _row(log_N)
-        return LOG_CENTRE_N + row @ self.mean, np.sqrt(((row @ self.cov) * row).sum(axis=1) + self.scatter_var)
+        (intercept, slope), off = self.mean, log_N - LOG_CENTRE_N
+        var = self.cov[0, 0] + self.scatter_var + off * (2 * self.cov[0, 1] + off * self.cov[1, 1])
+        return LOG_CENTRE_N + intercept + slope * off, np.sqrt(var)
 
     def condition(self, log_N: Float[np.ndarray, " m"], true_log_N: Float[np.ndarray, " m"]) -> "ForceLine":
         """Condition the line on presses with known forces.

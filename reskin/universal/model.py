@@ -165,7 +165,8 @@ class Evaluation:
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
         selected = ESTIMATORS.index(self.line.estimator)
-        log_N, sd_log_N = self.line.apply((self.other_log_forces or by_estimator)[selected])
+        log_forces = by_estimator if self.unlabelled is None else self.other_log_forces
+        log_N, sd_log_N = self.line.apply(log_forces[selected])
         if self.few is not None:
             near = kernel(place_mm, self.few.place_mm, log_N, self.few.log_N).max(axis=1)
             log_N = near * by_estimator[selected] + (1 - near) * log_N
@@ -173,15 +174,14 @@ class Evaluation:
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
         """Return the logarithms of the forces before calibration, once for each of `ESTIMATORS`."""
-        return self.other_log_forces or self._products(self.likelihoods, 1.0)[2]
+        return self._products(self.likelihoods, 1.0)[2] if self.unlabelled is None else self.other_log_forces
 
     @cached_property
     def other_log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
-        """Logarithms of the forces from the map that is not conditioned on the few known forces.
-
-        Empty if there is no such map.
-        """
-        return () if self.unlabelled is None else self._products(self.unlabelled, 1.0)[2]
+        """Logarithms of the forces from the map that is not conditioned on the few known forces."""
+        if self.unlabelled is None:
+            raise ValueError("this evaluation has only the map that is conditioned on all labels")
+        return self._products(self.unlabelled, 1.0)[2]
 
     def _products(
         self, likelihoods: Likelihoods, power: float
@@ -242,8 +242,9 @@ class CalibratedModel:
 
         `method` computes one or several estimates from the evaluation of a block.
         """
-        starts = range(0, max(len(db_uT), 1), BLOCK_N)
-        by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in starts]
+        if len(db_uT) <= BLOCK_N:
+            return list(method(self.evaluate(db_uT)))
+        by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in range(0, len(db_uT), BLOCK_N)]
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
 
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
@@ -557,6 +558,8 @@ class Universal:
         self._turned_given = False  # whether the user stated the orientation of the skin
         # If a saved calibration was loaded, this is the no-load reading in its file.
         self._saved_uT: Float[np.ndarray, " ch"] | None = None
+        self._centre_mm = np.array(self.layout.centre_mm)
+        self._to_board = self.layout.to_board(np.eye(self.channels_n))
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
@@ -570,10 +573,10 @@ class Universal:
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        # The following three results of cross-validation are None until they are needed.
+        # The following three results, which require cross-validation, are None until they are needed.
         self._folds: list[HeldOutLabels] | None
         self._power: float | None
-        self._line: ForceLine | None
+        self._calibrated: CalibratedModel | None
         self._restart(self._prior_map, CalibrationData.at_rest(self.tables.rest_uT))
 
     def __repr__(self) -> str:
@@ -601,7 +604,11 @@ class Universal:
     @property
     def calibrated(self) -> CalibratedModel:
         """Map and networks, conditioned on all calibration data, in the board's frame."""
-        return replace(self._model, line=self.line)
+        if self._calibrated is None:
+            labels = [day for day, _ in self._calibration.labels_by_day(self._calibration.data.labels)]
+            earlier = self._calibration.held_out_earlier(has_few(reduce(join_labels, labels)))
+            self._calibrated = replace(self._model, line=line_of_labels([*self._held_out(), *earlier]))
+        return self._calibrated
 
     @property
     def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
@@ -761,11 +768,7 @@ class Universal:
     @property
     def line(self) -> ForceLine:
         """The line that calibrates the forces, fitted to the labelled presses whose force is known."""
-        if self._line is None:
-            labels = [day for day, _ in self._calibration.labels_by_day(self._calibration.data.labels)]
-            earlier = self._calibration.held_out_earlier(has_few(reduce(join_labels, labels)))
-            self._line = line_of_labels([*self._held_out(), *earlier])
-        return self._line
+        return self.calibrated.line
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False, turned: bool | None = None) -> "Universal":
         """Set the no-load field to the mean of readings without contact, and condition the map on this field.
@@ -1007,16 +1010,13 @@ class Universal:
         """
         return self.predict(check_shape(db_uT, self.channels_n) + self.noload_uT).astype(np.float32)
 
-    @property
-    def _centre_mm(self) -> Float[np.ndarray, "2"]:
-        return np.array(self.layout.centre_mm)
-
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Subtract the no-load reading from readings, and return the field changes along the board's axes.
 
         Raises SchemaError if `zero` has not been called yet.
         """
-        return self._sign * self.layout.to_board(check_shape(b_uT, self.channels_n) - self.noload_uT)
+        db_uT = (check_shape(b_uT, self.channels_n) - self.noload_uT) @ self._to_board
+        return -db_uT if self._data.turned else db_uT
 
     def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
         """Return the field changes of presses along the board's axes.
@@ -1066,7 +1066,7 @@ class Universal:
         self._data = data
         self._calibration = PressCalibration(press_map, self.networks, joined, earlier)
         self._model = self._calibration.with_labels(joined.labels).with_offsets_in_biases()
-        self._folds = self._power = self._line = None
+        self._folds = self._power = self._calibrated = None
         return self
 
 
