@@ -15,7 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.models.reproducible import affine, exp
+from reskin.models.reproducible import affine, affine_layers, exp
 from reskin.numerics import BEYOND_AVX2, PINNED, TOO_LATE, VARIABLES, cpu_flags, departures, pinned
 from reskin.seeds import rng_for
 from tests.benchmarks import size
@@ -67,6 +67,28 @@ def test_affine_and_its_gradients_equal_those_of_pytorch():
             # The tolerance is rounding in double precision of sums of at most 21 products of about 1.
             torch.testing.assert_close(one.grad, other.grad)
         torch.testing.assert_close(affine(*ours), torch.matmul(theirs[0], theirs[1]) + theirs[2])
+
+
+@pytest.mark.parametrize("frozen", [None, "inputs", "layer 2"])
+def test_layers_and_their_gradients_equal_those_of_pytorch(frozen):
+    rng, relus = rng_for(0, "layers"), (True, False, True)
+    shapes = ((3, 7, 5), (3, 5, 6), (3, 6, 4), (3, 4, 2), (3, 1, 6), (3, 1, 4), (3, 1, 2))
+    ours = [torch.from_numpy(rng.normal(size=shape)).requires_grad_() for shape in shapes]
+    for i in {None: (), "inputs": (0,), "layer 2": (2, 5)}[frozen]:
+        ours[i].requires_grad_(False)
+    theirs = [values.detach().clone().requires_grad_(values.requires_grad) for values in ours]
+    mine = affine_layers(ours[0], ours[1:4], ours[4:], relus)
+    plain = theirs[0]
+    for weight, bias, relu in zip(theirs[1:4], theirs[4:], relus, strict=True):
+        plain = torch.relu(plain @ weight + bias) if relu else plain @ weight + bias
+    torch.testing.assert_close(mine, plain)
+    assert 0 < (plain == 0).sum() < plain.numel()
+    factors = torch.from_numpy(rng.normal(size=plain.shape))
+    (mine * factors).sum().backward()
+    (plain * factors).sum().backward()
+    for one, other in zip(ours, theirs, strict=True):
+        # The tolerance is rounding in double precision of sums of at most 21 products of about 1.
+        torch.testing.assert_close(one.grad, other.grad)
 
 
 def test_product_that_overflows_is_infinite():

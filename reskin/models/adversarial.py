@@ -73,8 +73,8 @@ def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: 
         net.zero_grad()
         discriminator.zero_grad()
         loss.backward()
-        clip_gradients(net, schedule.gradient_norm_max)
-        clip_gradients(discriminator, schedule.gradient_norm_max)
+        clip_gradients(list(net.parameters()), schedule.gradient_norm_max)
+        clip_gradients(list(discriminator.parameters()), schedule.gradient_norm_max)
         optimizer.step(one_cycle(step_i, schedule.steps_n, schedule.rate_max)[0], MOMENTUM)
     return net.weights_of(0)
 

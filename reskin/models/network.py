@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float32
 from torch import nn
 
 from reskin.models.job import Weights
-from reskin.models.reproducible import affine
+from reskin.models.reproducible import affine_layers
 
 HIDDEN_N = 200
 FEATURES_N = 40  # width of the bottleneck layer, on whose output the triplet loss is computed (paper section 4)
@@ -112,10 +112,8 @@ class Stack(nn.Module):
         return torch.stack([torch.isfinite(values.detach()).flatten(1).all(1) for values in self.parameters()]).all(0)
 
     def _run(self, values: torch.Tensor, first: int, last: int) -> torch.Tensor:
-        for i in range(first, last):
-            values = affine(values, self.weights[i], self.biases[i])
-            values = torch.relu_(values) if self.relus[i] else values
-        return values
+        weights, biases = list(self.weights)[first:last], list(self.biases)[first:last]
+        return affine_layers(values, weights, biases, self.relus[first:last])
 
 
 class Predictor:

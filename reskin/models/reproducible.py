@@ -11,6 +11,7 @@ operations of the networks (sums, ReLU, sigmoid, AdamW) do not use MKL.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,27 @@ def affine(
     if weight.ndim == 2 and values.ndim > 2:
         rows = affine(values.flatten(end_dim=-2), weight, bias)
         return rows.unflatten(0, values.shape[:-1])
-    if values.device.type != "cpu":
-        return values @ weight + bias
-    result: torch.Tensor = _Affine.apply(values, weight, bias)  # type: ignore[no-untyped-call]
-    return result
+    return affine_layers(values, [weight], [bias], [False])
+
+
+def affine_layers(
+    values: Float[torch.Tensor, "*n b i"],
+    weights: Sequence[Float[torch.Tensor, "*m _ _"]],
+    biases: Sequence[Float[torch.Tensor, "*m 1 _"]],
+    relus: Sequence[bool],
+) -> Float[torch.Tensor, "*n b o"]:
+    """Apply several layers, one after the other: `values @ weight + bias`, and then a ReLU where `relus` is True.
+
+    On a CPU, all layers together are one operation for PyTorch's autograd, because the networks are so small that the
+    overhead of one operation for each layer would take about a tenth of the training time.
+    """
+    if values.device.type == "cpu":
+        result: torch.Tensor = _AffineLayers.apply(values, relus, *weights, *biases)  # type: ignore[no-untyped-call]
+        return result
+    for weight, bias, relu in zip(weights, biases, relus, strict=True):
+        values = values @ weight + bias
+        values = torch.relu_(values) if relu else values
+    return values
 
 
 def exp(values: Float[torch.Tensor, "*s"]) -> Float[torch.Tensor, "*s"]:
@@ -40,26 +58,41 @@ def exp(values: Float[torch.Tensor, "*s"]) -> Float[torch.Tensor, "*s"]:
     return torch.exp2(values * math.log2(math.e))
 
 
-class _Affine(torch.autograd.Function):
+class _AffineLayers(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(values, weight)
-        return _product(values, weight).add_(bias)
+    def forward(ctx: Any, values: torch.Tensor, relus: Sequence[bool], *parameters: torch.Tensor) -> torch.Tensor:
+        weights, biases = parameters[: len(relus)], parameters[len(relus) :]
+        results: list[torch.Tensor] = []
+        # NumPy's warnings are turned off. As in PyTorch, an overflow then gives inf without a warning, and the training
+        # loop detects it.
+        with np.errstate(all="ignore"):
+            for weight, bias, relu in zip(weights, biases, relus, strict=True):
+                result = _product(results[-1] if results else values, weight).add_(bias)
+                results.append(result.relu_() if relu else result)
+        ctx.save_for_backward(values, *results, *weights)
+        ctx.relus = relus
+        return results[-1]
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (gradient,) = gradients
-        values, weight = ctx.saved_tensors
-        needs_values, needs_weight, needs_bias = ctx.needs_input_grad
-        return (
-            _product(gradient, weight.mT) if needs_values else None,
-            _product(values.mT, gradient) if needs_weight else None,
-            gradient.sum(-2, keepdim=True) if needs_bias else None,
-        )
+        n = len(ctx.relus)
+        inputs, results, weights = ctx.saved_tensors[:n], ctx.saved_tensors[1 : n + 1], ctx.saved_tensors[n + 1 :]
+        needs_values, _, *needs = ctx.needs_input_grad
+        of_weights: list[torch.Tensor | None] = [None] * n
+        of_biases: list[torch.Tensor | None] = [None] * n
+        with np.errstate(all="ignore"):
+            for i in reversed(range(n)):
+                if ctx.relus[i]:
+                    gradient = torch.ops.aten.threshold_backward(gradient, results[i], 0)
+                if needs[i]:
+                    of_weights[i] = _product(inputs[i].mT, gradient)
+                if needs[n + i]:
+                    of_biases[i] = gradient.sum(-2, keepdim=True)
+                if i or needs_values:
+                    gradient = _product(gradient, weights[i].mT)
+        return gradient if needs_values else None, None, *of_weights, *of_biases
 
 
 def _product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    # NumPy's warnings are turned off. As in PyTorch, an overflow then gives inf without a warning, and the training
-    # loop detects it.
-    with np.errstate(all="ignore"):
-        return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

@@ -101,7 +101,8 @@ def train(
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.initial_weights for job in jobs]).to(device)
-    optimizer = AdamW(net.parameters(), schedule.weight_decay)
+    parameters = list(net.parameters())
+    optimizer = AdamW(parameters, schedule.weight_decay)
     batches, monitor = BatchSampler(jobs, schedule.batch_n, device), Monitor(net)
     for first_step in range(0, schedule.steps_n, BLOCK_STEPS_N):
         steps_n = min(BLOCK_STEPS_N, schedule.steps_n - first_step)
@@ -120,11 +121,12 @@ def train(
             if loss_weights.few_labels:
                 predicted = net(batch["few_labels"])
                 loss = loss + loss_weights.few_labels * squared_error(predicted, batch["few_labels_targets"])
-            net.zero_grad()
+            for parameter in parameters:
+                parameter.grad = None
             # The losses of all networks are added, but the gradient of a network depends only on its own loss.
             loss.sum().backward()
             # Gradients are clipped, because a single large step can make all ReLUs of a layer output 0 forever.
-            clip_gradients(net, schedule.gradient_norm_max)
+            clip_gradients(parameters, schedule.gradient_norm_max)
             optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
             errors[step_i - first_step] = error.detach()
         if not monitor.check(errors, first_step + steps_n):
@@ -132,12 +134,12 @@ def train(
     return monitor.outcomes(schedule.steps_n)
 
 
-def clip_gradients(net: Stack, norm_max: float) -> None:
+def clip_gradients(parameters: Sequence[torch.Tensor], norm_max: float) -> None:
     """Clip the gradient of each network to a norm of at most `norm_max`.
 
-    The norm is computed over all weights of the network. A gradient with a larger norm is scaled down.
+    The norm is computed over all parameters of the network. A gradient with a larger norm is scaled down.
     """
-    gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
+    gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )

@@ -200,7 +200,8 @@ STEP = {
     "forward": [(Stack, "features"), (Stack, "head")],
     "losses": [(train_module, "squared_error"), (train_module, "triplet_loss")],
     "backward": [(torch.Tensor, "backward")],
-    "AdamW": [(AdamW, "step"), (Stack, "zero_grad")],
+    "clipping of gradients": [(train_module, "clip_gradients")],
+    "AdamW": [(AdamW, "step")],
     "one-cycle rate": [(train_module, "one_cycle")],
     "check that weights are finite and keep them": [(Monitor, "check")],
 }

@@ -51,7 +51,7 @@ def test_gradients_of_each_network_are_clipped_separately():
     for parameter in net.parameters():
         parameter.grad *= (lengths / whole)[:, None, None]
     before = [parameter.grad.clone() for parameter in net.parameters()]
-    clip_gradients(net, 1.0)
+    clip_gradients(list(net.parameters()), 1.0)
     after = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1)
     torch.testing.assert_close(after.norm(dim=1), torch.tensor([0.0, 0.5, 1.0]))
     torch.testing.assert_close(after[2] * 70, torch.cat([one.flatten(1) for one in before], dim=1)[2])
