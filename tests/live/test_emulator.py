@@ -350,6 +350,11 @@ class TestRobot:
         untouched = [one.frames.b_uT[np.isnan(one.true_contacts[:, 0])].mean(axis=0) for one in (robot_script, other)]
         assert np.abs(untouched[0] - untouched[1]).max() > 50  # The two skins differ by more than this number of uT.
 
+    @pytest.mark.parametrize("name", ["b 1", "../b1", "", "x" * 65])
+    def test_invalid_names_of_boards_raise(self, name):
+        with pytest.raises(ParamsError, match=r"--board: the name must be a name of 1 to 64 .* Choose another name"):
+            read_script("nominal", board=name)
+
     def test_options_for_the_nominal_board_raise_for_other_sources(self, tmp_path):
         write_script(SCRIPT, tmp_path / "c0")
         for options in ({"board": "b1"}, {"robot": True}):

@@ -69,7 +69,7 @@ def test_outline_of_another_board_replaces_that_of_the_papers_board():
 def test_title_of_the_figure_states_the_place_with_the_largest_error():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
-    assert "worst 3.00 mm at x = 2, y = 2" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
+    assert "worst 3.00 mm at (2, 2) mm" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
 
 
 def test_svg_is_made_smaller_without_changing_digits_in_texts():
