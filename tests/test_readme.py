@@ -113,7 +113,7 @@ def test_readme_is_short_and_links_in_the_docs_are_valid():
 
 
 def test_block_recorded_shows_the_scores_of_presses_at_random_places():
-    """Compares cells of the table with the committed results of scene lab."""
+    """Compares cells of the table with the committed results of scene lab, and then with results that are set here."""
     quick, lab = (
         join(*(io.read_json(ROOT / f"reports/{scene}/{name}.json") for name in ("numbers", "provenance")))
         for scene in ("quick", "lab")
@@ -128,6 +128,15 @@ def test_block_recorded_shows_the_scores_of_presses_at_random_places():
     mean, values = row["accuracy_pct"]["mean"], row["accuracy_pct"]["values"]
     line = next(line for line in block.splitlines() if "shipped model" in line and "within 1 mm" in line)
     assert line.endswith(f"| {mean:.0f} ({values[0]:.0f}; {values[1]:.0f}) |")
+
+    # If forces 1 and 3 N (board 1), and 2 and 8 N (board 2), were estimated as their means, the errors were 1 and 3 N.
+    for row in lab["random_presses"]["rows"]:
+        row |= {"mse_f_N2": {"values": [0.5, 18.0]}, "r2_f": {"values": [0.5, -1.0]}}
+        row["mse_f_N2"]["mean"] = row["r2_f"]["mean"] = 0.0
+    assert (
+        "A constant force, the mean of all, has an R² of 0 and an error of 2.0 (1.0; 3.0) N."
+        in (blocks_of([quick], [lab], {}, None)["recorded"])
+    )
 
 
 def test_block_headline_shows_our_scores_next_to_those_of_the_paper():

@@ -341,9 +341,7 @@ def error_grid(
         if axes.get_legend_handles_labels()[0]:
             figure.legend(loc="outside lower left", ncols=2, frameon=False, fontsize=9)
         (x_mm, y_mm), worst_mm = places[mean_mm.argmax()], mean_mm.max()
-        summary = (
-            f"median over places {np.median(mean_mm):.2f} mm, worst {worst_mm:.2f} mm at ({x_mm:g}, {y_mm:g}) mm"
-        )
+        summary = f"median over places {np.median(mean_mm):.2f} mm, worst {worst_mm:.2f} mm at ({x_mm:g}, {y_mm:g}) mm"
         figure.suptitle(f"{title}\n{summary}", x=0.01, ha="left", fontsize=10)
         return svg(figure)
 

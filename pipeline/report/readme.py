@@ -52,14 +52,13 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
-    "skins. Ours are simulated, the paper's were recorded. An earlier "
-    "simulation was tuned to row *Single-sensor*, so this row is not evidence. The paper does not state "
-    "its forces, so MSE_F may not be comparable."
+    "skins. Ours are simulated, the paper's were recorded. Row *Single-sensor* is not evidence, because an earlier "
+    "simulation was tuned to it. The paper does not state its forces, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
-    "universal, boards of the rig": "simulation and the rig's other board",
     "universal, simulated alone": "simulation (the shipped model)",
+    "universal, boards of the rig": "simulation and the rig's other board",
 }
 SHORT_NAMES = {
     "universal, boards of the rig": "model trained with the other board",
@@ -68,12 +67,13 @@ SHORT_NAMES = {
 LABELS = {"0": "no label", "weight": "one known weight, mid-skin", "10": "10 labels", "40": "40 labels"}
 RECORDED_METRICS = {
     "accuracy_pct": ("within 1 mm in x and y, %", 0), "mse_f_N2": ("force error (rms), N", 1),
-    "r2_f": ("R² of force (0: constant force)", 2),
+    "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Numbers "
-    "are means over {draws_n} random draws of presses and labels. In all columns, the model is first calibrated to "
-    "{presses_n} presses without labels. Labels are spread over the skin. {halves}\n\n{touch}"
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Means "
+    "over {draws_n} random draws of presses and labels. In all columns, the model is first calibrated to "
+    "{presses_n} presses without labels. Labels are spread over the skin. {halves} A constant force, the mean of all, "
+    "has an R² of 0 and an error of {constant} N.\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -215,7 +215,7 @@ def _simulated(scenes: Sequence[Numbers]) -> str:
                 scene = numbers["provenance"]["scene"]
                 size = SIZES.get(scene, f"`{scene}`")
                 line[f"{name}: {size}"] = _compact(numbers["table2"].get(key, {}).get(metric), digits)
-            line[f"{name}: the paper"] = f"{paper[metric][0]:.{digits}f}"
+            line[f"{name}: the paper"] = f"{paper[metric][0]:g}" if digits else f"{paper[metric][0]:.0f}"
         lines.append(line)
     commits = ", ".join(f"`{one['provenance']['scene']}` {one['provenance']['trained']}" for one in scenes)
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{SIMULATED_MEANING} Code: {commits}."
@@ -235,7 +235,8 @@ def _recorded(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
     meaning = RECORDED_MEANING.format(
         scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["presses_n"],
-        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), touch=_touches(numbers),
+        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), constant=_constant_force(unseen[0]),
+        touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
 
@@ -251,6 +252,16 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
     return {"mean": values.mean(), "values": values}
 
 
+def _constant_force(row: Numbers) -> str:
+    """Write the rms error in N if the estimated force of every press is the mean force, as mean and by board.
+
+    Its square is the variance of the forces. R² is 1 - MSE / variance.
+    """
+    variances = [mse / (1 - r2) for mse, r2 in zip(row["mse_f_N2"]["values"], row["r2_f"]["values"], strict=True)]
+    values = readable("mse_f_N2", variances)
+    return _compact({"mean": values.mean(), "values": values}, RECORDED_METRICS["mse_f_N2"][1])
+
+
 def _halves(numbers: Numbers) -> str:
     """State the accuracy of each model on one half of the skin if all labels are on the other half."""
     scores = [
@@ -261,8 +272,7 @@ def _halves(numbers: Numbers) -> str:
     if not scores:
         return ""
     return (
-        "If all 40 labels are on one half of the skin, this share of presses on the other half is within "
-        f"1 mm: {', '.join(scores)}."
+        f"If all 40 labels are on one half of the skin, fewer on the other half are within 1 mm: {', '.join(scores)}."
     )
 
 
@@ -279,14 +289,13 @@ def _touches(numbers: Numbers) -> str:
     false = []
     for baseline, rows in by_baseline.items():
         rates = sorted({f"{row['false_alarm_pct']:.0f}" for row in rows}, key=float)
-        false.append(f"{baseline}, {' to '.join(rates)} %")
+        false.append(f"{baseline}, {' and '.join(rates)} %")
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
         f"Forces of the presses: {ranges}. With the threshold of the live page, {share} of these presses are "
         "missed. The rate of false touches depends on when the no-load "
-        f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (button *zero*, or key z, on the "
-        "live page)."
+        f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (key z on the live page)."
     )
 
 
@@ -332,9 +341,9 @@ def _time(times: Numbers) -> str:
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
         f"This takes {environment_min:.1f} min for the environment, {stages_min:.1f} min for the stages "
-        f"({cpu_min:.1f} CPU min). It needs {all_GB:.1f} GB, of which {environment_GB:.1f} GB are the "
-        f"environment. Medians of {len(runs)} fresh clones on {times['machine']} (`make time-repro`, code "
-        f"{times['git']})."
+        f"({cpu_min:.1f} CPU min). With the CPU build of PyTorch, it needs {all_GB:.1f} GB, of which "
+        f"{environment_GB:.1f} GB are the environment. Medians of {len(runs)} fresh clones on {times['machine']} "
+        f"(`make time-repro`, code {times['git']})."
     )
 
 
