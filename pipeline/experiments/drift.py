@@ -903,8 +903,9 @@ def _draw_forces(late: Mapping[str, Any], points: Mapping[str, Sequence[float]],
             f"bias {show_difference(bias)} N ({late['bias_pct']:+.2g} %)\n"
             f"slope {late['slope']:.3g}, {late['indentations_n']:,} indentations\n"
             f"no-load reading: {name}\n"
-            f"bias and slope: mean of {len(late['network_bias_N'])} networks, ± standard error\n"
-            "points: networks of the first seed"
+            "±: standard error\n"
+            f"means of {len(late['network_bias_N'])} networks\n"
+            "points: first seed only"
         )
         axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=10)
         axes.legend(loc="lower right", frameon=False)

@@ -653,8 +653,8 @@ def _place_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[Row]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw false contacts and the accuracy of places against `external_uT`, with one panel for each kind of result."""
-    with drawing(13.0, 3.8) as figure:
-        panels = figure.subplots(1, 4)
+    with drawing(9.5, 8.5) as figure:
+        panels = figure.subplots(2, 2).ravel()
         plain = [row for row in numbers["contacts"] if row["method"] == "none"]
         false = ((plain, "group", RECORDED), (numbers["simulated_contacts"], "field", SIMULATED))
         for axes, (rows, key, kind) in zip(panels[:2], false, strict=True):
@@ -674,5 +674,5 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set(ylabel="within 1 mm / %", title=f"Places, {kind}", ylim=(0, 100))
         for axes in panels:
             axes.set(xlabel="external_uT / µT")
-            axes.legend(fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+            axes.legend(fontsize=9, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3.5)
         return {"moving_hand.svg": svg(figure)}

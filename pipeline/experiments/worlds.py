@@ -289,7 +289,7 @@ DEFAULT_WORLD = "default"
 FACTORS = {
     "residual": "error of the simulation, relative to |dB|",
     "skin_modulus": "spread of stiffness (sd of the logarithm)",
-    "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction between skin and tip",
+    "amplitude_and_gap": "spreads of amplitude and gap / default", "friction": "friction between skin and tip",
 }  # fmt: skip
 DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 MEANING = (

@@ -33,6 +33,7 @@ SIGNIFICANT = 0.05  # convention: a claim of the family is significant if its ad
 PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less than this, in percentage points
 NONE = "–"
 NOT_RUN = "not run in this scene"
+NOT_SIGNIFICANT = "not significant after Holm's correction"
 NOT_REACHED = "the experiment of this scene is too small for this result"
 SHORT_OF = "smaller than the paper's: "  # prefix of a note on the size of our experiment
 ONE_SKIN = "not comparable with the paper, because each of our networks was trained on only one skin"
@@ -229,10 +230,9 @@ def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
 
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
     """Add the adjusted p-value to the judgement of a claim; a verdict that is not significant becomes undecided."""
-    verdict = judgement.verdict
-    if verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
-        verdict = UNDECIDED
-    return replace(judgement, verdict=verdict, p_adjusted=p_adjusted)
+    if judgement.verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
+        return replace(judgement, verdict=UNDECIDED, p_adjusted=p_adjusted, notes=(*judgement.notes, NOT_SIGNIFICANT))
+    return replace(judgement, p_adjusted=p_adjusted)
 
 
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Judgement:

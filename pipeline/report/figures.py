@@ -192,8 +192,9 @@ def unseen_boards(
 ) -> str:
     """Draw places within 1 mm and rms errors of forces on boards never seen in training, by number of labels.
 
-    Each mark is one board. Scores of the paper's table 2 are below, with other marks. A metric that the results lack
-    has no panel. With `large`, for README.md, panels are beside each other and have large letters.
+    Each mark is one board, and each number is the mean of the boards. Scores of the paper's table 2 are below, with
+    other marks. A metric that the results lack has no panel. With `large`, for README.md, panels are beside each other
+    and have large letters.
     """
     rows = boards_rows(numbers)
     metrics = [metric for metric in metrics if all(metric in row for row in rows)]
@@ -227,7 +228,9 @@ def unseen_boards(
             "places, tests at other places. "
             f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
         )
-        title = f"Boards never seen in training ({source}):{' ' if large else chr(10)}each mark is one board"
+        title = (
+            f"Boards never seen in training ({source}):{' ' if large else chr(10)}marks are boards, numbers their means"
+        )
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
         return svg(figure, column=not large)
 

@@ -336,6 +336,8 @@ def test_p_values_of_related_claims_are_corrected_by_holms_method():
     # value of 0.06 is not significant, although the interval excludes 0.
     assert table["verdict"].tolist() == [SUPPORTED, INCONCLUSIVE, INCONCLUSIVE, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
+    corrected = "not significant after Holm's correction"
+    assert [corrected in note for note in table["note"]] == [False, True, True, False]
 
 
 def test_table_of_claims_lists_only_claims_with_a_verdict():
