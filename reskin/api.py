@@ -290,9 +290,7 @@ def simulate_recording(
         raise ParamsError(f"{where}: {target} exists. Choose another folder.")
     for what, name in (("folder", target.name), ("skin", skin), ("board", board)):
         if not re.fullmatch(headers.NAME, name):
-            raise ParamsError(
-                where, what, "1 to 64 characters from A-Z, a-z, 0-9, _ and -", repr(name), "Choose another name."
-            )
+            raise ParamsError(where, f"the {what}'s name", headers.NAME_RULE, repr(name), "Choose another name.")
     presses = nominal("protocols")[MAIN] | {"depths_mm": list(depths_mm), "passes_n": passes_n}
     section = {"boards": nominal("boards"), "protocols": {MAIN: presses}}
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, where)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from pipeline import plan
 from pipeline.cli import app
 from pipeline.report.numbers import join, split
-from pipeline.report.readme import blocks_of
+from pipeline.report.readme import HALVES, blocks_of
 from reskin import io
 from reskin.config import read_yaml
 from reskin.errors import ReskinError
@@ -133,9 +133,12 @@ def test_block_recorded_shows_the_scores_of_presses_at_random_places():
     for row in lab["random_presses"]["rows"]:
         row |= {"mse_f_N2": {"values": [0.5, 18.0]}, "r2_f": {"values": [0.5, -1.0]}}
         row["mse_f_N2"]["mean"] = row["r2_f"]["mean"] = 0.0
-    assert (
-        "A constant force, the mean of all, has an R² of 0 and an error of 2.0 (1.0; 3.0) N."
-        in (blocks_of([quick], [lab], {}, None)["recorded"])
+        if row["tested"] == HALVES:
+            row["accuracy_pct"]["mean"] = 31.4
+    block = blocks_of([quick], [lab], {}, None)["recorded"]
+    assert "The mean force as estimate would give an R² of 0 and an error of 2.0 (1.0; 3.0) N." in block
+    assert re.search(
+        r"31 % \(shipped model\) and 31 % \(model trained with .*\) of the presses on the other half", block
     )
 
 

@@ -61,8 +61,8 @@ TRAINED_ON = {
     "universal, boards of the rig": "simulation and the rig's other board",
 }
 SHORT_NAMES = {
-    "universal, boards of the rig": "model trained with the other board",
     "universal, simulated alone": "shipped model",
+    "universal, boards of the rig": "model trained with the other board",
 }
 LABELS = {"0": "no label", "weight": "one known weight, mid-skin", "10": "10 labels", "40": "40 labels"}
 RECORDED_METRICS = {
@@ -70,10 +70,10 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). Means "
-    "over {draws_n} random draws of presses and labels. In all columns, the model is first calibrated to "
-    "{presses_n} presses without labels. Labels are spread over the skin. {halves} A constant force, the mean of all, "
-    "has an R² of 0 and an error of {constant} N.\n\n{touch}"
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). All are "
+    "means over {draws_n} draws of presses and labels. In all columns, the model is first calibrated to "
+    "{presses_n} presses without labels. Labels are spread over the skin. {halves} The mean force as "
+    "estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -235,7 +235,7 @@ def _recorded(numbers: Numbers) -> str:
     provenance = numbers["provenance"]
     meaning = RECORDED_MEANING.format(
         scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["presses_n"],
-        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), constant=_constant_force(unseen[0]),
+        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), constant=_mean_force_error(unseen[0]),
         touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
@@ -252,10 +252,11 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
     return {"mean": values.mean(), "values": values}
 
 
-def _constant_force(row: Numbers) -> str:
-    """Write the rms error in N if the estimated force of every press is the mean force, as mean and by board.
+def _mean_force_error(row: Numbers) -> str:
+    """Write the rms error in N, as mean and by board, if the estimated force of every press were the mean force.
 
-    Its square is the variance of the forces. R² is 1 - MSE / variance.
+    Its square is the variance of the forces. It follows approximately from R² = 1 - MSE / variance, because R² and MSE
+    are means over draws of presses.
     """
     variances = [mse / (1 - r2) for mse, r2 in zip(row["mse_f_N2"]["values"], row["r2_f"]["values"], strict=True)]
     values = readable("mse_f_N2", variances)
@@ -264,16 +265,15 @@ def _constant_force(row: Numbers) -> str:
 
 def _halves(numbers: Numbers) -> str:
     """State the accuracy of each model on one half of the skin if all labels are on the other half."""
-    scores = [
-        f"{row['accuracy_pct']['mean']:.0f} % ({SHORT_NAMES[row['method']]})"
+    scores = {
+        row["method"]: f"{row['accuracy_pct']['mean']:.0f} %"
         for row in numbers["random_presses"]["rows"]
-        if (row["tested"], row["labels"]) == (HALVES, "40") and row["method"] in SHORT_NAMES
-    ]
-    if not scores:
+        if (row["tested"], row["labels"]) == (HALVES, "40")
+    }
+    shown = [f"{scores[method]} ({name})" for method, name in SHORT_NAMES.items() if method in scores]
+    if not shown:
         return ""
-    return (
-        f"If all 40 labels are on one half of the skin, fewer on the other half are within 1 mm: {', '.join(scores)}."
-    )
+    return f"With all 40 on one half, {' and '.join(shown)} of the presses on the other half are within 1 mm."
 
 
 def _touches(numbers: Numbers) -> str:
@@ -288,8 +288,8 @@ def _touches(numbers: Numbers) -> str:
     missed = max(100 - row["detected_pct"] for rows in by_baseline.values() for row in rows)
     false = []
     for baseline, rows in by_baseline.items():
-        rates = sorted({f"{row['false_alarm_pct']:.0f}" for row in rows}, key=float)
-        false.append(f"{baseline}, {' and '.join(rates)} %")
+        rates = [f"{row['false_alarm_pct']:.0f}" for row in rows]  # in the order of the boards
+        false.append(f"{baseline}, {rates[0] if len(set(rates)) == 1 else ' and '.join(rates)} %")
     ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
     share = f"at most {missed:.2g} %" if missed else "none"
     return (

@@ -639,7 +639,7 @@ def read_table1(path: Path = TABLE_1) -> Table1:
 def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
     """Add our column (`measured`, by row) to the paper's table 1, whose cells remain as printed.
 
-    A row for the localisation is added, too, if we have a result for it.
+    A row for the localisation is added if we have a result for it.
     """
     rows = data.rows | ({LOCALISATION: (NOT_GIVEN,) * len(data.columns)} if LOCALISATION in measured else {})
     if unknown := sorted(measured.keys() - rows.keys()):
@@ -650,9 +650,9 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
         for name, cells in rows.items()
     ]
     sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())
+    added = "the last column and the last row" if LOCALISATION in measured else "the last column"
     meaning = (
-        'The cells are printed as in table 1 of the paper, including "?". We added the last column'
-        f"{', and the last row' * (LOCALISATION in measured)}. "
+        f'The cells are printed as in table 1 of the paper, including "?". We added {added}. '
         f"Sources of the other columns: {sources}"
     )
     return tabulate(lines, meaning=meaning)

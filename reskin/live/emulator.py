@@ -29,7 +29,7 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
 from reskin.data.grid import points_mm
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.header import HEADER_FILE, LOG_FILE, NAME, STREAM_FILE, Source
+from reskin.recordings.header import HEADER_FILE, LOG_FILE, NAME, NAME_RULE, STREAM_FILE, Source
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
@@ -213,8 +213,7 @@ def simulate(
     first_board, skin = list_captures(simulation, protocol)[0]
     if board is not None:
         if not re.fullmatch(NAME, board):
-            rule = "a name of 1 to 64 of the characters A-Z a-z 0-9 _ -, which begins with a letter or a digit"
-            raise ParamsError("--board", "the name", rule, repr(board), "Choose another name.")
+            raise ParamsError("--board", "the name", NAME_RULE, repr(board), "Choose another name.")
         skin = f"{board}_s1"
     capture = simulate_capture(simulation, protocol, board=board or first_board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))

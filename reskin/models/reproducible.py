@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch.autograd.function import once_differentiable
 
 
 def affine(
@@ -39,10 +40,10 @@ def affine_layers(
     biases: Sequence[Float[torch.Tensor, "*m 1 _"]],
     relus: Sequence[bool],
 ) -> Float[torch.Tensor, "*n b o"]:
-    """Apply several layers, one after the other: `values @ weight + bias`, and then a ReLU where `relus` is True.
+    """Apply one or more layers, one after the other: `values @ weight + bias`, and then a ReLU where `relus` is True.
 
     On a CPU, all layers together are one operation for PyTorch's autograd, because the networks are so small that the
-    overhead of one operation for each layer would take about a tenth of the training time.
+    overhead of one operation for each layer would be noticeable. Second derivatives are not available.
     """
     if values.device.type == "cpu":
         result: torch.Tensor = _AffineLayers.apply(values, relus, *weights, *biases)  # type: ignore[no-untyped-call]
@@ -69,11 +70,14 @@ class _AffineLayers(torch.autograd.Function):
             for weight, bias, relu in zip(weights, biases, relus, strict=True):
                 result = _product(results[-1] if results else values, weight).add_(bias)
                 results.append(result.relu_() if relu else result)
-        ctx.save_for_backward(values, *results, *weights)
+        # The last result is needed only for the derivative of its ReLU. If it has none, the caller may change it.
+        last = results[-1] if relus[-1] else None
+        ctx.save_for_backward(values, *results[:-1], last, *weights)
         ctx.relus = relus
         return results[-1]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (gradient,) = gradients
         n = len(ctx.relus)

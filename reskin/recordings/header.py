@@ -26,6 +26,7 @@ PROBE_FILE = "probe.csv"
 LOG_FILE = "log.csv"
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+NAME_RULE = "1 to 64 of the characters A-Z a-z 0-9 _ -, and begin with a letter or a digit"  # NAME in words
 
 Name = Annotated[str, Field(pattern=NAME)]
 Source = Literal["simulated", "recorded"]

@@ -184,7 +184,7 @@ def _check_names(names: CaptureNames) -> None:
             raise CaptureError(
                 option,
                 "a name",
-                "1 to 64 of the characters A-Z a-z 0-9 _ -, and begin with a letter or a digit",
+                headers.NAME_RULE,
                 repr(name),
                 "Choose another name.",
             )

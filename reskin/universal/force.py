@@ -74,6 +74,7 @@ class ForceLine:
 
     def apply(self, log_N: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Convert estimated log forces to calibrated log forces. Returns these and their standard deviations."""
+        # Written without matrix products, because this is faster for a single reading.
         (intercept, slope), off = self.mean, log_N - LOG_CENTRE_N
         var = self.cov[0, 0] + self.scatter_var + off * (2 * self.cov[0, 1] + off * self.cov[1, 1])
         return LOG_CENTRE_N + intercept + slope * off, np.sqrt(var)
@@ -143,6 +144,4 @@ def _held_out_likelihood(estimator: str, log_N: Float[np.ndarray, " m"], true_lo
 
 
 def _row(log_N: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    row = np.ones((len(log_N), 2))  # faster than `np.column_stack` for a single reading
-    row[:, 1] = log_N - LOG_CENTRE_N
-    return row
+    return np.column_stack([np.ones(len(log_N)), log_N - LOG_CENTRE_N])

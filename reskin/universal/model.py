@@ -165,8 +165,7 @@ class Evaluation:
         """
         place_mm, sd_mm, by_estimator = self._products(self.likelihoods, power)
         selected = ESTIMATORS.index(self.line.estimator)
-        log_forces = by_estimator if self.unlabelled is None else self.other_log_forces
-        log_N, sd_log_N = self.line.apply(log_forces[selected])
+        log_N, sd_log_N = self.line.apply((self._unlabelled_log_forces or by_estimator)[selected])
         if self.few is not None:
             near = kernel(place_mm, self.few.place_mm, log_N, self.few.log_N).max(axis=1)
             log_N = near * by_estimator[selected] + (1 - near) * log_N
@@ -174,14 +173,12 @@ class Evaluation:
 
     def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
         """Return the logarithms of the forces before calibration, once for each of `ESTIMATORS`."""
-        return self._products(self.likelihoods, 1.0)[2] if self.unlabelled is None else self.other_log_forces
+        return self._unlabelled_log_forces or self._products(self.likelihoods, 1.0)[2]
 
-    @cached_property
-    def other_log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
-        """Logarithms of the forces from the map that is not conditioned on the few known forces."""
-        if self.unlabelled is None:
-            raise ValueError("this evaluation has only the map that is conditioned on all labels")
-        return self._products(self.unlabelled, 1.0)[2]
+    @property
+    def _unlabelled_log_forces(self) -> Sequence[Float[np.ndarray, " n"]] | None:
+        """Logarithms of the forces from the map that is not conditioned on the few known forces, if there is one."""
+        return None if self.unlabelled is None else self._products(self.unlabelled, 1.0)[2]
 
     def _products(
         self, likelihoods: Likelihoods, power: float
@@ -529,7 +526,8 @@ class Universal:
 
     First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
     presses at known places, in any order and any number of times. Each of these three methods changes the model in
-    place and returns it. `predict` works at any time after `zero`. Fields are in uT along the chips' axes.
+    place and returns it. `predict` works at any time after `zero`. Fields are in uT along the chips' axes. Do not
+    calibrate a model in one thread while another thread uses it.
 
     Parameters
     ----------
@@ -559,7 +557,8 @@ class Universal:
         # If a saved calibration was loaded, this is the no-load reading in its file.
         self._saved_uT: Float[np.ndarray, " ch"] | None = None
         self._centre_mm = np.array(self.layout.centre_mm)
-        self._to_board = self.layout.to_board(np.eye(self.channels_n))
+        # Matrix that converts readings along the chips' axes to the board's axes. Each estimate needs it.
+        self._board_from_chips = self.layout.to_board(np.eye(self.channels_n))
         self._prior_map = new_map(self.tables, external_cov=self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
@@ -573,7 +572,7 @@ class Universal:
         self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        # The following three results, which require cross-validation, are None until they are needed.
+        # The following three, which require cross-validation if there are labels, are None until they are needed.
         self._folds: list[HeldOutLabels] | None
         self._power: float | None
         self._calibrated: CalibratedModel | None
@@ -604,11 +603,13 @@ class Universal:
     @property
     def calibrated(self) -> CalibratedModel:
         """Map and networks, conditioned on all calibration data, in the board's frame."""
-        if self._calibrated is None:
+        calibrated = self._calibrated
+        if calibrated is None:
             labels = [day for day, _ in self._calibration.labels_by_day(self._calibration.data.labels)]
             earlier = self._calibration.held_out_earlier(has_few(reduce(join_labels, labels)))
-            self._calibrated = replace(self._model, line=line_of_labels([*self._held_out(), *earlier]))
-        return self._calibrated
+            calibrated = replace(self._model, line=line_of_labels([*self._held_out(), *earlier]))
+            self._calibrated = calibrated
+        return calibrated
 
     @property
     def external_cov(self) -> Float[np.ndarray, "ch ch"] | None:
@@ -624,9 +625,7 @@ class Universal:
         0.
         """
         cov = self.external_cov
-        return (
-            None if cov is None else self.layout.to_board(np.eye(self.channels_n)) @ external.suppressor(cov, noise_uT)
-        )
+        return None if cov is None else self._board_from_chips @ external.suppressor(cov, noise_uT)
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
@@ -663,7 +662,8 @@ class Universal:
             raise SchemaError(
                 "mounting: the model has no no-load reading. First call zero with readings without contact."
             )
-        return find_mounting(self.tables, self._sign * self._data.rest_uT, turned=self._data.turned)
+        rest_uT, turned = self._data.rest_uT, self._data.turned
+        return find_mounting(self.tables, -rest_uT if turned else rest_uT, turned=turned)
 
     @property
     def label_frame(self) -> LabelFrame | None:
@@ -1015,7 +1015,7 @@ class Universal:
 
         Raises SchemaError if `zero` has not been called yet.
         """
-        db_uT = (check_shape(b_uT, self.channels_n) - self.noload_uT) @ self._to_board
+        db_uT = (check_shape(b_uT, self.channels_n) - self.noload_uT) @ self._board_from_chips
         return -db_uT if self._data.turned else db_uT
 
     def _check_change(self, where: str, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
@@ -1027,10 +1027,6 @@ class Universal:
         db_uT = check_presses(self._change(b_uT))
         check_is_reading(where, np.atleast_2d(b_uT), self.noload_uT)
         return db_uT
-
-    @property
-    def _sign(self) -> int:
-        return -1 if self._data.turned else 1
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
         """Calibrate to all days from scratch.

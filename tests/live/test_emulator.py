@@ -352,7 +352,7 @@ class TestRobot:
 
     @pytest.mark.parametrize("name", ["b 1", "../b1", "", "x" * 65])
     def test_invalid_names_of_boards_raise(self, name):
-        with pytest.raises(ParamsError, match=r"--board: the name must be a name of 1 to 64 .* Choose another name"):
+        with pytest.raises(ParamsError, match=r"--board: the name must be 1 to 64 .* Choose another name"):
             read_script("nominal", board=name)
 
     def test_options_for_the_nominal_board_raise_for_other_sources(self, tmp_path):
