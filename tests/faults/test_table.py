@@ -1,5 +1,7 @@
 """Tests that docs/faults.md has a row for every fault, and that a row shows the error message and the outcome."""
 
+import tempfile
+
 from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
 from tests.faults.__main__ import OUT
 from tests.faults.harness import CASES, Row, line, message_of
@@ -25,5 +27,6 @@ def test_message_of_prefers_the_message_of_the_stage_to_that_of_dvc():
 
 
 def test_paths_of_this_machine_are_shortened_in_the_table():
-    row = Row("error: /tmp/x1/case/data must be; delete .dvc/tmp/rwlock", 2, "nothing", "ran adapt")
+    message = f"error: {tempfile.gettempdir()}/x1/case/data must be; delete .dvc/tmp/rwlock"
+    row = Row(message, 2, "nothing", "ran adapt")
     assert "“error: …/data must be; delete .dvc/tmp/rwlock”" in line("f", "h", row, 1.0)

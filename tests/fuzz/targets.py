@@ -4,6 +4,8 @@ A target accepts arbitrary bytes; the only exception that it may raise is a `Res
 random inputs for a given time, `test_corpus.py` runs them on the committed corpus.
 """
 
+import atexit
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -31,6 +33,7 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
+atexit.register(shutil.rmtree, FOLDER, ignore_errors=True)
 WIRES = get_args(Wire)
 LIVE = Session("none", [], "no board")
 
