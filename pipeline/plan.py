@@ -14,7 +14,7 @@ from pipeline.manage.running import DVC_FILES, require_idle
 from pipeline.scenes import ANALYSES, EXPERIMENTS, MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
 from reskin.errors import ParamsError, did_you_mean
-from reskin.recordings.header import NAME
+from reskin.recordings.header import NAME, NAME_RULE
 
 HEADER = """\
 # The scenes that `dvc repro` runs, and the items (scenes, captures or folders) for which each stage of dvc.yaml runs.
@@ -118,8 +118,7 @@ def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
         yield
         return
     if not re.fullmatch(NAME, name):
-        rule = "1 to 64 characters of A-Z a-z 0-9 _ -"
-        raise ParamsError("--scene", "a name", rule, repr(name), "Choose another name.")
+        raise ParamsError("--scene", "a name", NAME_RULE, repr(name), "Choose another name.")
     original = scene_file(root, like)
     target = original.with_name(f"{name}.yaml")
     if target.exists():

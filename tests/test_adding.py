@@ -22,7 +22,7 @@ from reskin import config
 from reskin.board.wire import encode
 from reskin.errors import CaptureError, ReskinError
 from reskin.recordings import preparing, probe
-from reskin.recordings.header import Clock, write_capture
+from reskin.recordings.header import NAME_RULE, Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
 from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
@@ -436,7 +436,7 @@ def test_option_like_copies_a_scene_and_leaves_no_copy_if_adding_fails(root_with
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
     invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
-    assert "--scene: a name must be 1 to 64 characters of" in invalid
+    assert f"--scene: a name must be {NAME_RULE}" in invalid
     assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
     assert contents(root_with_code) == before
     run(root_with_code, "reskin", *arguments, "small")

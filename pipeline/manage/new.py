@@ -9,7 +9,7 @@ from pipeline.plan import scene_names
 from pipeline.scenes import Source, read_scene
 from reskin import io
 from reskin.errors import ParamsError
-from reskin.recordings.header import NAME
+from reskin.recordings.header import NAME, NAME_RULE
 from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
 from reskin.universal.model import FILE
 
@@ -111,8 +111,7 @@ def new(
     """
     for option, name in (("SCENE", scene), *(("--boards", board) for board in boards)):
         if not re.fullmatch(NAME, name):
-            rule = "1 to 64 characters of A-Z a-z 0-9 _ -"
-            raise ParamsError(option, "a name", rule, repr(name), "Choose another name.")
+            raise ParamsError(option, "a name", NAME_RULE, repr(name), "Choose another name.")
     if len(set(boards)) < len(boards):
         raise ParamsError(f"--boards: {', '.join(boards)}: a name occurs twice. Name each board once.")
     if len(boards) < 2:

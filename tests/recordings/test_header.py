@@ -2,13 +2,14 @@
 
 import hashlib
 import json
+import re
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.errors import CaptureError
-from reskin.recordings.header import Clock, Rate, check_same_capture, parse, render, write_capture
+from reskin.recordings.header import NAME, Clock, Rate, check_same_capture, parse, render, write_capture
 from reskin.recordings.ingest import check_losses, open_capture, read_header
 from reskin.recordings.readers import READERS, lab
 from tests.recordings.headers import DEFAULT_POLICY, make_header
@@ -30,6 +31,16 @@ def test_frame_rate_in_a_header_is_optional():
     rate = Rate(sent_hz=400.0, method="clock", arrived_hz=398.5, repeated_frames=0.0, repeated_readings=0.25)
     header = make_header(rate=rate)
     assert parse(render(header), "header.json").rate == rate
+
+
+@pytest.mark.parametrize("name", ["b", "9", "Z_-", "x" * 64])
+def test_names_of_up_to_64_letters_digits_and_dashes_are_valid(name):
+    assert re.fullmatch(NAME, name)
+
+
+@pytest.mark.parametrize("name", ["", "_b", "-b", "x" * 65, "b 1", "b.1", "../b", "b\n", "b\u00e4"])
+def test_longer_names_and_names_with_other_characters_are_invalid(name):
+    assert not re.fullmatch(NAME, name)
 
 
 @pytest.mark.parametrize(
