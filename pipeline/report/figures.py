@@ -35,7 +35,7 @@ MARGIN_MM = 0.5  # margin of the axes around the skin
 RANGES = {
     "accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf), "mse_f_N2": (0.0, np.inf), "r2_f": (-np.inf, 1.0),
 }  # fmt: skip
-MANY_N = 4  # a legend with so many entries has several columns
+MANY_N = 4  # a legend with so many entries has several columns if it has no note
 SWEPT = ("accuracy_pct", "mse_xy_mm2")
 R2_MIN = -1.0  # models with a smaller R² are much worse than a constant, and are outside the axis
 # The axis of the number of pokes is linear below this number, because a logarithmic axis cannot show 0.
@@ -54,6 +54,7 @@ WAYS = {
 # Names of those rows of the paper's table 2 that are drawn beside our scores.
 PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}
 PLACE_LABEL, FORCE_LABEL = "place: within 1 mm / %", "force: rms error / N"
+CONSTANT_ROW, CONSTANT_NAME = "constant force", "the mean force of all presses as the estimate of each"
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -192,17 +193,20 @@ def unseen_boards(
 ) -> str:
     """Draw places within 1 mm and rms errors of forces on boards never seen in training, by number of labels.
 
-    Each mark is one board, and each number is the mean of the boards. Scores of the paper's table 2 are below, with
-    other marks. A metric that the results lack has no panel. With `large`, for README.md, panels are beside each other
-    and have large letters.
+    Each mark is one board, and each number is the mean of the boards. Below are the force errors of a constant
+    estimate, and scores of the paper's table 2 with other marks. A metric that the results lack has no panel. With
+    `large`, for README.md, panels are beside each other and have large letters.
     """
     rows = boards_rows(numbers)
     metrics = [metric for metric in metrics if all(metric in row for row in rows)]
     labels = sorted({int(row["labels"]) for row in rows})
     paper_n = len(PAPERS_ROWS)
-    y = {f"{n} labels": paper_n + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
+    constant_n = int("mse_f_N2" in metrics)
+    y = {f"{n} labels": paper_n + constant_n + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
+    if constant_n:
+        y[CONSTANT_ROW] = paper_n + 1.0
     y |= {name: paper_n - i - 0.5 for i, name in enumerate(PAPERS_ROWS.values())}
-    letters_pt, size_in = (13.0, (8.33, 5.2)) if large else (9.0, (4.7, 3.8))
+    letters_pt, size_in = (13.0, (8.33, 5.5)) if large else (9.0, (4.7, 4.0))
     with drawing(*size_in) as figure:
         panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
         for axes, metric in zip(panels, metrics, strict=True):
@@ -211,10 +215,11 @@ def unseen_boards(
                 for row in (row for row in rows if row["method"] == method):
                     values = readable(metric, row[metric]["values"])
                     row_y = y[f"{row['labels']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
-                    axes.plot(values, [row_y] * len(values), label=name, **look)
-                    mean = f"{np.mean(values):.{0 if metric == 'accuracy_pct' else 1}f}"
-                    beside = {"xytext": (0.7 * letters_pt, 0), "textcoords": "offset points", "va": "center"}
-                    axes.annotate(mean, (max(values), row_y), color=COLOURS[1 + i], fontsize=0.8 * letters_pt, **beside)
+                    _draw_boards(axes, metric, values, row_y, letters_pt, label=name, **look)
+            if metric == "mse_f_N2":
+                look = {"color": "0.45", "marker": "x", "markersize": letters_pt * 0.65, "linewidth": 1}
+                errors_N = mean_force_errors(rows[0])
+                _draw_boards(axes, metric, errors_N, y[CONSTANT_ROW], letters_pt, label=CONSTANT_NAME, **look)
             _draw_papers_row(axes, metric, [y[name] for name in PAPERS_ROWS.values()], letters_pt)
             axes.set_xlabel(PLACE_LABEL if metric == "accuracy_pct" else FORCE_LABEL, size=letters_pt)
             axes.set_xlim(0, 105 if metric == "accuracy_pct" else 1.15 * axes.dataLim.x1)
@@ -233,6 +238,26 @@ def unseen_boards(
         )
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
         return svg(figure, column=not large)
+
+
+def _draw_boards(
+    axes: Any, metric: str, values: Float[np.ndarray, " n"], y: float, letters_pt: float, **look: Any
+) -> None:
+    """Draw a mark for each board, a line through them, and the mean of the boards on the right."""
+    axes.plot(values, [y] * len(values), **look)
+    mean = f"{np.mean(values):.{0 if metric == 'accuracy_pct' else 1}f}"
+    beside = {"xytext": (0.7 * letters_pt, 0), "textcoords": "offset points", "va": "center"}
+    axes.annotate(mean, (max(values), y), color=look["color"], fontsize=0.8 * letters_pt, **beside)
+
+
+def mean_force_errors(row: Mapping[str, Any]) -> Float[np.ndarray, " n"]:
+    """Return the rms error in N on each board if the estimated force of every press were the mean force.
+
+    Its square is the variance of the forces. It follows approximately from R² = 1 - MSE / variance, because R² and MSE
+    are means over draws of presses.
+    """
+    variances = [mse / (1 - r2) for mse, r2 in zip(row["mse_f_N2"]["values"], row["r2_f"]["values"], strict=True)]
+    return readable("mse_f_N2", variances)
 
 
 def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:
@@ -286,7 +311,7 @@ def _finish(figure: Any, title: str, letters_pt: float = 9.0, *, note: str = "")
         label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     look = {"loc": "outside lower left", "frameon": False, "fontsize": letters_pt, "alignment": "left"}
-    columns_n = 1 if len(handles) < MANY_N else 3
+    columns_n = 1 if note or len(handles) < MANY_N else 3
     figure.legend(handles.values(), handles.keys(), title=note, title_fontsize=letters_pt, ncols=columns_n, **look)
     figure.suptitle(title, x=0.01, ha="left", fontsize=letters_pt + 1)
 

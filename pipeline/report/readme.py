@@ -13,7 +13,7 @@ import pandas as pd
 
 from pipeline import FLOW
 from pipeline.benchmark import entries
-from pipeline.report.figures import TESTED, readable, unseen_boards, unseen_rows
+from pipeline.report.figures import TESTED, mean_force_errors, readable, unseen_boards, unseen_rows
 from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
 from pipeline.report.paper import TABLE_2, TABLE_2_ROWS
@@ -52,8 +52,8 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
-    "skins. Ours are simulated, the paper's were recorded. Row *Single-sensor* is not evidence, because an earlier "
-    "simulation was tuned to it. The paper does not state its forces, so MSE_F may not be comparable."
+    "skins. Ours are simulated, the paper's were recorded. An earlier simulation was tuned to the paper's "
+    "*Single-sensor*, so this row proves nothing. The paper does not state its forces, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
@@ -253,13 +253,8 @@ def _readable(row: Numbers | None, metric: str) -> Numbers | None:
 
 
 def _mean_force_error(row: Numbers) -> str:
-    """Write the rms error in N, as mean and by board, if the estimated force of every press were the mean force.
-
-    Its square is the variance of the forces. It follows approximately from R² = 1 - MSE / variance, because R² and MSE
-    are means over draws of presses.
-    """
-    variances = [mse / (1 - r2) for mse, r2 in zip(row["mse_f_N2"]["values"], row["r2_f"]["values"], strict=True)]
-    values = readable("mse_f_N2", variances)
+    """Write the rms error in N, as mean and by board, if the estimated force of every press were the mean force."""
+    values = mean_force_errors(row)
     return _compact({"mean": values.mean(), "values": values}, RECORDED_METRICS["mse_f_N2"][1])
 
 

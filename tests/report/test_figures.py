@@ -3,6 +3,7 @@
 import json
 import re
 import xml.etree.ElementTree as ET
+from copy import deepcopy
 from html import unescape
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from pipeline.report.drawing import drawing, svg
 from pipeline.report.figures import (
+    CONSTANT_NAME,
+    CONSTANT_ROW,
     FORCE,
     FORCE_LABEL,
     HEADLINE,
@@ -221,6 +224,16 @@ def test_figure_of_unseen_boards_has_a_mark_for_each_board_and_for_the_paper(lab
     ):
         ends = f"bar from {low:.4g} to {high:.4g}"
         assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
+
+
+def test_figure_of_unseen_boards_shows_the_force_error_of_a_constant_estimate(lab):
+    """If forces 1 and 3 N (board 1), and 2 and 8 N (board 2), were estimated as their means, the errors were 1, 3 N."""
+    numbers = deepcopy(lab)
+    for row in boards_rows(numbers):
+        row |= {"mse_f_N2": {"values": [0.5, 18.0]}, "r2_f": {"values": [0.5, -1.0]}}
+    shown = titles(headline_figures(numbers, "recorded")[FORCE])
+    for error_N in (1, 3):
+        assert f"{CONSTANT_NAME}\n{FORCE_LABEL} = {error_N}\n{CONSTANT_ROW}" in shown
 
 
 def test_title_of_the_figure_of_unseen_boards_has_two_short_lines(lab):
