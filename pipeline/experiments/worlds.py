@@ -300,8 +300,8 @@ MEANING = (
     "|dB|² that the simulation explains (scene lab). The error is correlated over {residual_length_mm:g} mm, and "
     "{residual_own_share:.0%} of its variance is specific to a skin. The simulated skins of all other scenes have no "
     "such error. {folds_n} boards are held out in turn. One network is trained for each row of table 2, fold and "
-    "world, for {steps_n} steps. The default world has the skins of table 2, but its own presses, without the effect of "
-    "earlier presses on later ones. So its scores differ slightly from those of table 2."
+    "world, for {steps_n} steps. The default world has the skins of table 2, but its own presses, without the effect "
+    "of earlier presses on later ones. So its scores differ slightly from those of table 2."
 )
 # Values of two factors in the default world. The values of the other factors are in the experiment's numbers.
 DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}

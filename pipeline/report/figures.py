@@ -233,9 +233,9 @@ def unseen_boards(
             "places, tests at other places. "
             f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
         )
-        title = (
-            f"Boards never seen in training ({source}):{' ' if large else chr(10)}marks are boards, numbers their means"
-        )
+        boards_n = len(rows[0]["accuracy_pct"]["values"])
+        space = " " if large else "\n"
+        title = f"{boards_n} boards never seen in training ({source}):{space}marks are boards, numbers their means"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
         return svg(figure, column=not large)
 
@@ -270,7 +270,9 @@ def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: flo
     means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
     low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
     look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
-    name = f"{PAPER_NAME} (other skins, other test)"  # the paper's rows are not scores of the tests drawn above them
+    name = (
+        f"{PAPER_NAME} (other skins, forces and test)"  # the paper's rows are not scores of the tests drawn above them
+    )
     axes.errorbar(middle, y, xerr=np.stack([middle - low, high - middle]), label=name, **look)
 
 

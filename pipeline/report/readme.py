@@ -52,12 +52,12 @@ SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F,
 SIZES = {"quick": "`quick`", "paper": "full protocol"}
 SIMULATED_MEANING = (
     "[low, high] is the 95 % interval over six held-out boards. ± is the standard deviation over pairs of "
-    "skins. Ours are simulated, the paper's were recorded. An earlier simulation was tuned to the paper's "
+    "skins. An earlier simulation was tuned to the paper's "
     "*Single-sensor*, so this row proves nothing. The paper does not state its forces, so MSE_F may not be comparable."
 )
 HALVES = "half of the skin without labels"
 TRAINED_ON = {
-    "universal, simulated alone": "simulation (the shipped model)",
+    "universal, simulated alone": "simulation (shipped model)",
     "universal, boards of the rig": "simulation and the rig's other board",
 }
 SHORT_NAMES = {
@@ -70,10 +70,9 @@ RECORDED_METRICS = {
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2). All are "
-    "means over {draws_n} draws of presses and labels. In all columns, the model is first calibrated to "
-    "{presses_n} presses without labels. Labels are spread over the skin. {halves} The mean force as "
-    "estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2), over {draws_n} draws of "
+    "presses and labels. In all columns, the model is first calibrated to {presses_n} presses without labels. {halves} "
+    "The mean force as estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -268,7 +267,8 @@ def _halves(numbers: Numbers) -> str:
     shown = [f"{scores[method]} ({name})" for method, name in SHORT_NAMES.items() if method in scores]
     if not shown:
         return ""
-    return f"With all 40 on one half, {' and '.join(shown)} of the presses on the other half are within 1 mm."
+    of_presses = f"{' and '.join(shown)} of the presses on the other half are within 1 mm"
+    return f"With all 40 labels on one half of the skin, {of_presses}."
 
 
 def _touches(numbers: Numbers) -> str:
@@ -289,8 +289,8 @@ def _touches(numbers: Numbers) -> str:
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
         f"Forces of the presses: {ranges}. With the threshold of the live page, {share} of these presses are "
-        "missed. The rate of false touches depends on when the no-load "
-        f"reading was taken: {'; '.join(false)}. So take a new no-load reading often (key z on the live page)."
+        f"missed. False touches depend on when the no-load reading was taken: {'; '.join(false)}. So take a new "
+        "no-load reading often (key z on the live page)."
     )
 
 
@@ -336,8 +336,8 @@ def _time(times: Numbers) -> str:
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
         f"This takes {environment_min:.1f} min for the environment, {stages_min:.1f} min for the stages "
-        f"({cpu_min:.1f} CPU min). With the CPU build of PyTorch, it needs {all_GB:.1f} GB, of which "
-        f"{environment_GB:.1f} GB are the environment. Medians of {len(runs)} fresh clones on {times['machine']} "
+        f"({cpu_min:.1f} CPU min), and needs {all_GB:.1f} GB ({environment_GB:.1f} GB for the environment, with "
+        f"PyTorch's CPU build). Medians of {len(runs)} fresh clones on {times['machine']} "
         f"(`make time-repro`, code {times['git']})."
     )
 

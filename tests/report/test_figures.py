@@ -241,10 +241,10 @@ def test_title_of_the_figure_of_unseen_boards_has_two_short_lines(lab):
     lines = [
         line
         for line in text.splitlines()
-        if "Boards never seen" in line or "marks are boards, numbers their means" in line
+        if "boards never seen" in line or "marks are boards, numbers their means" in line
     ]
     assert [re.sub("<[^>]*>", "", line).strip() for line in lines] == [
-        "Boards never seen in training (recorded):",
+        "2 boards never seen in training (recorded):",
         "marks are boards, numbers their means",
     ]
 
