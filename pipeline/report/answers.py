@@ -50,6 +50,7 @@ RIG, SHIPPED = WAYS  # methods of experiment random_presses
 ADAPTED = "Multi-sensor with triplet loss, adapted"
 NETWORK = "Network of the paper, trained on the other boards"
 OURS = "Universal model (ours), trained on simulated skins"
+CHOSEN_ON = "lab"  # the scene on whose boards details of the universal model were chosen (docs/learning.md)
 USABLE = {YES: " (usable)", PARTLY: " (partly usable)", NO: " (not usable)"}
 WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the first of these that the scene ran is shown
 
@@ -211,6 +212,8 @@ def _tested(numbers: Results, best: Effort) -> str:
     held_out = f"Tested on {boards}; no tested board or skin was in training."
     if source == "simulated":
         held_out += " All readings were simulated, so these results are no evidence about real skins."
+    if boards_rows(numbers) and numbers["provenance"]["scene"] == CHOSEN_ON:
+        held_out += " However, details of the model were chosen with these boards, so the scores are optimistic."
     return f"{held_out} Model: {best.model}. Data that this model needs from the new skin: {best.needs}."
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.report.answers import NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms
+from pipeline.report.answers import CHOSEN_ON, NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms
 from pipeline.report.figures import TESTED, WAYS
 from pipeline.report.paper import PLACE_ACCURACY_MIN_PCT, TABLE_2
 from tests.report.synthetic import all_experiments
@@ -108,6 +108,9 @@ def test_answer_uses_experiment_random_presses_if_it_was_run():
     # The rms error is the mean over the two boards.
     assert found.force.short.startswith("not usable; rms error 1.5 N")
     assert "needs from the new skin: 65 presses without labels." in found.tested
+    assert "optimistic" not in found.tested
+    numbers["provenance"] = numbers["provenance"] | {"scene": CHOSEN_ON}
+    assert "so the scores are optimistic" in answers(numbers | {"random_presses": {"draws_n": 10, "rows": rows}}).tested
 
 
 @pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
