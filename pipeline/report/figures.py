@@ -201,10 +201,9 @@ def unseen_boards(
     metrics = [metric for metric in metrics if all(metric in row for row in rows)]
     labels = sorted({int(row["labels"]) for row in rows})
     paper_n = len(PAPERS_ROWS)
-    constant_n = int("mse_f_N2" in metrics)
-    y = {f"{n} labels": paper_n + constant_n + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
-    if constant_n:
-        y[CONSTANT_ROW] = paper_n + 1.0
+    constant = "mse_f_N2" in metrics and "r2_f" in rows[0]  # R² is missing if all forces of a board are equal
+    y = {f"{n} labels": paper_n + constant + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
+    y |= {CONSTANT_ROW: paper_n + 1.0} if constant else {}
     y |= {name: paper_n - i - 0.5 for i, name in enumerate(PAPERS_ROWS.values())}
     letters_pt, size_in = (13.0, (8.33, 5.5)) if large else (9.0, (4.7, 4.0))
     with drawing(*size_in) as figure:
@@ -216,7 +215,7 @@ def unseen_boards(
                     values = readable(metric, row[metric]["values"])
                     row_y = y[f"{row['labels']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
                     _draw_boards(axes, metric, values, row_y, letters_pt, label=name, **look)
-            if metric == "mse_f_N2":
+            if metric == "mse_f_N2" and constant:
                 look = {"color": "0.45", "marker": "x", "markersize": letters_pt * 0.65, "linewidth": 1}
                 errors_N = mean_force_errors(rows[0])
                 _draw_boards(axes, metric, errors_N, y[CONSTANT_ROW], letters_pt, label=CONSTANT_NAME, **look)
@@ -233,7 +232,7 @@ def unseen_boards(
             "places, tests at other places. "
             f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
         )
-        boards_n = len(rows[0]["accuracy_pct"]["values"])
+        boards_n = len(rows[0][metrics[0]]["values"])
         space = " " if large else "\n"
         title = f"{boards_n} boards never seen in training ({source}):{space}marks are boards, numbers their means"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
@@ -256,8 +255,8 @@ def mean_force_errors(row: Mapping[str, Any]) -> Float[np.ndarray, " n"]:
     Its square is the variance of the forces. It follows approximately from R² = 1 - MSE / variance, because R² and MSE
     are means over draws of presses.
     """
-    variances = [mse / (1 - r2) for mse, r2 in zip(row["mse_f_N2"]["values"], row["r2_f"]["values"], strict=True)]
-    return readable("mse_f_N2", variances)
+    mse_N2, r2 = (np.array(row[metric]["values"]) for metric in ("mse_f_N2", "r2_f"))
+    return readable("mse_f_N2", mse_N2 / (1 - r2))
 
 
 def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:

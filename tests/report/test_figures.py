@@ -234,6 +234,11 @@ def test_figure_of_unseen_boards_shows_the_force_error_of_a_constant_estimate(la
     shown = titles(headline_figures(numbers, "recorded")[FORCE])
     for error_N in (1, 3):
         assert f"{CONSTANT_NAME}\n{FORCE_LABEL} = {error_N}\n{CONSTANT_ROW}" in shown
+    for row in boards_rows(numbers):  # R² is missing if all forces of a board are equal
+        del row["r2_f"]
+    text = headline_figures(numbers, "recorded")[FORCE]
+    assert FORCE_LABEL in texts_of(text)
+    assert CONSTANT_ROW not in texts_of(text)
 
 
 def test_title_of_the_figure_of_unseen_boards_has_two_short_lines(lab):
