@@ -24,8 +24,8 @@ def main() -> None:
             parser.add_argument("--digests", type=Path, required=True)
             write_digests(parser.parse_args(sys.argv[2:]).digests)
             return
+        from pipeline.catalogue import is_stage, module_of
         from pipeline.stage import run
-        from pipeline.stages import is_stage, module_of
     except ModuleNotFoundError as error:
         sys.exit(f"error: package {error.name} is not installed for {sys.executable}. Try: . .venv/bin/activate")
     if is_stage(name):

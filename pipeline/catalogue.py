@@ -1,13 +1,30 @@
-"""Catalogue of experiments: which stage runs each experiment, and what a scene needs to run it."""
+"""Catalogue of stages and experiments: the module of each stage, and what a scene needs to run an experiment.
+
+The file dvc.yaml runs a stage with the command `python -m pipeline STAGE --scene SCENE ...`. `STAGES` lists the stages
+of package `pipeline.stages` by module. In addition, each experiment in `pipeline.experiments` is a stage of its own: a
+function with the name of the experiment, in the module of the same name.
+"""
 
 from collections.abc import Mapping
 from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 from reskin.config import Strict, parse, read_yaml
 
 FOLDER = Path(__file__).parent / "experiments"
+STAGES = {
+    "simulate": ("simulate",),
+    "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
+    "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
+    "sweeps": ("sweep_pokes", "sweep_sensors"),
+    "universal": ("few_labels", "universal", "calibrated"),
+    "report": ("table2", "report", "publish"),
+}
+MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
+EXPERIMENTS_PACKAGE = "pipeline.experiments"
 Kind = Literal["models", "curve", "analysis", "study", "report"]
 
 
@@ -107,3 +124,18 @@ LEARNING = (
     _learning("calibrated", "curve", "calibrated", needs=("labels",), reads=("compare",), file="model"),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip
+
+
+def is_stage(name: str) -> bool:
+    """Return whether a stage or an experiment has this name."""
+    return name in MODULES or name in experiment_files()
+
+
+def module_name(stage: str) -> str:
+    """Return the name of the module that contains a stage's function."""
+    return MODULES.get(stage, f"{EXPERIMENTS_PACKAGE}.{stage}")
+
+
+def module_of(stage: str) -> ModuleType:
+    """Import the module that contains a stage's function."""
+    return import_module(module_name(stage))

@@ -354,7 +354,7 @@ def score(
     """Check a file of predictions for the benchmark; print its scores and write them as JSON beside the file."""
     from pipeline.benchmark.entries import score_and_write
     from pipeline.benchmark.scoring import table_of
-    from pipeline.report.formatting import to_markdown
+    from pipeline.formatting import to_markdown
 
     about = {"method": method, "by": by, "trained_on": trained_on, "code": code}
     entry, written = score_and_write(predictions, about, data, enter=enter)

@@ -7,9 +7,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline import PARAMS
-from pipeline.catalogue import LEARNING, Experiment, Kind, read_experiments
+from pipeline.catalogue import LEARNING, Experiment, Kind, module_of, read_experiments
 from pipeline.settings import Seed, Settings, read_settings, section_of
-from pipeline.stages import module_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
 from reskin.data.splits import Split

@@ -14,11 +14,11 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import PARAMS, PLAN, SCENES, plan
+from pipeline.catalogue import module_of
 from pipeline.experiments.shear import Shear
 from pipeline.manage.new import scene_text
 from pipeline.scenes import SECTIONS, read_scene
 from pipeline.settings import Adaptations, Settings, Training, read_settings, read_shared_files, section_of
-from pipeline.stages import module_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import NOMINAL

@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.benchmark.folds import ENTRIES, FOLDER, read_folds
 from pipeline.benchmark.scoring import MEANING, METRICS, About, Entry, score_file, table_of
-from pipeline.report.formatting import show, tabulate, to_markdown
+from pipeline.formatting import show, tabulate, to_markdown
 from reskin import io
 from reskin.config import parse
 from reskin.errors import ParamsError, SchemaError

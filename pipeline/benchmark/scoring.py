@@ -11,7 +11,7 @@ from pydantic import Field
 
 from pipeline.benchmark.folds import FORCE, PLACE, Dataset, read_dataset
 from pipeline.benchmark.predictions import Predictions, check_units, read_predictions
-from pipeline.report.formatting import rounded, show, tabulate
+from pipeline.formatting import rounded, show, tabulate
 from pipeline.statistics import statistic
 from reskin import io
 from reskin.config import Strict

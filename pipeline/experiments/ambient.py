@@ -19,8 +19,8 @@ from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.results import write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import show_digits
+from pipeline.formatting import show_digits
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import add_seed_sd, summarise, tally

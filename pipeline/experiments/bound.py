@@ -16,7 +16,7 @@ from scipy.special import owens_t
 
 from pipeline.experiments.ambient import readings_uT
 from pipeline.experiments.results import write_results
-from pipeline.report.formatting import COLUMNS, n_of, show, tabulate
+from pipeline.formatting import COLUMNS, n_of, show, tabulate
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say

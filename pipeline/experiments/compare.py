@@ -28,8 +28,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import show_digits, tabulate
+from pipeline.formatting import show_digits, tabulate
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Row, SectionWithRows, Settings
 from pipeline.statistics import combine_verdicts, statistic, verdict, verdict_within
 from reskin.errors import ParamsError

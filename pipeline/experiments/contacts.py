@@ -30,8 +30,8 @@ from pipeline.experiments.detection import (
     thresholds,
 )
 from pipeline.experiments.results import write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import show_digits
+from pipeline.formatting import show_digits
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic

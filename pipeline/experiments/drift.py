@@ -21,9 +21,9 @@ from pydantic import Field, model_validator
 from scipy.constants import micro
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, show, show_difference, tabulate
-from pipeline.report.paper import FIGURE_5
+from pipeline.formatting import COLUMNS, show, show_difference, tabulate
+from pipeline.paper import FIGURE_5
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import (
     SUPPORTED,

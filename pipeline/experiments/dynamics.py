@@ -15,10 +15,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 
+from pipeline import paper
 from pipeline.experiments.results import only, read_captures, read_losses, write_results
-from pipeline.report import paper
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import show_difference
+from pipeline.formatting import show_difference
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import VERDICTS, negate, paired, statistic, summarise, verdict

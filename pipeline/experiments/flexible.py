@@ -10,9 +10,9 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, drawing, svg
-from pipeline.report.formatting import COLUMNS, PAPER_METRICS, show, show_difference, tabulate
-from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
+from pipeline.formatting import COLUMNS, PAPER_METRICS, show, show_difference, tabulate
+from pipeline.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Adaptations, Settings
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.experiments.sensitivity import group_by_level
-from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
 from pipeline.stage import say

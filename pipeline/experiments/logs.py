@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
+from pipeline import paper
 from pipeline.experiments.ambient import Instrument, draw_instrument, readings_uT, reference_uT
 from pipeline.experiments.results import only, write_results
-from pipeline.report import paper
-from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.formatting import COLUMNS, PAPER_METRICS, Stat, gain, show, show_difference, tabulate
-from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
+from pipeline.formatting import COLUMNS, PAPER_METRICS, Stat, gain, show, show_difference, tabulate
+from pipeline.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.settings import Adaptations, Settings
 from pipeline.statistics import VERDICTS, verdict
 from pipeline.training.jobs import (

@@ -24,7 +24,7 @@ from pipeline.experiments.random_presses import (
     raise_forces,
 )
 from pipeline.experiments.results import write_results
-from pipeline.report.formatting import show, tabulate
+from pipeline.formatting import show, tabulate
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic

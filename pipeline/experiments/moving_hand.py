@@ -26,8 +26,8 @@ from pipeline.experiments.known_boards import align_boards
 from pipeline.experiments.mounting import Skin, simulated_skins, skin_of_board
 from pipeline.experiments.random_presses import CHECKERBOARD, BoardPresses, board_presses, draw_presses, place_scores
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import show, tabulate
+from pipeline.formatting import show, tabulate
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic

@@ -23,8 +23,8 @@ from scipy.spatial.transform import Rotation
 
 import reskin.universal
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import n_of, scores, tabulate
+from pipeline.formatting import n_of, scores, tabulate
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
-from pipeline.report.formatting import show, tabulate
+from pipeline.formatting import show, tabulate
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic

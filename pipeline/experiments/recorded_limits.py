@@ -30,8 +30,8 @@ from pipeline.experiments.random_presses import (
     raise_forces,
 )
 from pipeline.experiments.results import read_captures, write_results
-from pipeline.report.drawing import COLOURS, drawing, svg
-from pipeline.report.formatting import show, show_digits, tabulate
+from pipeline.formatting import show, show_digits, tabulate
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Row, SectionWithRows, Settings
 from pipeline.stage import say
 from pipeline.statistics import DECIMALS, statistic

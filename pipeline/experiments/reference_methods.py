@@ -26,8 +26,8 @@ from pydantic import Field
 from pipeline.experiments.detection import roc_area
 from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
+from pipeline.formatting import COLUMNS, FORCE_METRICS, n_of, scores, show, show_difference, tabulate
 from pipeline.provenance import SECONDS
-from pipeline.report.formatting import COLUMNS, FORCE_METRICS, n_of, scores, show, show_difference, tabulate
 from pipeline.settings import Row, SectionWithRows, Settings, take
 from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy

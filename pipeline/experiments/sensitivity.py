@@ -9,9 +9,9 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64, Int32
 from scipy.special import ndtr, ndtri
 
+from pipeline import paper
 from pipeline.experiments.results import only, read_captures, read_losses, write_results
-from pipeline.report import paper
-from pipeline.report.drawing import COLOURS, drawing, svg
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
 from pipeline.stage import say

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, drawing, svg
-from pipeline.report.formatting import show, tabulate
-from pipeline.report.paper import SHEAR
+from pipeline.formatting import show, tabulate
+from pipeline.paper import SHEAR
+from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import over_units, tally
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs, write_timings

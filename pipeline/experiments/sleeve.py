@@ -15,9 +15,9 @@ from pydantic import Field
 
 from pipeline.executors import InProcessExecutor
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, ERROR_COLOURS, drawing, svg
-from pipeline.report.formatting import COLUMNS, scores, show, tabulate
-from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
+from pipeline.formatting import COLUMNS, scores, show, tabulate
+from pipeline.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
+from pipeline.plot import COLOURS, ERROR_COLOURS, drawing, svg
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say

@@ -29,7 +29,7 @@ from pipeline.experiments.detection import (
     thresholds,
 )
 from pipeline.experiments.results import write_results
-from pipeline.report.formatting import show_digits
+from pipeline.formatting import show_digits
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic

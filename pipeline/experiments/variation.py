@@ -14,9 +14,9 @@ from pydantic import Field
 
 from pipeline.experiments.drift import describe_pace, pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import tabulate
-from pipeline.report.paper import FIGURE_4
+from pipeline.formatting import tabulate
+from pipeline.paper import FIGURE_4
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from reskin import io
 from reskin.config import Strict

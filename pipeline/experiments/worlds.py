@@ -16,9 +16,9 @@ from pydantic import Field
 from scipy.constants import micro, milli
 
 from pipeline.experiments.results import write_results
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
-from pipeline.report.paper import TABLE_2
+from pipeline.formatting import COLUMNS, SHORT, show, tabulate
+from pipeline.paper import TABLE_2
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Adaptations, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say

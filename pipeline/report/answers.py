@@ -9,8 +9,7 @@ from math import sqrt
 from statistics import fmean
 from typing import Any
 
-from pipeline.report.figures import WAYS, boards_rows
-from pipeline.report.formatting import (
+from pipeline.formatting import (
     Results,
     Stat,
     models,
@@ -20,7 +19,8 @@ from pipeline.report.formatting import (
     two_digits,
     universal_rows,
 )
-from pipeline.report.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
+from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
+from pipeline.report.figures import WAYS, boards_rows
 
 PLACE, FORCE = "place", "force"
 YES, PARTLY, NO, UNTESTED = "yes", "partly", "no", "not tested"

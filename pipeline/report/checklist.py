@@ -1,7 +1,7 @@
 """The checklist, which compares each result of the paper with ours and gives a verdict on each claim.
 
 Its rows are read from `checklist.yaml` and from the entry `checklist` of each experiment's YAML file. The paper's
-numbers are constants of `pipeline.report.paper`.
+numbers are constants of `pipeline.paper`.
 """
 
 import re
@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from pipeline import statistics
-from pipeline.report import paper
+from pipeline import paper, statistics
+from pipeline.formatting import FEW_POINTS, Stat, gain, is_pooled, reworded, show, show_difference
 from pipeline.report.experiments import add_rows
-from pipeline.report.formatting import FEW_POINTS, Stat, gain, is_pooled, reworded, show, show_difference
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
@@ -72,7 +71,7 @@ NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # the name of a number in the text o
 class Reach(Strict):
     """The sizes of the paper's experiment and of ours, for example the numbers of training readings.
 
-    `paper` names a constant of `pipeline.report.paper`, and `ours` is a path in numbers.json.
+    `paper` names a constant of `pipeline.paper`, and `ours` is a path in numbers.json.
     """
 
     paper: str
@@ -101,7 +100,7 @@ class Row(Strict):
     id: str
     where: str
     what: str
-    paper: str | None = None  # the dotted name of a constant of `pipeline.report.paper`
+    paper: str | None = None  # the dotted name of a constant of `pipeline.paper`
     says: str | None = None  # the paper's words, if it gives no number
     ours: str | None = None
     experiment: str | None = None  # the experiment that computes `ours`, if this number is missing in small scenes
@@ -358,10 +357,10 @@ def resolve(numbers: Any, path: str) -> Any:
 
 
 def look_up(numbers: Mapping[str, Any], name: str) -> Any:
-    """Look up a dotted name: a constant of `pipeline.report.paper` (`SHEAR.mse_fz_N2`) or a path in numbers.json."""
+    """Look up a dotted name: a constant of `pipeline.paper` (`SHEAR.mse_fz_N2`) or a path in numbers.json."""
     value = resolve(vars(paper) if name[0].isupper() else numbers, name)
     if value is None:
-        problem = f"{name} is neither a constant of pipeline.report.paper nor a path in numbers.json"
+        problem = f"{name} is neither a constant of pipeline.paper nor a path in numbers.json"
         raise SchemaError(f"{FILE.name}: {problem}. Correct the name in {FILE.name}.")
     return value
 

@@ -7,8 +7,8 @@ from typing import Any
 import pandas as pd
 
 from pipeline.experiments.runtime import CANDIDATES, ERROR_MAX, REFERENCE
-from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import scored, tabulate, to_markdown
+from pipeline.formatting import scored, tabulate, to_markdown
+from pipeline.plot import COLOURS, MARKERS, drawing, svg
 
 TRADE_OFFS = {
     "training": ("train_s", "median time of a training run / s"),

@@ -10,9 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.catalogue import experiment_files
+from pipeline.catalogue import experiment_files, module_name
 from pipeline.scenes import ANALYSES, EXPERIMENTS
-from pipeline.stages import module_name
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

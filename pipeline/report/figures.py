@@ -14,10 +14,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.report.drawing import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
-from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
-from pipeline.report.layout import WIDTH_IN
-from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, Number
+from pipeline.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
+from pipeline.paper import ADAPTED_POKES_N, TABLE_2, Number
+from pipeline.plot import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
+from pipeline.plot_layout import WIDTH_IN
 
 HEADLINE = "headline.svg"
 FORCE = "headline_force.svg"

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from pipeline.report.formatting import control_of
-from pipeline.report.paper import PLATEAU_POKES_N
+from pipeline.formatting import control_of
+from pipeline.paper import PLATEAU_POKES_N
 from pipeline.scenes import EXPERIMENTS, TABLE_2
 from pipeline.statistics import (
     AS_LABELLED,

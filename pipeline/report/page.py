@@ -14,15 +14,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from pydantic import Field
 
+from pipeline.catalogue import is_stage, module_name
+from pipeline.formatting import notes
 from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
 from pipeline.report.checklist import CLAIM, ONE_SKIN
 from pipeline.report.costs import cost_tables
 from pipeline.report.experiments import add_sections
 from pipeline.report.figures import HEADLINE
-from pipeline.report.formatting import notes
 from pipeline.report.protocol import Protocol, protocols
 from pipeline.report.sentences import sentences
-from pipeline.stages import is_stage, module_name
 from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
@@ -379,7 +379,7 @@ def measure(file: str, svg: str, id: str) -> Drawing:
     if size is None:
         raise SchemaError(
             f"{file}: the SVG has no size in points; it starts with {svg[:80]}. Write figures with function `svg` of "
-            "pipeline/report/drawing.py."
+            "pipeline/plot.py."
         )
     width_pt, height_pt = map(float, size.groups())
     smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)

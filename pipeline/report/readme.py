@@ -13,13 +13,13 @@ import pandas as pd
 
 from pipeline import FLOW
 from pipeline.benchmark import entries
+from pipeline.catalogue import module_name
+from pipeline.formatting import tabulate, to_markdown
+from pipeline.paper import TABLE_2, TABLE_2_ROWS
 from pipeline.report.figures import TESTED, mean_force_errors, readable, unseen_boards, unseen_rows
-from pipeline.report.formatting import tabulate, to_markdown
 from pipeline.report.numbers import join
-from pipeline.report.paper import TABLE_2, TABLE_2_ROWS
 from pipeline.report.tables import make_tables, skins_table
 from pipeline.scenes import ANALYSES
-from pipeline.stages import module_name
 from reskin import io
 from reskin.code import ROOT, file_of
 from reskin.config import read_yaml

@@ -4,9 +4,9 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from pipeline.formatting import SHORT
+from pipeline.paper import TABLE_2
 from pipeline.report.figures import FORCE, HEADLINE, LABELS, WAYS, boards_rows, readable
-from pipeline.report.formatting import SHORT
-from pipeline.report.paper import TABLE_2
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 # Places where no line break is allowed: between a number and its unit.

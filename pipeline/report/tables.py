@@ -10,9 +10,7 @@ from pydantic import model_validator
 
 from pipeline import scenes
 from pipeline.experiments.neglected_effects import neglected_effects_table
-from pipeline.report.checklist import checklist, claims_table
-from pipeline.report.experiments import experiment_tables
-from pipeline.report.formatting import (
+from pipeline.formatting import (
     COLUMNS,
     FORCE_METRICS,
     INTERVAL,
@@ -35,7 +33,9 @@ from pipeline.report.formatting import (
     to_markdown,
     universal_rows,
 )
-from pipeline.report.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
+from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
+from pipeline.report.checklist import checklist, claims_table
+from pipeline.report.experiments import experiment_tables
 from pipeline.report.protocol import protocol_table, protocols
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError

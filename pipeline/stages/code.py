@@ -4,22 +4,22 @@ The digests of a stage are written to the file data/code/<stage>, on which the s
 edited, the files of the stages that import this module change, and DVC runs these stages again. Comments and docstrings
 are not part of a digest, so edits of them cause no runs.
 
-`pipeline.report` and the YAML files of experiments contain captions, which do not affect computed results. Therefore,
-they are included only in the files of stages that show results.
+The modules in `SHOWING` and the YAML files of experiments affect only how results are shown. Therefore, they are
+included only in the files of stages that show results.
 """
 
 import gc
 from pathlib import Path
 
-from pipeline.catalogue import experiment_files
-from pipeline.stages import EXPERIMENTS, MODULES, module_name
+from pipeline.catalogue import EXPERIMENTS_PACKAGE, MODULES, experiment_files, module_name
 from reskin import io
 from reskin.code import digest, imported
 
-REPORT = "pipeline.report"
+# Packages and modules that only show results.
+SHOWING = ("pipeline.report", "pipeline.plot", "pipeline.plot_layout", "pipeline.formatting", "pipeline.paper")
 # A stage that imports this module shows results. The module imports the modules of experiments by their names, so these
 # imports cannot be found in its code.
-PRESENTATION = f"{REPORT}.experiments"
+PRESENTATION = "pipeline.report.experiments"
 
 
 def all_stages() -> list[str]:
@@ -32,8 +32,8 @@ def digests_of(stage: str) -> dict[str, str]:
     names = imported(module_name(stage))
     if PRESENTATION in names:
         return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_files()))}
-    computing = [name for name in names if not name.startswith(REPORT)]
-    return {name: digest(name, data=not name.startswith(EXPERIMENTS)) for name in computing}
+    computing = [name for name in names if not name.startswith(SHOWING)]
+    return {name: digest(name, data=not name.startswith(EXPERIMENTS_PACKAGE)) for name in computing}
 
 
 def write_digests(digests: Path) -> None:

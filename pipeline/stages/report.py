@@ -10,6 +10,7 @@ import pyarrow as pa
 
 from pipeline import PLAN, SCENES
 from pipeline.executors import make_executor
+from pipeline.formatting import rounded, to_markdown
 from pipeline.provenance import (
     COSTS,
     SECONDS,
@@ -25,7 +26,6 @@ from pipeline.report.costs import cost_pages
 from pipeline.report.experiments import experiment_figures
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
 from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
-from pipeline.report.formatting import rounded, to_markdown
 from pipeline.report.numbers import (
     add_up,
     before_touch_numbers,

@@ -14,11 +14,11 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Int64
 
+from pipeline.catalogue import module_name
 from pipeline.executors import make_executor, prepare_workers
 from pipeline.provenance import COSTS, SECONDS, code_version_of, home, record_trainings
 from pipeline.settings import Settings, Training
 from pipeline.stage import say
-from pipeline.stages import module_name
 from reskin import io
 from reskin.code import imported
 from reskin.data.lines import Lines, grid_lines, take_pokes

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.report.formatting import to_markdown
+from pipeline.formatting import to_markdown
 from pipeline.report.readme import fill
 from reskin import io
 

@@ -15,7 +15,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from scipy.optimize import brentq
 
-from pipeline.report.drawing import COLOURS, MARKERS, STYLE, svg
+from pipeline.plot import COLOURS, MARKERS, STYLE, svg
 from reskin import io
 from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 

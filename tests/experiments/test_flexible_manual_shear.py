@@ -18,8 +18,8 @@ from pipeline.experiments.flexible import (  # fmt: skip
 )
 from pipeline.experiments.manual import GRID, summarise_manual
 from pipeline.experiments.shear import score5, summarise_shear
-from pipeline.report.formatting import to_markdown
-from pipeline.report.paper import FLEXIBLE, MANUAL, SHEAR
+from pipeline.formatting import to_markdown
+from pipeline.paper import FLEXIBLE, MANUAL, SHEAR
 from pipeline.statistics import by_skin, paired, tidy
 from pipeline.training.variants import (
     AFTER,

@@ -17,7 +17,7 @@ from pipeline.experiments.variation import (
     over_time,
     tables,
 )
-from pipeline.report.formatting import to_markdown
+from pipeline.formatting import to_markdown
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
 from tests.data.tables import readings

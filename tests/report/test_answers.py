@@ -2,9 +2,9 @@
 
 import pytest
 
+from pipeline.paper import PLACE_ACCURACY_MIN_PCT, TABLE_2
 from pipeline.report.answers import CHOSEN_ON, NO, PARTLY, UNTESTED, YES, answers, force_level, level, rms
 from pipeline.report.figures import TESTED, WAYS
-from pipeline.report.paper import PLACE_ACCURACY_MIN_PCT, TABLE_2
 from tests.report.synthetic import all_experiments
 
 

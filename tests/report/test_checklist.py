@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from scipy.stats import t
 
-from pipeline.report import paper
+from pipeline import paper
+from pipeline.formatting import INCONCLUSIVE
 from pipeline.report.checklist import (
     AGREES,
     DIFFERS,
@@ -31,7 +32,6 @@ from pipeline.report.checklist import (
     read_rows,
     resolve,
 )
-from pipeline.report.formatting import INCONCLUSIVE
 from pipeline.scenes import ANALYSES
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED
 from reskin.errors import SchemaError
@@ -351,7 +351,7 @@ def test_table_of_claims_lists_only_claims_with_a_verdict():
 
 
 def test_name_of_an_unknown_number_of_the_paper_is_refused():
-    with pytest.raises(SchemaError, match="SHEARS.x.* is neither a constant of pipeline.report.paper"):
+    with pytest.raises(SchemaError, match="SHEARS.x.* is neither a constant of pipeline.paper"):
         look_up({}, "SHEARS.x")
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.experiments.runtime import REFERENCE, Precision, choose
+from pipeline.plot import COLOURS, MARKERS
 from pipeline.report.costs import (
     cost_pages,
     cost_tables,
@@ -22,7 +23,6 @@ from pipeline.report.costs import (
     trade_off,
     trade_off_points,
 )
-from pipeline.report.drawing import COLOURS, MARKERS
 from pipeline.report.numbers import learning_times
 from reskin.physics.magnet import DEFAULT_QUADRATURE
 from tests.report.synthetic import cost, texts_of

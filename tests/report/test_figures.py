@@ -9,7 +9,9 @@ from html import unescape
 import numpy as np
 import pytest
 
-from pipeline.report.drawing import drawing, svg
+from pipeline.formatting import models
+from pipeline.paper import TABLE_2
+from pipeline.plot import drawing, svg
 from pipeline.report.figures import (
     CONSTANT_NAME,
     CONSTANT_ROW,
@@ -30,8 +32,6 @@ from pipeline.report.figures import (
     sweep_sensors,
     unseen_boards,
 )
-from pipeline.report.formatting import models
-from pipeline.report.paper import TABLE_2
 from tests.report.synthetic import all_experiments, texts_of
 from tests.stages.checkout import ROOT
 

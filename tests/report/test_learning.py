@@ -5,8 +5,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.report.formatting import CONTROL, to_markdown
-from pipeline.report.paper import TABLE_2
+from pipeline.formatting import CONTROL, to_markdown
+from pipeline.paper import TABLE_2
 from pipeline.report.readme import blocks_of
 from pipeline.report.tables import (
     audit_table,

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.cli import app
-from pipeline.report.paper import TABLE_2
+from pipeline.paper import TABLE_2
 from pipeline.report.summary import summarise
 from reskin import io
 from tests.stages.checkout import ROOT

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
+from pipeline.paper import TABLE_2
 from pipeline.report.figures import HEADLINE, headline_figures
-from pipeline.report.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
 from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
-from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
 from pipeline.report.tables import (
     HELD_OUT,

@@ -58,9 +58,9 @@ def preload(protocols: set[tuple[str, str]]) -> None:
     importlib.import_module("pipeline")  # first, because it sets variables that NumPy reads when imported
     import numpy as np
 
+    from pipeline.catalogue import module_name
     from pipeline.settings import read_settings
     from pipeline.simulation import simulation_settings
-    from pipeline.stages import module_name
     from pipeline.stages.code import all_stages
     from reskin.physics.skin import draw_skin, moved_dipoles
 

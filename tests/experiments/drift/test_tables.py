@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from pipeline.experiments.drift import figures, tables
-from pipeline.report.formatting import to_markdown
+from pipeline.formatting import to_markdown
 
 
 def numbers(force: bool = True, spread: bool = True, **changed) -> dict:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
+from pipeline.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.statistics import UNDECIDED, negate
 
 # A statistic with keys `mean` and `n`. If known, it also has `sd`, and either `ci95` ([low, high]) or, for few boards,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.report.drawing import MARKS_MAX_N, drawing, svg
+from pipeline.plot import MARKS_MAX_N, drawing, svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 

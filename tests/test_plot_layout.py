@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from pipeline.report.drawing import DARK, EXACT, drawing, svg
-from pipeline.report.layout import LEGIBLE_PT, WIDTH_IN, lay_out
+from pipeline.plot import DARK, EXACT, drawing, svg
+from pipeline.plot_layout import LEGIBLE_PT, WIDTH_IN, lay_out
 
 TITLE = "a title of a figure that is much longer than the width of a phone allows without a line break"
 

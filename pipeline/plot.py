@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.layout import lay_out
+from pipeline.plot_layout import lay_out
 
 MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which would make the file too large
 # Matplotlib writes the marks of an artist as <use> tags if there are many, and as <path> tags if there are few.
@@ -157,7 +157,7 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 def svg(figure: Any, *, column: bool = True) -> str:
     """Write a figure as SVG text whose marks show their values on hover.
 
-    A row of panels is put in a column, unless `column` is False (see `pipeline.report.layout`). The text contains no
+    A row of panels is put in a column, unless `column` is False (see `pipeline.plot_layout`). The text contains no
     date and no version, so that equal data give equal bytes.
     """
     from matplotlib.backends.backend_svg import FigureCanvasSVG
