@@ -45,6 +45,7 @@ class Experiment(Strict):
     file: the key of the experiment's section that names a file on which the stage depends; None if there is none.
     recorded: whether scenes with recorded captures may run the experiment.
     without_contact: whether the experiment reads recordings in which nothing touches the skin.
+    scores: whether the stage writes rows of the table of scores.
     alone: whether a scene may run this experiment without any other, because it needs neither folds nor places in mm.
     """
 
@@ -60,6 +61,7 @@ class Experiment(Strict):
     file: str | None = None
     recorded: bool = False
     without_contact: bool = False
+    scores: bool = False
     alone: bool = False
 
 
@@ -98,6 +100,7 @@ def _learning(
         folds=folds,
         settings=settings,
         recorded=True,
+        scores=kind != "report",
         reads=reads,
         file=file,
     )

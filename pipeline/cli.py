@@ -302,7 +302,10 @@ def publish() -> None:
                 f"scene {name}: {path} is missing, so nothing is written to MLflow. To compute all results: dvc repro"
             )
             continue
-        folders = (ROOT / "data/indentations" / name, ROOT / "data/models" / name, results, ROOT / "reports" / name)
+        folders = (
+            *(ROOT / "data" / kind / name for kind in ("indentations", "models", "scores", "results")),
+            ROOT / "reports" / name,
+        )
         typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))
 
 

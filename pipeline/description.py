@@ -60,7 +60,7 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
     if {weak, strong} <= set(skins):  # computed per skin, because a capture may contain only one of the two forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
     summary = summarise(skins)
-    return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
+    return {name: stat.to_json() | {"least": float(skins[name].min()), "most": float(skins[name].max())}
             for name, stat in summary.items()}  # fmt: skip
 
 

@@ -10,11 +10,9 @@ import numpy as np
 import pandas as pd
 
 from pipeline.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
-from pipeline.statistics import UNDECIDED, negate
+from pipeline.statistics import UNDECIDED, Stat, as_json
 
-# A statistic with keys `mean` and `n`. If known, it also has `sd`, and either `ci95` ([low, high]) or, for few boards,
-# `values` (one value per board).
-Stat = Mapping[str, Any]
+Statistic = Stat | Mapping[str, Any]  # a statistic, or its entry in numbers.json
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 FORCE_METRICS = ("mse_f_N2", "r2_f")  # metrics that do not depend on offsets of positions
@@ -56,35 +54,33 @@ def reworded(text: str) -> str:
     return reduce(lambda found, pair: re.sub(rf"\b{pair[0]}\b", pair[1], found), pairs, text)
 
 
-def show(value: Stat | None) -> str:
+def show(value: Statistic | None) -> str:
     """Write a mean, its interval over boards (or else its standard deviation), and its standard deviation over seeds.
 
     All these numbers have as many decimals as `decimals` returns.
     """
     if value is None:
         return "–"
-    if "ci95" in value or "values" in value:
-        return f"{_rounded_mean(value)} {show_interval(value)}{_show_seeds(value)}"
-    return show_deviation(value)
+    stat = Stat.of(value)
+    return f"{_rounded_mean(stat)} {show_interval(stat)}{_show_seeds(stat)}" if stat.ends else show_deviation(stat)
 
 
-def show_deviation(value: Stat) -> str:
+def show_deviation(value: Statistic) -> str:
     """Write a mean with its standard deviations over the n values and over seeds, if they are known."""
-    over_n = f" ± {_rounded_sd(value, 'sd')}" if "sd" in value else ""
-    return f"{_rounded_mean(value)}{over_n}{_show_seeds(value)}"
+    stat = Stat.of(value)
+    over_n = "" if stat.sd is None else f" ± {_rounded_sd(stat, stat.sd)}"
+    return f"{_rounded_mean(stat)}{over_n}{_show_seeds(stat)}"
 
 
-def show_interval(value: Stat) -> str:
+def show_interval(value: Statistic) -> str:
     """Write the 95 % interval over boards, or the values of a few boards, without the mean."""
-    digits = decimals(value)
-    ends = [
-        three_digits(end) if digits is None else f"{end:z.{digits}f}"
-        for end in value["values" if "values" in value else "ci95"]
-    ]
-    return f"({'; '.join(ends)})" if "values" in value else f"[{', '.join(ends)}]"
+    stat = Stat.of(value)
+    digits = decimals(stat)
+    ends = [three_digits(end) if digits is None else f"{end:z.{digits}f}" for end in stat.ends]
+    return f"({'; '.join(ends)})" if stat.few else f"[{', '.join(ends)}]"
 
 
-def show_with_unit(value: Stat | None, unit: str) -> str:
+def show_with_unit(value: Statistic | None, unit: str) -> str:
     """Write a mean with its unit, then its uncertainty.
 
     >>> show_with_unit({"mean": 78.7, "n": 6, "ci95": [72.1, 84.2]}, "%")
@@ -94,7 +90,7 @@ def show_with_unit(value: Stat | None, unit: str) -> str:
     return " ".join([mean, unit, *uncertainty]) if value else mean
 
 
-def decimals(value: Stat) -> int | None:
+def decimals(value: Statistic) -> int | None:
     """Return the number of decimals at which the uncertainty of a mean has two significant digits.
 
     The uncertainty is half of the interval over boards, half of the range of a few boards' values, or else the standard
@@ -105,15 +101,16 @@ def decimals(value: Stat) -> int | None:
     >>> decimals({"mean": 78.7, "n": 6, "ci95": [72.1234, 84.2234]}), decimals({"mean": 1234.5, "n": 3, "sd": 8.0})
     (1, 0)
     """
-    few = value.get("values")
-    low, high = (min(few), max(few)) if few else value.get("ci95", (0.0, 2 * value.get("sd", value.get("sd_seeds", 0))))
-    uncertainty = (high - low) / 2
+    stat = Stat.of(value)
+    sd = stat.sd_seeds or 0.0 if stat.sd is None else stat.sd
+    ends = stat.ends or (0.0, 2 * sd)
+    uncertainty = (max(ends) - min(ends)) / 2
     if not np.isfinite(uncertainty) or uncertainty <= 0:
         return None
-    largest = max(abs(value["mean"]), uncertainty)
-    digits = max(0, min(1 - _exponent(uncertainty), (2 if few else 3) - _exponent(largest)))
-    ends = [end for end in value.get("ci95", ()) if end and not float(f"{end:.{digits}f}")]
-    if ends and all(float(f"{end:.{digits + 1}f}") for end in ends):
+    largest = max(abs(stat.mean), uncertainty)
+    digits = max(0, min(1 - _exponent(uncertainty), (2 if stat.few else 3) - _exponent(largest)))
+    zeros = [end for end in stat.ci95 or () if end and not float(f"{end:.{digits}f}")]
+    if zeros and all(float(f"{end:.{digits + 1}f}") for end in zeros):
         digits += 1
     return digits if digits <= DECIMALS_MAX else None
 
@@ -122,46 +119,48 @@ def _exponent(value: float) -> int:
     return int(np.floor(np.log10(value)))
 
 
-def _rounded_mean(value: Stat) -> str:
-    digits = decimals(value)
-    return three_digits(value["mean"]) if digits is None else f"{value['mean']:z.{digits}f}"
+def _rounded_mean(stat: Stat) -> str:
+    digits = decimals(stat)
+    return three_digits(stat.mean) if digits is None else f"{stat.mean:z.{digits}f}"
 
 
-def _rounded_sd(value: Stat, name: str) -> str:
+def _rounded_sd(stat: Stat, sd: float) -> str:
     """Write a standard deviation with the decimals of its mean, or with one significant digit instead of 0."""
-    digits, sd = decimals(value), value[name]
+    digits = decimals(stat)
     text = f"{sd:.2g}" if digits is None else f"{sd:.{digits}f}"
     return text if float(text) or not sd else f"{sd:.1g}"
 
 
-def show_digits(value: Stat, digits: int) -> str:
+def show_digits(value: Statistic, digits: int) -> str:
     """Write a mean with `digits` decimals, and its interval over boards and standard deviation over seeds, if known."""
-    mean, *ends = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
+    stat = Stat.of(value)
+    mean, *ends = [f"{number:.{digits}f}" for number in (stat.mean, *stat.ends)]
     if not ends:
-        return f"{mean}{_show_seeds(value)}"
-    boards = f"[{', '.join(ends)}]" if "ci95" in value else f"({'; '.join(ends)})"
-    return f"{mean} {boards}{_show_seeds(value)}"
+        return f"{mean}{_show_seeds(stat)}"
+    boards = f"({'; '.join(ends)})" if stat.few else f"[{', '.join(ends)}]"
+    return f"{mean} {boards}{_show_seeds(stat)}"
 
 
-def show_both(value: Stat | None) -> str:
+def show_both(value: Statistic | None) -> str:
     """Write a mean with its standard deviation, which the paper also gives, and with its interval over boards."""
-    if value is None or not {"ci95", "values"} & set(value):
+    if value is None or not Stat.of(value).ends:
         return show(value)
     return f"{show_deviation(value)} {show_interval(value)}"
 
 
-def show_difference(value: Stat | None) -> str:
+def show_difference(value: Statistic | None) -> str:
     """Write a mean difference with its sign."""
-    return "–" if value is None else ("+" if value["mean"] > 0 else "") + show(value)
+    return "–" if value is None else ("+" if Stat.of(value).mean > 0 else "") + show(value)
 
 
-def gain(difference: Stat, metric: str) -> Stat:
+def gain(difference: Statistic, metric: str) -> Stat:
     """Return the difference with a sign such that positive is better; differences of errors are negated."""
-    return negate(difference) if metric.startswith("mse_") else difference
+    stat = Stat.of(difference)
+    return -stat if metric.startswith("mse_") else stat
 
 
-def _show_seeds(value: Stat) -> str:
-    return f" ± {_rounded_sd(value, 'sd_seeds')} (seeds)" if "sd_seeds" in value else ""
+def _show_seeds(stat: Stat) -> str:
+    return "" if stat.sd_seeds is None else f" ± {_rounded_sd(stat, stat.sd_seeds)} (seeds)"
 
 
 def three_digits(value: float) -> str:
@@ -189,7 +188,7 @@ def scored(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def beside(
-    row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
+    row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Statistic | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
     """Write each metric of a row beside the paper's value (`printed`), and then n; return cells by column title."""
     cells: dict[str, str] = {}
@@ -226,11 +225,18 @@ def to_markdown(table: pd.DataFrame) -> str:
 
 
 def rounded(value: Any, digits: int = 6) -> Any:
-    """Round every float to significant digits, so that rounding errors do not change committed numbers."""
+    """Round every float to significant digits, so that rounding errors do not change committed numbers.
+
+    Statistics become entries of numbers.json.
+    """
+    return _rounded(as_json(value), digits)
+
+
+def _rounded(value: Any, digits: int) -> Any:
     if isinstance(value, dict):
-        return {key: rounded(item, digits) for key, item in value.items()}
+        return {key: _rounded(item, digits) for key, item in value.items()}
     if isinstance(value, list):
-        return [rounded(item, digits) for item in value]
+        return [_rounded(item, digits) for item in value]
     if isinstance(value, float):
         return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
     return value

@@ -104,6 +104,11 @@ class Scene(Strict, extra="allow"):
         return stages(self.experiments, "models")
 
     @property
+    def scored_stages(self) -> list[str]:
+        """The stages that write rows of the table of scores."""
+        return list(dict.fromkeys(experiment.stage for experiment in self.entries if experiment.scores))
+
+    @property
     def curves(self) -> dict[str, str]:
         """The stage of each experiment of kind `curve`, by experiment."""
         of_curves = (experiment for experiment in EXPERIMENTS.values() if experiment.kind == "curve")

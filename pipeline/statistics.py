@@ -1,34 +1,21 @@
-"""The table of scores of all training runs, and the statistics over boards that reports compute from it.
+"""Statistics over boards, folds and pairs of skins, computed from rows of the table of scores.
 
-A row of the table contains the scores of one network on one skin, or its joint scores on all skins on which it was
-tested. In statistical tests, one board counts as one observation. The skins of a board are not independent
-observations, because they share the board and are tested with the same networks, which were trained without this board.
+In statistical tests, one board counts as one observation. The skins of a board are not independent observations,
+because they share the board and are tested with the same networks, which were trained without this board.
 """
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from pipeline.scores import AS_LABELLED, KEYS, by_skin, whole
 from reskin.errors import SchemaError
-from reskin.metrics import METRICS, TRUTH
+from reskin.metrics import TRUTH
 
-NAMES = ("question", "method", "recipe", "inputs", "architecture", "base", "fold", "board", "skin", "places")
-COUNTS = (
-    "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
-)  # fmt: skip
-KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
-UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that state an uncertainty
-ALL_SKINS = ""  # value of column `skin` in joint rows, which are for all skins on which a network was tested
-# Values of column `places`. In rows AS_LABELLED, predicted positions are scored without a correction. In rows
-# REGISTERED, the mean error of each board, which is estimated from its labels, was first subtracted from the positions.
-AS_LABELLED, REGISTERED = "as_labelled", "registered"
-METHODS = {
-    "triplet": "network + triplet",
-    "adapt": "network, adapted",
-}  # names of methods by experiment; "network" for all other experiments
 CONFIDENCE = 0.95  # confidence level of intervals; the usual convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
@@ -46,117 +33,71 @@ VERDICTS = (
     "same boards; the intervals do not account for this."
 )
 
-Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-# A statistic with keys `mean` and `n`, and with `sd` if n > 1. If the values belong to boards, it also has `ci95`
-# ([low, high]), or `values` (one value per board) if there are few boards.
-Stat = Mapping[str, Any]
 
 
-# --- The table of scores ---
+@dataclass(frozen=True)
+class Stat:
+    """The mean of a metric over n units (boards, folds, or pairs of skins), and its spread as far as it is known.
 
-
-def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
-    """Tabulate the scores of all training runs.
-
-    Parameters
-    ----------
-    cards
-        Model cards, which are the JSON descriptions of trained networks. If each network is adapted to one skin, the
-        networks of the same fold and seed also have a joint row for all their skins.
-    points
-        Points of the curves of sweeps, by experiment. Each point has the scores of one training run.
-
-    Returns
-    -------
-    DataFrame
-        Columns `KEYS`, then metrics; NaN where a method has no such metric.
+    - sd: standard deviation over the units.
+    - ci95: 95 % interval of the mean over boards, from `BOARDS_MIN` boards on.
+    - values: the values of the boards, in their order, if there are fewer boards.
+    - sd_seeds: standard deviation over the networks of one unit that differ in their seed, averaged over units.
+    - se, df, p: standard error, degrees of freedom and p-value of a mean difference (null hypothesis: no difference).
+    - training_n, boards_n: numbers of training skins and of test boards, if the units are pairs of both.
     """
-    keyed = [(_keys_of_card(card), card["scores"]) for card in cards]
-    keyed += [
-        (_keys_of_point(experiment, point), point["scores"])
-        for experiment, experiment_points in (points or {}).items()
-        for point in experiment_points
-    ]
-    rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
-    # Joint rows by fold and seed. There are several rows for a fold and seed if each network is adapted to one skin.
-    groups: dict[Hashable, list[dict[str, Any]]] = {}
-    for row in (row for row in rows if row["skin"] == ALL_SKINS):
-        groups.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
-    kept = [*map(_pool, groups.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
-    return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *UNCERTAINTY]).astype(
-        dict.fromkeys((*COUNTS, *METRICS, *UNCERTAINTY), float)
-    )
+
+    mean: float
+    n: int
+    sd: float | None = None
+    ci95: tuple[float, float] | None = None
+    values: tuple[float, ...] | None = None
+    sd_seeds: float | None = None
+    se: float | None = None
+    df: float | None = None
+    p: float | None = None
+    training_n: int | None = None
+    boards_n: int | None = None
+
+    @classmethod
+    def of(cls, stat: "Stat | Mapping[str, Any]") -> "Stat":
+        """Return a statistic from its entry in numbers.json."""
+        return stat if isinstance(stat, Stat) else cls(**{name: stat[name] for name in _FIELDS if name in stat})
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The ends of the interval, or the values of a few boards; empty if neither is known."""
+        return tuple(self.ci95 or self.values or ())
+
+    @property
+    def few(self) -> bool:
+        """Whether there are so few boards that their values replace the interval."""
+        return self.values is not None
+
+    def __neg__(self) -> "Stat":
+        """Change the sign of a difference: its mean, its interval and its values."""
+        ci95 = None if self.ci95 is None else (-self.ci95[1], -self.ci95[0])
+        values = None if self.values is None else tuple(-value for value in self.values)
+        return replace(self, mean=-self.mean, ci95=ci95, values=values)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry of numbers.json: what is known, by name."""
+        known = {name: value for name, value in asdict(self).items() if value is not None}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in known.items()}
 
 
-def _keys_of_card(card: Mapping[str, Any]) -> dict[str, Any]:
-    keys = {key: card[key] for key in ("question", "fold")} | {"recipe": card["recipe_name"], "seed": card["seed_i"]}
-    keys |= {key: card["recipe"][key] for key in ("inputs", "architecture")}
-    keys |= {"method": METHODS.get(card["question"], "network"), "trained_on_skins_n": len(card["train_skins"])}
-    keys |= {"trained_on_rows_n": card["train_rows_n"]}
-    tuning = card.get("tuning")
-    return keys | ({"base": tuning["settings"]["base"], "pokes_n": tuning["pokes_n"]} if tuning else {})
+_FIELDS = tuple(field.name for field in fields(Stat))
+Summary = dict[str, Stat]  # statistics by metric
 
 
-def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
-    renamed = {"name": "recipe", "seed_i": "seed", "rows_n": "trained_on_rows_n"}
-    keys = {renamed.get(key, key): value for key, value in point.items()}
-    return {key: value for key, value in keys.items() if key in KEYS} | {"question": experiment}
-
-
-def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the rows of one training run.
-
-    The first two rows are joint rows for all skins, one with positions as labelled, and one with registered positions.
-    One row for each skin follows.
-    """
-    boards = {*scores["board_of"].values()}
-    joint = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
-    rows = [joint | {"places": AS_LABELLED} | scores["all"], joint | {"places": REGISTERED} | scores["registered"]]
-    for skin, skin_scores in scores["by_skin"].items():
-        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **skin_scores})
-    return rows
-
-
-def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Average the scores of the networks of one fold and seed, weighted by the number of test rows of each network."""
-    rows_n = np.array([row["rows_n"] for row in rows])
-    known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
-    parts = {name: np.array([row[name] for row in rows]) for name in known}
-    scores = {name: float(np.average(values, weights=rows_n)) for name, values in parts.items()}
-    if "r2_f" in parts:
-        between_N2 = (parts["force_mean_N"] - scores["force_mean_N"]) ** 2
-        scores["force_var_N2"] += float(np.average(between_N2, weights=rows_n))
-        scores["r2_f"] = 1 - scores["mse_f_N2"] / scores["force_var_N2"]
-    return {**rows[0], **scores, "rows_n": int(rows_n.sum())}
-
-
-def to_csv(table: pd.DataFrame) -> str:
-    """Return the table as CSV text with six significant digits, as in numbers.json."""
-    return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
-
-
-def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:
-    """Select the rows that have the given values in these columns."""
-    for column, value in values.items():
-        rows = rows[rows[column] == value]
-    return rows
-
-
-def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
-    """Select the joint rows for all skins that a network was tested on, one row per training run."""
-    return select(rows, skin=ALL_SKINS, places=places)
-
-
-def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
-    """Select the rows for single skins."""
-    return rows[rows["skin"] != ALL_SKINS]
-
-
-def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Return the values as a dict of dicts, by index and column, without NaN."""
-    known = {str(index): row.dropna() for index, row in rows.iterrows()}
-    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
+def as_json(value: Any) -> Any:
+    """Replace each statistic in nested dicts and lists by its entry of numbers.json."""
+    if isinstance(value, Stat):
+        return value.to_json()
+    if isinstance(value, Mapping):
+        return {key: as_json(item) for key, item in value.items()}
+    return [as_json(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
@@ -176,7 +117,7 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 # --- Intervals and p-values ---
 
 
-def interval(values: Values, metric: str = "") -> list[float] | None:
+def interval(values: Values, metric: str = "") -> tuple[float, float] | None:
     """Compute the two-sided 95 % interval of a mean by Student's t (see `t_interval`).
 
     Returns None if there are fewer than two values.
@@ -194,7 +135,7 @@ def interval(values: Values, metric: str = "") -> list[float] | None:
     return t_interval(float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(n)), n - 1, metric)
 
 
-def t_interval(mean: float, se: float, df: float, metric: str = "") -> list[float]:
+def t_interval(mean: float, se: float, df: float, metric: str = "") -> tuple[float, float]:
     """Compute the 95 % interval of a mean from its standard error by Student's t, within the metric's possible range.
 
     The delta method gives the interval g(mean) +- t g'(mean) se, which is transformed back by the inverse of g. The
@@ -205,16 +146,18 @@ def t_interval(mean: float, se: float, df: float, metric: str = "") -> list[floa
 
     half_width = float(stdtrit(df, (1 + CONFIDENCE) / 2)) * se
     if half_width == 0:
-        return [mean, mean]
+        return mean, mean
     ends = np.array([-half_width, half_width])
     if metric in PERCENTAGES:
         fraction = mean / 100
-        return [float(end) for end in 100 * expit(logit(fraction) + ends / (100 * fraction * (1 - fraction)))]
-    if metric.startswith("mse_"):
-        return [float(end) for end in mean * np.exp(ends / mean)]
-    if metric in AT_MOST_1:
-        return [float(end) for end in 1 - (1 - mean) * np.exp(-ends / (1 - mean))]
-    return [float(end) for end in mean + ends]
+        low, high = 100 * expit(logit(fraction) + ends / (100 * fraction * (1 - fraction)))
+    elif metric.startswith("mse_"):
+        low, high = mean * np.exp(ends / mean)
+    elif metric in AT_MOST_1:
+        low, high = 1 - (1 - mean) * np.exp(-ends / (1 - mean))
+    else:
+        low, high = mean + ends
+    return float(low), float(high)
 
 
 def p_value(mean: float, se: float, df: float) -> float:
@@ -242,25 +185,24 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 # --- Summaries over boards, folds, pairs ---
 
 
-def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
-    """Summarise values by their mean, their number and their spread.
+def statistic(values: Values, *, boards: bool = False, metric: str = "") -> Stat:
+    """Summarise values by their mean, their number and, if there are two or more, their standard deviation (n - 1).
 
-    The summary has the keys `mean` and `n` and, if there are two or more values, the standard deviation `sd` (with
-    divisor n - 1). If each value belongs to one board (`boards`), the summary of two or more values also has the 95 %
-    confidence interval `ci95`. If there are fewer than `BOARDS_MIN` values, it has `values` instead of the interval:
-    the values themselves, in the order of the boards.
+    If each value belongs to one board (`boards`), the summary also has the 95 % interval of the mean, or the values
+    themselves if there are fewer than `BOARDS_MIN`.
     """
-    stat = {"mean": float(np.mean(values)), "n": len(values)}
+    stat = Stat(float(np.mean(values)), len(values))
     if len(values) < 2:
         return stat
-    stat["sd"] = float(np.std(values, ddof=1))
+    stat = replace(stat, sd=float(np.std(values, ddof=1)))
     if not boards:
         return stat
-    few = len(values) < BOARDS_MIN
-    return stat | ({"values": [float(value) for value in values]} if few else {"ci95": interval(values, metric)})
+    if len(values) < BOARDS_MIN:
+        return replace(stat, values=tuple(float(value) for value in values))
+    return replace(stat, ci95=interval(values, metric))
 
 
-def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
+def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> Summary:
     """Summarise each column over its values that are not NaN.
 
     differences: whether the columns are differences of metrics. Intervals of metrics are limited to possible values,
@@ -274,7 +216,7 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
     }
 
 
-def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
+def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> Summary:
     """Summarise every metric over units, which are the groups of rows with equal values in the columns `unit`.
 
     The value of a unit is the mean of its rows. The summary also has `sd_seeds`, the standard deviation within a unit,
@@ -285,28 +227,26 @@ def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str
     return add_seed_sd(summary, rows, *unit) if not boards or groups.ngroups == 1 else summary
 
 
-def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
+def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> Summary:
     """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, averaged over units.
 
     The rows of a unit are networks that differ in their seed. If every unit has only one row, `sd_seeds` is not added.
     """
     sds = rows.groupby(list(unit))[_metrics(rows)].std().mean().dropna()
-    return {
-        name: {**stat, "sd_seeds": float(sds[name])} if name in sds else dict(stat) for name, stat in summary.items()
-    }
+    return {name: replace(stat, sd_seeds=float(sds[name])) if name in sds else stat for name, stat in summary.items()}
 
 
-def over_folds(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
+def over_folds(rows: pd.DataFrame) -> Summary:
     """Summarise training runs over folds; the value of a fold is the mean over its seeds."""
     return over_units(whole(rows), "fold")
 
 
-def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict[str, Any]]:
+def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> Summary:
     """Summarise training runs over held-out boards; a board's value is the mean over seeds and draws of skins."""
     return over_units(whole(rows, places), "board", boards=True)
 
 
-def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
+def over_pairs(rows: pd.DataFrame) -> Summary:
     """Summarise over pairs of a training skin and a test skin, as the paper does (3 x 9 pairs).
 
     The interval `ci95` treats both training skins and test boards as samples (`two_way_error`). `training_n` is the
@@ -319,9 +259,8 @@ def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     for name, stat in pairs.items():
         table = crossed[name].dropna().unstack()
         error = two_way_error(table)
-        summary[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
-        if error is not None:
-            summary[name]["ci95"] = t_interval(stat["mean"], *error, name)
+        ci95 = None if error is None else t_interval(stat.mean, *error, name)
+        summary[name] = replace(stat, ci95=ci95, training_n=len(table), boards_n=len(table.columns))
     return summary
 
 
@@ -345,6 +284,12 @@ def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
 def board_means(rows: pd.DataFrame) -> pd.DataFrame:
     """Average scores over the networks on each skin, then over the skins of each board; return one row per board."""
     return _skin_means(rows).groupby("board").mean()
+
+
+def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
+    """Return the values as a dict of dicts, by index and column, without NaN."""
+    known = {str(index): row.dropna() for index, row in rows.iterrows()}
+    return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
 
 
 def _metrics(rows: pd.DataFrame) -> list[str]:
@@ -385,11 +330,11 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     from them under the null hypothesis of no difference.
     """
     summary = summarise(by_board, boards=True, differences=True)
-    means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
-    for stat in means.values():
-        if "ci95" in stat:
-            stat |= _t_test(stat["mean"], stat["sd"] / stat["n"] ** 0.5, stat["n"] - 1)
-    return {**means, "by_board": records(by_board)}
+    stats = {name: replace(stat, mean=round(stat.mean, DECIMALS)) for name, stat in summary.items()}
+    for name, stat in stats.items():
+        if stat.ci95 is not None and stat.sd is not None:
+            stats[name] = _t_test(stat, stat.sd / stat.n**0.5, stat.n - 1)
+    return {**stats, "by_board": records(by_board)}
 
 
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
@@ -407,14 +352,14 @@ def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, 
     summary = summarise_differences(by_pair.groupby("board").mean())
     for name in by_pair:
         if name in summary:
-            stat = {key: value for key, value in summary[name].items() if key in ("mean", "sd", "n", "values")}
+            stat = replace(summary[name], ci95=None, se=None, df=None, p=None)
             error = two_way_error(by_pair[name].dropna().unstack())
-            summary[name] = stat if error is None else stat | _t_test(stat["mean"], *error)
+            summary[name] = stat if error is None else _t_test(stat, *error)
     return summary
 
 
-def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
-    return {"ci95": t_interval(mean, se, df), "se": se, "df": df, "p": p_value(mean, se, df)}
+def _t_test(stat: Stat, se: float, df: float) -> Stat:
+    return replace(stat, ci95=t_interval(stat.mean, se, df), se=se, df=df, p=p_value(stat.mean, se, df))
 
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:
@@ -425,29 +370,22 @@ def _unpaired(skins: Sequence[Any]) -> SchemaError:
     )
 
 
-def negate(stat: Stat) -> dict[str, Any]:
-    """Change the sign of a difference: its mean, its values and its interval."""
-    negative = {**stat, "mean": -stat["mean"]}
-    negative |= {"values": [-value for value in stat["values"]]} if "values" in stat else {}
-    return negative | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
-
-
 # --- Verdicts ---
 
 
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
     """Judge from the 95 % interval whether a mean over boards is above a threshold."""
-    if "ci95" not in stat:
+    if stat.ci95 is None:
         return FEW_BOARDS
-    low, high = stat["ci95"]
+    low, high = stat.ci95
     return SUPPORTED if low > above else CONTRADICTED if high < above else UNDECIDED
 
 
 def verdict_within(stat: Stat, margin: float) -> str:
     """Judge from the 95 % interval whether a mean over boards is nearer to 0 than `margin` (a test of equivalence)."""
-    if "ci95" not in stat:
+    if stat.ci95 is None:
         return FEW_BOARDS
-    low, high = stat["ci95"]
+    low, high = stat.ci95
     if -margin < low and high < margin:
         return SUPPORTED
     return CONTRADICTED if low > margin or high < -margin else UNDECIDED

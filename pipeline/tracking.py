@@ -24,7 +24,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipeline.provenance import COSTS, SECONDS
-from pipeline.statistics import over_folds, tidy
+from pipeline.scores import rows_of_cards
+from pipeline.statistics import over_folds
 from pipeline.views import TRAIN_S, UI, link, missing_tags
 from reskin import io
 from reskin.errors import ReskinError
@@ -384,8 +385,8 @@ class Publisher:
         if unwritten:
             rows = [(name, value, 0) for name, value in scores.items()]
             rows += [(TRAIN_S, sum(span.duration_s for span in spans), 0)] if spans else []
-            for (experiment, recipe), group in tidy(list(cards.values())).groupby(["question", "recipe"]):
-                means = {name: summary["mean"] for name, summary in over_folds(group).items()}
+            for (experiment, recipe), group in rows_of_cards(list(cards.values())).groupby(["experiment", "recipe"]):
+                means = {name: stat.mean for name, stat in over_folds(group).items()}
                 rows += [(f"{name}.{experiment}.{recipe}", value, 0) for name, value in means.items()]
             self.log(parent_id, rows, whole)
             self.end(parent_id, whole)

@@ -16,6 +16,28 @@ METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
 TRUTH = ("force_mean_N", "force_var_N2")
 
 
+def accuracy_pct(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"]) -> float:
+    """Return the percentage of rows whose errors in x and in y are at most 1 mm."""
+    error_mm = np.abs(predicted_mm.astype(float) - true_mm)
+    return 100.0 * float((error_mm <= ACCURACY_LIMIT_MM).all(axis=1).mean())
+
+
+def mse(true: Float[np.ndarray, "..."], predicted: Float[np.ndarray, "..."]) -> float:
+    """Return the mean squared error over all values."""
+    return float(((predicted.astype(float) - true) ** 2).mean())
+
+
+def r2(true: Float[np.ndarray, " f *c"], predicted: Float[np.ndarray, " f *c"]) -> float:
+    """Return R^2, which is 1 - `mse` / variance of the true values; the variance is averaged over columns.
+
+    It is 0 if the prediction is always the mean of the true values, and NaN if all true values are equal.
+    """
+    # Both conditions are needed because of rounding. The computed variance of equal values can differ from zero, and
+    # the computed variance of nearly equal values can be zero.
+    variance = float(true.astype(float).var(axis=0).mean())
+    return 1 - mse(true, predicted) / variance if np.ptp(true, axis=0).any() and variance > 0 else float("nan")
+
+
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
     """Score predictions of x_mm, y_mm and F_N.
 
@@ -26,28 +48,33 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
     - `accuracy_pct`: percentage of rows whose errors in x and in y are at most 1 mm
     - `mse_xy_mm2`: mean squared error of the place, averaged over x and y. The paper does not say whether its MSE is
       the sum over x and y, or the mean.
-    - `mse_f_N2`: mean squared error of the force
-    - `r2_f`: R^2 of the force, 1 - `mse_f_N2` / (variance of the true forces). It is 0 if the prediction is always the
-      mean of the true forces.
+    - `mse_f_N2`, `r2_f`: mean squared error and R^2 of the force
     - `force_mean_N`, `force_var_N2`: mean and variance of the true forces
 
     If no true force is known, the last four are missing. If all true forces are equal, `r2_f` is missing.
     """
-    error = predicted.astype(float) - true
-    known = ~np.isnan(error[:, 2])
-    place = error[:, :2]
-    numbers = {
-        "accuracy_pct": 100.0 * float((np.abs(place) <= ACCURACY_LIMIT_MM).all(axis=1).mean()),
-        "mse_xy_mm2": float((place**2).mean()),
-    }
+    place, place_predicted = true[:, :2], predicted[:, :2]
+    numbers = {"accuracy_pct": accuracy_pct(place, place_predicted), "mse_xy_mm2": mse(place, place_predicted)}
+    known = ~np.isnan(true[:, 2]) & ~np.isnan(predicted[:, 2])
     if known.any():
-        numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
-        force_N = true[known, 2].astype(float)
+        force_N, predicted_N = true[known, 2].astype(float), predicted[known, 2]
+        numbers |= {"mse_f_N2": mse(force_N, predicted_N)}
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # Both conditions are needed because of rounding. The computed variance of equal forces can differ from zero,
-        # and the computed variance of nearly equal forces can be zero.
-        if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
-            numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
+        if not np.isnan(explained := r2(force_N, predicted_N)):
+            numbers["r2_f"] = explained
+    return numbers
+
+
+def score_shear(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
+    """Score predictions of x_mm, y_mm, Fx_N, Fy_N and Fz_N.
+
+    `explained_*` is R^2. Unlike an MSE, it does not grow with the size of the forces.
+    """
+    parts = {"xy_mm2": slice(0, 2), "fxy_N2": slice(2, 4), "fz_N2": slice(4, 5)}
+    numbers = {"accuracy_pct": accuracy_pct(true[:, :2], predicted[:, :2])}
+    for name, part in parts.items():
+        numbers[f"mse_{name}"] = mse(true[:, part], predicted[:, part])
+        numbers[f"explained_{name.partition('_')[0]}"] = r2(true[:, part], predicted[:, part])
     return numbers
 
 

@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 
 from pipeline.manage.new import scene_text
 from pipeline.scenes import EXPERIMENTS, check_scene
+from pipeline.scores import KEYS
 from pipeline.settings import Settings, read_shared_files
-from pipeline.statistics import KEYS, UNCERTAINTY
 from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import TARGETS

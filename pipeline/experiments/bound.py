@@ -17,10 +17,11 @@ from scipy.special import owens_t
 from pipeline.experiments.ambient import readings_uT
 from pipeline.experiments.results import write_results
 from pipeline.formatting import COLUMNS, n_of, show, tabulate
+from pipeline.scores import rows_of_cards
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.statistics import over_folds, tidy
+from pipeline.statistics import over_folds
 from reskin import io
 from reskin.data.grid import CENTRE_MM, points_mm
 from reskin.errors import ParamsError, SchemaError
@@ -190,7 +191,7 @@ def score_network(models: Path, skin: str) -> dict[str, Any]:
             f"{models}: the networks of {NETWORK} were trained on skins {skins}, not on {skin}. Run stage "
             "train_single again."
         )
-    scores = over_folds(tidy(cards))
+    scores = over_folds(rows_of_cards(cards))
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 

@@ -13,9 +13,10 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.formatting import COLUMNS, PAPER_METRICS, show, show_difference, tabulate
 from pipeline.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 from pipeline.plot import COLOURS, drawing, svg
+from pipeline.scores import join, select, write_scores
 from pipeline.settings import Adaptations, Settings
 from pipeline.simulation import simulation_settings
-from pipeline.statistics import statistic
+from pipeline.statistics import Stat, statistic
 from pipeline.training.jobs import SceneData, adaptation_jobs, preload_training, read_data, read_pretrained
 from pipeline.training.variants import (  # fmt: skip
     AFTER,
@@ -27,6 +28,7 @@ from pipeline.training.variants import (  # fmt: skip
     compare_variants,
     force_biases,
     predict_before,
+    score_variants,
     summarise_variants,
 )
 from reskin.data.rows import Selection, gather, stack
@@ -43,7 +45,9 @@ FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figu
 SHAPE = "shape"
 
 
-def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
+def flexible(
+    settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, scores: Path, results: Path
+) -> None:
     """Adapt networks that were trained on rigid boards to each flexible skin; test them on later passes of the skin.
 
     The networks are those of the first fold of experiment `lobo` (leave one board out).
@@ -71,19 +75,19 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     }
     after, trainings = adapt_and_predict(data, jobs, "flexible")
     of_paper = before[HEADLINE] + [prediction for prediction in after if prediction.variant != SHAPE]
+    tables = [score_variants("flexible", of_paper, recipe=HEADLINE)]
+    if SHAPE in recipes:
+        shaped = before[SHAPE] + [replace(one, variant=AFTER) for one in after if one.variant == SHAPE]
+        tables.append(score_variants("flexible", shaped, recipe=SHAPE))
+    write_scores(scores, join(tables))
     numbers: dict[str, Any] = {
-        "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
-        "seeds_n": len({prediction.seed_i for prediction in of_paper}), "pokes_n": adapting.pokes_n, "fold": first.name,
+        "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
         "strength_ratio": strength_ratio(
             [sizes_by_depth(capture) for capture in captures],
             [sizes_by_depth(capture) for capture in read_captures(main)],
         ),
-    } | gaps(data) | summarise_flexible(of_paper)  # fmt: skip
-    if SHAPE in recipes:
-        numbers[SHAPE] = summarise_flexible(
-            before[SHAPE] + [replace(prediction, variant=AFTER) for prediction in after if prediction.variant == SHAPE]
-        )
+    } | gaps(data)  # fmt: skip
     plot_data = draw_forces(of_paper, rng_for(data.settings.seed, "flexible", "drawn"))
     write_results(results, numbers, plot_data, read_losses(indentations, poked.dropped), trainings)
 
@@ -98,7 +102,7 @@ def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
     return {float(depth): size_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
 
 
-def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
+def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> Stat:
     """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over their common depths."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
@@ -118,10 +122,18 @@ def gaps(data: SceneData) -> dict[str, Any]:
     return {"gap_mm": gap_mm, "gap_less_pct": 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])}
 
 
-def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, Any]:
+def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise the networks of the paper's recipe and, if the scene has recipe `shape`, of this recipe."""
+    by_recipe = {name: select(scores, recipe=name) for name in (HEADLINE, SHAPE)}
+    counts = {f"{name}s_n": by_recipe[HEADLINE][name].nunique() for name in ("skin", "board", "seed")}
+    shape = {SHAPE: _summarise_recipe(by_recipe[SHAPE])} if len(by_recipe[SHAPE]) else {}
+    return {**measured, **counts, **_summarise_recipe(by_recipe[HEADLINE]), **shape}
+
+
+def _summarise_recipe(scores: pd.DataFrame) -> dict[str, Any]:
     """Summarise scores and force bias of each variant, and the change of scores by adaptation, over boards."""
-    differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(predictions, AFTER, BEFORE)}
-    return summarise_variants(predictions) | force_biases(predictions) | {"paired": differences}
+    differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(scores, AFTER, BEFORE)}
+    return {**summarise_variants(scores), **force_biases(scores), "paired": differences}
 
 
 def draw_forces(

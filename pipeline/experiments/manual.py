@@ -5,7 +5,7 @@ that were adapted with the same number of robot pokes, and with a control: netwo
 same number of steps, but without pokes of the skin.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import COLUMNS, PAPER_METRICS, Stat, gain, show, show_difference, tabulate
+from pipeline.formatting import COLUMNS, PAPER_METRICS, gain, show, show_difference, tabulate
 from pipeline.paper import GAINS, MANUAL, MANUAL_POKES_N
+from pipeline.scores import write_scores
 from pipeline.settings import Adaptations, Settings
-from pipeline.statistics import VERDICTS, verdict
+from pipeline.statistics import VERDICTS, Stat, verdict
 from pipeline.training.jobs import (
     AdaptationPokes,
     PretrainedNetworks,
@@ -37,6 +38,7 @@ from pipeline.training.variants import (  # fmt: skip
     adapt_and_predict,
     compare_variants,
     predict_before,
+    score_variants,
     summarise_variants,
 )
 from reskin.data.lines import Lines, hand_rows, shift_rows
@@ -49,7 +51,9 @@ from reskin.models.recipe import HEADLINE
 GRID = "grid"  # name of the variant that is adapted with equally many robot pokes instead of hand pokes
 
 
-def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
+def manual(
+    settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, scores: Path, results: Path
+) -> None:
     """Adapt networks to every skin with its hand pokes, or with equally many robot pokes; test on the robot's grid."""
     preload_training()
     data = read_data(settings, main, folds)
@@ -67,7 +71,8 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
     after, trainings = adapt_and_predict(data, jobs, "manual")
     pokes_n = [count_pokes(data, skin_lines) for skin_lines in lines.values()]
     lines_n = [len(np.unique(skin_lines.line_i)) for skin_lines in lines.values()]
-    numbers = summarise_manual([*predictions, *after], pokes_n=pokes_n, lines_n=lines_n)
+    write_scores(scores, score_variants("manual", [*predictions, *after]))
+    numbers = {"pokes_n": round(np.mean(pokes_n)), "lines_n": round(np.mean(lines_n))}
     write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
@@ -106,27 +111,16 @@ def fold_without(data: SceneData, board: str) -> Fold:
     return folds[board]
 
 
-def summarise_manual(
-    predictions: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
-) -> dict[str, Any]:
-    """Summarise the scores of each variant over boards, and the differences between variants.
-
-    `pokes_n` and `lines_n` are the numbers of pokes and lines of each skin; their means are reported.
-    """
-    variants = summarise_variants(predictions)
-    counts = {
-        "pokes_n": round(np.mean(pokes_n)),
-        "lines_n": round(np.mean(lines_n)),
-        "skins_n": len({prediction.skin for prediction in predictions}),
-        "boards_n": len({prediction.board for prediction in predictions}),
-        "seeds_n": len({prediction.seed_i for prediction in predictions}),
-    }
+def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise the scores of each variant over boards, and the differences between variants on the same skins."""
+    variants = summarise_variants(scores)
+    counts = {f"{name}s_n": scores[name].nunique() for name in ("skin", "board", "seed")}
     differences = {
-        f"{AFTER}_minus_{other}": compare_variants(predictions, AFTER, other)
+        f"{AFTER}_minus_{other}": compare_variants(scores, AFTER, other)
         for other in (BEFORE, CONTROL, GRID)
         if other in variants
     }
-    return counts | variants | {"paired": differences}
+    return {**measured, **counts, **variants, "paired": differences}
 
 
 VARIANTS = {

@@ -28,9 +28,10 @@ from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
 from pipeline.formatting import COLUMNS, FORCE_METRICS, n_of, scores, show, show_difference, tabulate
 from pipeline.provenance import SECONDS
+from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, rows_of_cards
 from pipeline.settings import Row, SectionWithRows, Settings, take
 from pipeline.stage import say
-from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
+from pipeline.statistics import over_boards, paired, statistic, tally
 from pipeline.training.jobs import SceneData, score_test
 from pipeline.training.universal import (
     ASSUMED_POWER,
@@ -165,7 +166,7 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
     If `controls` names a control of a method, the summary of the method also contains the difference between the method
     and its control, paired by board.
     """
-    table = tidy([], {"rivals": points})
+    table = rows_of_cards([], {"rivals": points})
     table["labels_n"] = table["labels_n"].astype(int)
     groups: dict[Any, Any] = dict(iter(table.groupby(["method", "recipe", "labels_n"], sort=False)))
     rows = []

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pipeline.statistics import as_json
 from reskin import io
 from reskin.errors import SchemaError
 from reskin.schema import Readings
@@ -53,5 +54,5 @@ def write_results(
     `read_losses` if the experiment has captures of its own. trainings: the numbers of trained and of collapsed networks
     (see `pipeline.statistics.tally`).
     """
-    content = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
+    content = {"numbers": as_json(numbers), "drawn": dict(drawn), "losses": dict(losses)}
     io.write_json(results, content if trainings is None else content | {"trainings": dict(trainings)})

@@ -3,29 +3,28 @@
 The readings of every skin are split in two ways: random readings are held out, or whole lines are held out.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import show, tabulate
 from pipeline.paper import SHEAR
 from pipeline.plot import COLOURS, drawing, svg
+from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import over_units, tally
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs, write_timings
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.data.splits import NO_POOL, Fold, draw_sides
-from reskin.metrics import ACCURACY_LIMIT_MM
+from reskin.metrics import score_shear
 from reskin.seeds import rng_for, seed_for
 
-PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
-PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
+BY_READING, BY_LINE = "reading", "line"  # splits: random readings or whole lines are held out
 DRAWN_N = 400  # number of points in a panel of the figure
 FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
 
@@ -38,7 +37,7 @@ class Shear(SectionWithTraining):
     training: Training
 
 
-def shear(settings: Settings, section: Shear, indentations: Path, results: Path) -> None:
+def shear(settings: Settings, section: Shear, indentations: Path, scores: Path, results: Path) -> None:
     """Train networks with five targets on both splits of every skin, and score the held-out readings."""
     preload_training()
     rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
@@ -48,16 +47,19 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
     jobs = make_jobs(data, section.training, data.folds)
     trained = train_jobs(data, jobs, "shear")
     write_timings(settings.scene, "shear", jobs, trained)
-    scores = [
-        (job.fold, score5(rows.target[job.test], result.predicted)) for job, result in zip(jobs, trained, strict=True)
+    lines = {fold.name for fold in by_line}
+    rows_of_jobs = [
+        {"experiment": "shear", "split": BY_LINE if job.fold in lines else BY_READING, "recipe": job.recipe_name}
+        | {"fold": job.fold, "seed": job.seed_i, **score_shear(rows.target[job.test], result.predicted)}
+        for job, result in zip(jobs, trained, strict=True)
     ]
-    names = {fold.name for fold in by_line}
-    numbers = summarise_shear(
-        [job for job in scores if job[0] not in names], [job for job in scores if job[0] in names],
-        target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
-        seeds_n=section.training.seeds_n,
-    )  # fmt: skip
-    first_i = next(i for i, job in enumerate(jobs) if job.fold in names)
+    write_scores(scores, make_table(rows_of_jobs))
+    rms_N = np.sqrt((rows.target.astype(float) ** 2).mean(axis=0))
+    numbers = {
+        "readings_n": len(rows), "lines_n": len(np.unique(rows.indentation)), "passes_n": len(np.unique(rows.pass_i)),
+        "fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4]),
+    }  # fmt: skip
+    first_i = next(i for i, job in enumerate(jobs) if job.fold in lines)
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(jobs[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[jobs[first_i].test], trained[first_i].predicted
     plot_data = {
@@ -85,46 +87,13 @@ def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int
     return folds
 
 
-def score5(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, Fx_N, Fy_N, Fz_N).
+def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise the scores of both splits over folds; the score of a fold is the mean over its seeds.
 
-    `explained_*` is 1 - MSE / variance of the true values: 1 is perfect, 0 is no better than predicting the mean.
-    Unlike an MSE, it does not grow with the size of the forces.
+    `sd_seeds` is the standard deviation over the networks of one fold, averaged over folds.
     """
-    error = predicted.astype(float) - true
-    near = np.abs(error[:, PLACE]) <= ACCURACY_LIMIT_MM
-    numbers = {"accuracy_pct": 100.0 * float(near.all(axis=1).mean())}
-    numbers |= {mse: float((error[:, part] ** 2).mean()) for part, mse in PARTS.values()}
-    for name, (part, mse) in PARTS.items():
-        numbers[f"explained_{name}"] = 1 - numbers[mse] / float(true[:, part].astype(float).var(axis=0).mean())
-    return numbers
-
-
-def summarise_shear(
-    by_reading: Sequence[tuple[Hashable, Mapping[str, float]]],
-    by_line: Sequence[tuple[Hashable, Mapping[str, float]]],
-    *,
-    target: Float[np.ndarray, "f 5"],
-    lines_n: int,
-    passes_n: int,
-    seeds_n: int,
-) -> dict[str, Any]:
-    """Summarise the scores of both splits over folds, and add the rms forces.
-
-    `by_reading` and `by_line` have one pair (fold, scores) per network. The score of a fold is the mean over its seeds.
-    `sd_seeds` is the standard deviation over the `seeds_n` networks of one fold, averaged over folds. `lines_n` is the
-    number of dragged lines over all passes; each pass drags along the same lines.
-    """
-
-    def over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
-        return over_units(pd.DataFrame([{"fold": fold, **scores} for fold, scores in scored]), "fold")
-
-    rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
-    sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
-    return over_folds(by_reading) | {
-        "by_line": over_folds(by_line), "seeds_n": seeds_n,
-        "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
-    }  # fmt: skip
+    by_reading, by_line = (over_units(select(scores, split=name), "fold") for name in (BY_READING, BY_LINE))
+    return {**by_reading, "by_line": by_line, "seeds_n": scores["seed"].nunique(), **measured}
 
 
 TITLES = {

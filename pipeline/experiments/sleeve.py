@@ -18,21 +18,22 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.formatting import COLUMNS, scores, show, tabulate
 from pipeline.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
 from pipeline.plot import COLOURS, ERROR_COLOURS, drawing, svg
+from pipeline.scores import make_table, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.statistics import tally
+from pipeline.statistics import statistic, tally
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
-from reskin.metrics import score
+from reskin.metrics import METRICS, score
 from reskin.models.classical import ClassicalJob, Neighbours, run_classical_jobs
 from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
 NEAR_MM = 4.0  # a place closer than this to a border between boards is near it (assumed: twice the skin's thickness)
-Stats = dict[str, dict[str, float]]  # for each metric: mean, n and, for several training runs, sd
+PARTS = {"near_seam": "median error near a border, mm", "inside": "median error elsewhere, mm"}
 
 
 class Sleeve(SectionWithTraining):
@@ -62,7 +63,7 @@ class Area:
         return near
 
 
-def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Path) -> None:
+def sleeve(settings: Settings, section: Sleeve, indentations: Path, scores: Path, results: Path) -> None:
     """Train the networks on the first pokes of each capture; score them and nearest neighbours on the last pokes."""
     preload_training()
     captures, area = read_captures(indentations), area_of(settings)
@@ -81,12 +82,18 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
     }
     predictions |= predict_by_neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]
-    scored = {name: score_places(true, by_seed, indentation, area) for name, by_seed in predictions.items()}
+    near = area.near_border(true[:, :2])
+    scored = [
+        {"experiment": "sleeve", "method": name, "seed": seed_i, **score_places(true, predicted, near)}
+        for name, by_seed in predictions.items()
+        for seed_i, predicted in enumerate(by_seed)
+    ]
+    write_scores(scores, make_table(scored))
     trained_n, tested_n = (len(np.unique(data.rows.indentation[side])) for side in (train, test))
     numbers = {
         "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
         "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
-        **scored.pop(HEADLINE), "variants": scored,
+        "tested": {part: len(np.unique(indentation[rows])) for part, rows in (("near_seam", near), ("inside", ~near))},
     }  # fmt: skip
     plot_data = draw_errors(area, true, errors_mm(true, predictions[HEADLINE][0]), indentation)
     losses = read_losses(indentations, data.rows.dropped)
@@ -176,43 +183,29 @@ def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"
 
 
 def score_places(
-    true: Float[np.ndarray, "f 3"],
-    predictions: Sequence[Float[np.ndarray, "f 3"]],
-    indentation: Int[np.ndarray, " f"],
-    area: Area,
-) -> dict[str, Any]:
-    """Score the predictions of a method: over all places, near borders between boards, and elsewhere.
-
-    `predictions` has one array per network seed.
-    """
-    near = area.near_border(true[:, :2])
-    seed_errors_mm = [errors_mm(true, predicted) for predicted in predictions]
-    scores: dict[str, Any] = over_seeds(
-        [
-            {
-                **score(true, predicted),
-                "median_error_mm": float(np.median(error_mm)),
-                "p95_error_mm": float(np.percentile(error_mm, 95)),
-            }
-            for predicted, error_mm in zip(predictions, seed_errors_mm, strict=True)
-        ]
-    )
-    for name, rows in (("near_seam", near), ("inside", ~near)):
-        if rows.any():
-            medians = [{"median_error_mm": float(np.median(error_mm[rows]))} for error_mm in seed_errors_mm]
-            scores[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[rows]))}
-    return scores
+    true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"], near: Bool[np.ndarray, " f"]
+) -> dict[str, float]:
+    """Score the predictions of one network over all places, near borders between boards (`near`), and elsewhere."""
+    error_mm = errors_mm(true, predicted)
+    parts = {f"median_error_{part}_mm": error_mm[rows] for part, rows in (("near_seam", near), ("inside", ~near))}
+    medians = {name: float(np.median(of_part_mm)) for name, of_part_mm in parts.items() if len(of_part_mm)}
+    whole = {"median_error_mm": float(np.median(error_mm)), "p95_error_mm": float(np.percentile(error_mm, 95))}
+    return {**score(true, predicted), **whole, **medians}
 
 
-def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
-    """Return the mean and number of values of each metric over training runs, and the sd if there are several runs."""
-    stats: Stats = {}
-    for name in scores[0]:
-        values = np.array([of_seed[name] for of_seed in scores])
-        stats[name] = {"mean": float(values.mean()), "n": len(values)}
-        if len(values) > 1:
-            stats[name]["sd"] = float(values.std(ddof=1))
-    return stats
+def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise the scores of each method over the seeds of its networks."""
+    tested = measured["tested"]
+    by_method: dict[str, dict[str, Any]] = {}
+    for method, rows in scores.groupby("method", sort=False):
+        stats = {name: statistic(rows[name]) for name in (*METRICS, *PLACES) if rows[name].notna().all()}
+        for part, tested_n in tested.items():
+            if tested_n:
+                median = {"median_error_mm": statistic(rows[f"median_error_{part}_mm"])}
+                stats |= {part: median | {"pokes_n": tested_n}}
+        by_method[str(method)] = stats
+    counts = {name: value for name, value in measured.items() if name != "tested"}
+    return {**counts, **by_method.pop(HEADLINE), "variants": by_method}
 
 
 def draw_errors(
@@ -232,7 +225,6 @@ def draw_errors(
 
 
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % of errors below, mm"}
-PARTS = {"near_seam": "median error near a border, mm", "inside": "median error elsewhere, mm"}
 NO_NUMBER = "none, only a demonstration"
 SPREAD = "± is the standard deviation over the network seeds; column `seeds` gives their number."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}

@@ -19,10 +19,11 @@ from pipeline.experiments.results import write_results
 from pipeline.formatting import COLUMNS, SHORT, show, tabulate
 from pipeline.paper import TABLE_2
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.scores import by_skin, rows_of_cards, select, whole
 from pipeline.settings import Adaptations, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from pipeline.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
+from pipeline.statistics import over_boards, over_pairs, records
 from pipeline.training.jobs import (
     PretrainedNetworks,
     SceneData,
@@ -263,7 +264,7 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
         for card in cards
         if card["fold"].startswith(f"{world.name}.") and card["recipe_name"] == HEADLINE
     ]
-    table, scores = tidy(world_cards), {}
+    table, scores = rows_of_cards(world_cards), {}
     for row, experiment in EXPERIMENTS.items():
         rows = select(table, question=experiment)
         boards = by_skin(rows).groupby("board")[list(METRICS)].mean() if row == "single" else None

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipeline.formatting import (
     Results,
-    Stat,
+    Statistic,
     models,
     show,
     show_with_unit,
@@ -21,6 +21,7 @@ from pipeline.formatting import (
 )
 from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
 from pipeline.report.figures import WAYS, boards_rows
+from pipeline.statistics import Stat
 
 PLACE, FORCE = "place", "force"
 YES, PARTLY, NO, UNTESTED = "yes", "partly", "no", "not tested"
@@ -122,28 +123,32 @@ def answers(numbers: Results) -> Answers:
     return Answers(_tested(numbers, best), _place(best, others), _force(numbers, best, others), efforts)
 
 
-def rms(mse: Stat | None) -> Stat | None:
+def rms(mse: Statistic | None) -> Stat | None:
     """Return the root mean squared error for a mean squared error, with an interval or with one value per board.
 
     If the values of boards are known, the square root of each value is computed, and the mean is the mean of these
     roots. The result has no standard deviation, because the standard deviation of the square roots cannot be computed
     from the standard deviation of the squared errors.
 
-    >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]})
+    >>> rms({"mean": 0.25, "n": 6, "ci95": [0.16, 0.36]}).to_json()
     {'mean': 0.5, 'n': 6, 'ci95': [0.4, 0.6]}
     """
     if mse is None:
         return None
-    ends = {name: [sqrt(end) for end in mse[name]] for name in ("ci95", "values") if name in mse}
-    mean = fmean(ends["values"]) if "values" in ends else sqrt(mse["mean"])
-    return {"mean": mean, "n": mse["n"]} | ends
+    stat = Stat.of(mse)
+    if stat.values:
+        roots = tuple(sqrt(value) for value in stat.values)
+        return Stat(fmean(roots), stat.n, values=roots)
+    ci95 = None if stat.ci95 is None else (sqrt(stat.ci95[0]), sqrt(stat.ci95[1]))
+    return Stat(sqrt(stat.mean), stat.n, ci95=ci95)
 
 
-def level(stat: Stat, yes: float, partly: float) -> str:
+def level(score: Statistic, yes: float, partly: float) -> str:
     """Return the level of a score; for a yes, the whole interval, or all boards, must be at `yes` or above."""
-    if min(stat.get("ci95", stat.get("values", [stat["mean"]]))) >= yes:
+    stat = Stat.of(score)
+    if min(stat.ends or (stat.mean,)) >= yes:
         return YES
-    return PARTLY if stat["mean"] >= partly else NO
+    return PARTLY if stat.mean >= partly else NO
 
 
 def _efforts(numbers: Results) -> Iterator[Effort]:
@@ -250,9 +255,10 @@ def _place(best: Effort, others: Sequence[Effort]) -> Answer:
     return Answer(PLACE, reached, short, tuple(sentences), second)
 
 
-def _requirement(accuracy: Stat) -> str:
+def _requirement(accuracy: Statistic) -> str:
     """Say whether an accuracy reaches the paper's requirement, from its interval or the values of a few boards."""
-    ends, few = accuracy.get("ci95", accuracy.get("values", [accuracy["mean"]])), "ci95" not in accuracy
+    stat = Stat.of(accuracy)
+    ends, few = stat.ends or (stat.mean,), stat.ci95 is None
     if min(ends) >= PLACE_ACCURACY_MIN_PCT:
         return "reached on all boards" if few else "reached"
     if max(ends) < PLACE_ACCURACY_MIN_PCT:
@@ -266,7 +272,7 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         return Answer(FORCE, UNTESTED, "the recordings have no forces")
     second = ""
     sentences = [f"Rms error: {show_with_unit(error, 'N')}; R²: {show(explained)}.", *_forces(numbers)]
-    constant = numbers.get("constant_force", {}).get("labels" if numbers.get("labels") else "table2")
+    constant = numbers.get("constant_force", {}).get("table2")
     if best.paper:
         sentences.append(
             f"Paper: rms error {sqrt(best.paper['mse_f_N2']):.2f} N. The paper does not state how large its forces are."
@@ -276,15 +282,15 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         shown = show_with_unit(rms(other.scores["mse_f_N2"]), "N")
         sentences.append(f"{_named(other)}: rms error {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
         second = sentences[-1] if other.role == SECOND else second
-    short = f"rms error {two_digits(error['mean'])} N"
+    short = f"rms error {two_digits(error.mean)} N"
     if constant and (guessing := rms(constant["mse_f_N2"])):
-        short += f" (always predicting the mean force: {two_digits(guessing['mean'])} N)"
+        short += f" (always predicting the mean force: {two_digits(guessing.mean)} N)"
     if force_level(explained) == NO:
         short = f"not usable; {short}"
     return Answer(FORCE, force_level(explained), short, tuple(sentences), second)
 
 
-def force_level(explained: Stat) -> str:
+def force_level(explained: Statistic) -> str:
     """Return the level that R² of the force reaches."""
     return level(explained, FORCE_YES_R2, FORCE_PARTLY_R2)
 

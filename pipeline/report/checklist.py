@@ -13,9 +13,9 @@ from typing import Any, Literal
 import pandas as pd
 
 from pipeline import paper, statistics
-from pipeline.formatting import FEW_POINTS, Stat, gain, is_pooled, reworded, show, show_difference
+from pipeline.formatting import FEW_POINTS, gain, is_pooled, reworded, show, show_difference
 from pipeline.report.experiments import add_rows
-from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS
+from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS, Stat
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
@@ -216,15 +216,13 @@ def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
         if not p_values or len(p_values) < len(parts):
             return None
         contradicting = [
-            p
-            for p, part in zip(p_values, parts, strict=True)
-            if gain(part, row.metric)["mean"] < 0 and p <= SIGNIFICANT
+            p for p, part in zip(p_values, parts, strict=True) if gain(part, row.metric).mean < 0 and p <= SIGNIFICANT
         ]
         return min(1.0, len(p_values) * min(contradicting)) if contradicting else max(p_values)
     if not isinstance(ours, Mapping) or "se" not in ours:
         return None
     limit = sizeable(mean_of(printed)) if row.rule == "sizeable" else 0.0
-    return statistics.p_value(gain(ours, row.metric)["mean"] - limit, ours["se"], ours["df"])
+    return statistics.p_value(gain(ours, row.metric).mean - limit, ours["se"], ours["df"])
 
 
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
@@ -257,11 +255,11 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if row.rule == "each":
         return _judge_each(ours)
     if row.rule in DIFFERENCES:
-        return _judge_difference(row, mean_of(printed), ours)
+        return _judge_difference(row, mean_of(printed), Stat.of(ours))
     if row.rule in ("at_most", "at_least", "positive"):
         limit = 0.0 if row.rule == "positive" else mean_of(printed)
         assert limit is not None, "a row with this rule has a number of the paper as its limit"
-        return _judge_limit(row.rule, limit, ours if isinstance(ours, Mapping) else {"mean": float(ours)})
+        return _judge_limit(row.rule, limit, Stat.of(ours) if isinstance(ours, Mapping) else Stat(float(ours), 1))
     return _judge_number(printed, ours, target=row.rule == "target" and simulated)
 
 
@@ -270,24 +268,24 @@ def _judge_difference(row: Row, printed: float | None, ours: Stat) -> Judgement:
     if row.rule in ("slight", "plateau"):
         margin = FEW_POINTS if row.rule == "slight" else PLATEAU_POINTS
         verdict = statistics.verdict_within(ours, margin)
-        return Judgement(verdict, f"change of less than {margin:g} points", _yes(abs(ours["mean"]) < margin))
+        return Judgement(verdict, f"change of less than {margin:g} points", _yes(abs(ours.mean) < margin))
     improvement = gain(ours, row.metric)
     limit, criterion = 0.0, "gain above 0"
     if row.rule == "sizeable":
         limit = sizeable(printed)
         criterion = f"gain above {limit:.3g} (half of the paper's gain)"
-    low, high = improvement.get("ci95", (-float("inf"), float("inf")))
+    low, high = improvement.ci95 or (-float("inf"), float("inf"))
     notes = (EQUIVALENT,) if printed and max(-low, high) < sizeable(printed) else ()
     return Judgement(
-        statistics.verdict(improvement, above=limit), criterion, _yes(improvement["mean"] > limit), notes=notes
+        statistics.verdict(improvement, above=limit), criterion, _yes(improvement.mean > limit), notes=notes
     )
 
 
 def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
     """Judge whether a number is within a limit (the paper's number, or 0)."""
-    mean = ours["mean"]
+    mean = ours.mean
     if rule == "at_most":
-        verdict = statistics.verdict(statistics.negate(ours), above=-limit)
+        verdict = statistics.verdict(-ours, above=-limit)
         return Judgement(verdict, f"at most {limit:g}", _yes(mean <= limit))
     verdict = statistics.verdict(ours, above=limit)
     if rule == "at_least":
@@ -297,7 +295,7 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
 
 def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
     """Judge a claim about accuracy that must hold for every number of training skins."""
-    verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
+    verdicts = {row["skins_n"]: statistics.verdict(Stat.of(row["accuracy_pct"])) for row in contrasts}
     counts = [f"with {n}{' training skin' * (i == 0)}{'s' * (i == 0 and n > 1)}" for i, n in enumerate(verdicts)]
     by_number = "; ".join(f"{count}: {verdict}" for count, verdict in zip(counts, verdicts.values(), strict=True))
     return Judgement(
@@ -321,7 +319,7 @@ def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
     if isinstance(printed, tuple):
         tolerance, criterion = printed[1], "within the paper's standard deviation"
     inside = {"yes": AGREES, "no": DIFFERS}.get(_paper_in_interval(printed, ours))
-    few = FEW_BOARDS if isinstance(ours, Mapping) and "values" in ours else NO_INTERVAL
+    few = FEW_BOARDS if isinstance(ours, Mapping) and Stat.of(ours).few else NO_INTERVAL
     met = _yes(abs(value - mean) <= tolerance)
     return Judgement(inside or few, criterion, met, notes=(TARGET,) if target else ())
 
@@ -377,9 +375,10 @@ def mean_of(value: Any) -> float | None:
 def _paper_in_interval(printed: Any, ours: Any) -> str:
     """If both exist, say whether our interval over boards includes the paper's number."""
     mean = mean_of(printed)
-    if mean is None or not isinstance(ours, Mapping) or "ci95" not in ours:
+    ci95 = Stat.of(ours).ci95 if isinstance(ours, Mapping) and "mean" in ours else None
+    if mean is None or ci95 is None:
         return NONE
-    low, high = ours["ci95"]
+    low, high = ci95
     return _yes(low <= mean <= high)
 
 

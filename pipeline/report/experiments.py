@@ -12,6 +12,20 @@ import pandas as pd
 
 from pipeline.catalogue import experiment_files, module_name
 from pipeline.scenes import ANALYSES, EXPERIMENTS
+from pipeline.scores import select
+
+
+def experiment_numbers(results: Mapping[str, Any], table: pd.DataFrame) -> dict[str, Any]:
+    """Return the numbers of experiments: those that they measured, and summaries of their rows of the table of scores.
+
+    results: content of the files that the experiments wrote, by experiment.
+    """
+    numbers = {}
+    for name, result in results.items():
+        module = import_module(module_name(name))
+        scores = select(table, experiment=name)
+        numbers[name] = module.summarise(scores, result["numbers"]) if EXPERIMENTS[name].scores else result["numbers"]
+    return numbers
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -7,16 +7,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from pipeline.formatting import control_of
 from pipeline.paper import PLATEAU_POKES_N
 from pipeline.scenes import EXPERIMENTS, TABLE_2
+from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
 from pipeline.statistics import (
-    AS_LABELLED,
-    METHODS,
-    REGISTERED,
-    by_skin,
+    as_json,
     differences,
     over_boards,
     over_folds,
@@ -24,18 +21,15 @@ from pipeline.statistics import (
     paired,
     paired_with_single,
     records,
-    select,
     statistic,
     summarise,
     summarise_differences,
     tally,
-    tidy,
-    whole,
 )
+from pipeline.training.before_contact import MAGNITUDES, PLACE
 from reskin.metrics import METRICS
 
 Row = Mapping[str, Any]
-Points = Mapping[str, Sequence[dict[str, Any]]]
 Seconds = Sequence[Row]  # times of training runs: name, train_s, one_reading_s
 
 CONTROL = "control"  # recipe of adaptation that fine-tunes for equally many steps, without the new skin's pokes
@@ -51,18 +45,14 @@ PAPERS_SPLITS = (
 # Splits in which the readings of an indentation, or of a pass, are never divided between training and test.
 STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}
 SWEPT = ("multi", "triplet", "adapted")
-TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
-NETWORKS = {
-    METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN
-}  # name of the experiment, by name of the method
-OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
 # For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
-AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
+AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
     "by_time": "single_temporal",
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
+BEFORE_TOUCH = ("noload", "scan")  # methods that predict the position from what is known before the contact
 HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
 SEEN_PCT = 25.0  # assumed: if a hovering tip is located with at least this accuracy, the chips sense the tip
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
@@ -79,15 +69,14 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     `headline` is the recipe that is compared with the paper's numbers.
     """
     recipes = {row: (experiment, headline) for row, experiment in TABLE_2.items()} | {CONTROL: ("adapt", CONTROL)}
-    models = {row: select(table, question=experiment, recipe=recipe) for row, (experiment, recipe) in recipes.items()}
+    models = {row: select(table, experiment=experiment, recipe=recipe) for row, (experiment, recipe) in recipes.items()}
     models = {row: group for row, group in models.items() if len(group)}
     table2 = {row: over_pairs(group) if row == "single" else over_boards(group) for row, group in models.items()}
     control = table2.pop(CONTROL, None)
     adapt: dict[str, Any] = {}
     if "adapted" in models:
         adapt = {"pokes_n": int(models["adapted"]["pokes_n"].iloc[0])} | ({"control": control} if control else {})
-    tested = {"table2": models.get("multi", table[:0]), "labels": select(table, question="labels")}
-    constant_force = {name: _constant_force(rows) for name, rows in tested.items()}
+    constant_force = {"table2": _constant_force(models["multi"])} if "multi" in models else {}
     numbers: dict[str, Any] = {
         "table2": table2,
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
@@ -106,37 +95,25 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     return numbers | _sweeps(table) | {"variants": _variants(table)}
 
 
-def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
+def sweep_curves(table: pd.DataFrame) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
     """Return the points of sweeps as curves, by experiment: (method, step on the axis, mean scores)."""
-    numbers = _sweeps(tidy([], points))
-    curves: dict[str, list[tuple[str, int, dict[str, float]]]] = {}
-    for experiment, (key, axis) in AXES.items():
-        for row in numbers.get(key, ()):
-            name = "_".join(part for part in (row.get("method", "adapted"), row.get("inputs", "")) if part)
-            name = name.replace(", ", "_").replace(" ", "_").replace("+", "and")
-            curves.setdefault(experiment, []).append((name, row[axis], _means(row.get(AS_LABELLED, row))))
-    return curves
+    numbers = as_json(_sweeps(table))
+    return {
+        experiment: [(row.get("method", "adapted"), row[axis], _means(row)) for row in numbers[key]]
+        for experiment, (key, axis) in AXES.items()
+        if key in numbers
+    }
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of methods with their training times on this machine, if these were measured."""
-    joined: dict[str, Any] = {}
-    if "baselines" in numbers:
-        joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
-    if "sweep_pokes" in numbers:
-        timed = seconds.get("sweep_pokes", [])
-        joined["adaptation"] = []
-        for row in numbers["sweep_pokes"]:
-            times_s = [training["train_s"] for training in timed if f".{row['pokes_n']}pokes." in training["name"]]
-            joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
-    if "rivals" in numbers:
-        timed = seconds.get("reference_methods", [])
-        joined["rivals_costs"] = [
-            {"method": row["method"]} | row[AS_LABELLED] | _median_times(timed, f"{row['method']}.")
-            for row in numbers["rivals"]["methods"]
-            if row["pokes"] == OWN_POKES
-        ]
-    return joined
+    """Join the errors of adapted networks with their training times on this machine, if these were measured."""
+    if "sweep_pokes" not in numbers:
+        return {}
+    rows = []
+    for row in numbers["sweep_pokes"]:
+        named = [t for t in seconds.get("sweep_pokes", []) if f".{row['pokes_n']}pokes." in t["name"]]
+        rows.append(row | ({"seconds": float(np.median([t["train_s"] for t in named]))} if named else {}))
+    return {"adaptation": rows}
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
@@ -158,8 +135,8 @@ def _protocol(table: pd.DataFrame, headline: str) -> dict[str, dict[str, int]]:
     """Count boards, skins, folds, seeds and rows per fold for training and testing, by experiment."""
     counts = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
-    networks = select(table[table["question"].isin(names)], recipe=headline)
-    for experiment, rows in _groups(networks, "question", sort=False):
+    networks = select(table[table["experiment"].isin(names)], recipe=headline)
+    for experiment, rows in _groups(networks, "experiment", sort=False):
         folds, skins = whole(rows), by_skin(rows)
         counts[str(experiment)] = {
             "folds_n": folds["fold"].nunique(), "seeds_n": folds["seed"].nunique(),
@@ -174,14 +151,14 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
     """Summarise networks of one skin by split; `single_sensor` is compared with the paper."""
     experiments = (*PAPERS_SPLITS, *STRICTER.values())
     numbers = {
-        experiment: over_folds(select(table, question=experiment, recipe=headline)) for experiment in experiments
+        experiment: over_folds(select(table, experiment=experiment, recipe=headline)) for experiment in experiments
     }
     numbers = {experiment: group for experiment, group in numbers.items() if group}
     like_paper = next(
         ({"split": experiment} | numbers[experiment] for experiment in PAPERS_SPLITS if experiment in numbers), {}
     )
     stricter = {name: numbers[experiment] for name, experiment in STRICTER.items() if experiment in numbers}
-    by_skin = whole(select(table, question="single_temporal", recipe=headline)).groupby("fold")[list(METRICS)].mean()
+    by_skin = whole(select(table, experiment="single_temporal", recipe=headline)).groupby("fold")[list(METRICS)].mean()
     skins = {"single_skins": records(by_skin)} if len(by_skin) > 1 else {}
     return numbers | {"single_sensor": like_paper | stricter} | skins
 
@@ -190,8 +167,8 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise every recipe of the experiments of kind `models` over skin pairs, repeats on one skin, or boards."""
     numbers: dict[str, dict[str, Any]] = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
-    models = table[table["question"].isin(names)]
-    for (experiment, recipe), group in _groups(models, ["question", "recipe"], sort=False):
+    models = table[table["experiment"].isin(names) & (table["recipe"] != "")]
+    for (experiment, recipe), group in _groups(models, ["experiment", "recipe"], sort=False):
         summarise = (
             over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards
         )
@@ -200,11 +177,8 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
-    """Summarise sweeps over pokes, training skins and labels, and classical methods."""
-    pokes, sensors, classical, labels = (
-        select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
-    )
-    labels = pd.concat([labels, *(select(table, question=name) for name in ("calibrated", "universal"))])
+    """Summarise the sweeps over pokes and over training skins."""
+    pokes, sensors = (select(table, experiment=name) for name in AXES)
     numbers: dict[str, Any] = {}
     if len(pokes):
         numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _groups(pokes, "pokes_n")]
@@ -216,12 +190,6 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
             for n, group in _groups(select(sensors, method=method), "trained_on_skins_n")
         ]
         numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(sensors)
-    if len(classical):
-        networks = select(table[table["question"].isin(list(TRAINED_IN))], architecture="paper")
-        networks = networks[networks["recipe"] != CONTROL]
-        numbers["baselines"] = list(_methods(pd.concat([networks, classical])))
-    if len(labels):
-        numbers["labels"] = list(_labels(labels))
     return numbers
 
 
@@ -269,24 +237,6 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     return adapted | more | {"sensors_gain_fewer": counts_n | summarise_differences(gain_few - gain_many)}
 
 
-def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Summarise the scores of each recipe of each experiment over boards."""
-    for (_, recipe), group in _groups(rows, ["question", "recipe"], sort=False):
-        first = group.iloc[0]
-        names = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
-        names |= {"base": first["base"]} if first["base"] else {}
-        yield {**names, "rows_n": int(first["trained_on_rows_n"]), **over_boards(group)}
-
-
-def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Summarise the scores of each method over boards, by number of labels."""
-    for (method, inputs), group in _groups(rows, ["method", "inputs"], sort=False):
-        for labels_n, labelled in _groups(group, "labels_n"):
-            parts = {places: over_boards(labelled, places) for places in (AS_LABELLED, REGISTERED)}
-            by_board = records(whole(labelled).groupby("board")[list(METRICS)].mean())
-            yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts, "by_board": by_board}
-
-
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
     """Score a constant prediction, the mean of the tested forces; its MSE is their variance, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
@@ -301,29 +251,6 @@ def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> It
     yield from rows.groupby(by, sort=sort)
 
 
-def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Return the median times of a method's training runs; the times of adapted networks include pretraining."""
-    experiment = NETWORKS.get(row["method"])
-    if experiment is None:
-        return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
-    times = _median_times(seconds.get(TRAINED_IN[experiment], []), f"{experiment}.{row['name']}.")
-    if experiment != "adapt" or not times:
-        return times
-    base = _median_times(seconds.get("train_triplet", []), f"triplet.{row['base']}.")
-    return times | {"train_s": times["train_s"] + base["train_s"]} if base else {}
-
-
-def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
-    """Return the median times of the training runs whose names start with `prefix`."""
-    trainings = [training for training in timed if training["name"].startswith(prefix)]
-    if not trainings:
-        return {}
-    return {
-        "train_s": float(np.median([training["train_s"] for training in trainings])),
-        "inference_us": 1e6 * float(np.median([training["one_reading_s"] for training in trainings])),
-    }
-
-
 def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add up the counts of captures (keys that end in `_n`); `lost_bytes_n` is the total number of skipped bytes."""
     total = Counter({"captures_n": 0})
@@ -333,7 +260,7 @@ def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
 
 
-def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
+def before_touch_numbers(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the scores of positions that were predicted from readings before the contact.
 
     `before_touch`: scores by experiment and predictor, summarised over folds. `hover`: for each fold (one skin), the
@@ -341,31 +268,29 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
     """
     before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
-    for table in tables:
-        for (experiment, predictor), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
-            if predictor not in HOVER:
-                scores = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
-                before.setdefault(experiment, {})[predictor] = scores
-                continue
-            for row in rows.to_dict("records"):
-                skin_scores = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
-                skin_scores[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
-                if predictor == "hover":
-                    skin_scores["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
+    controls = table[table["method"].isin([*BEFORE_TOUCH, *HOVER])]
+    for (experiment, method), rows in _groups(controls, ["experiment", "method"], sort=False):
+        if method in BEFORE_TOUCH:
+            before.setdefault(experiment, {})[method] = {name: statistic(rows[name]) for name in PLACE}
+            continue
+        for row in rows.to_dict("records"):
+            skin_scores = hover.setdefault(str(row["fold"]), {name: row[name] for name in MAGNITUDES})
+            skin_scores[method] = {name: row[name] for name in PLACE}
+            if method == "hover":
+                skin_scores["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
     return ({"before_touch": before} if before else {}) | ({"hover": hover} if hover else {})
 
 
-def count_trainings(
-    cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
-) -> dict[str, dict[str, int]]:
-    """Count training runs by experiment: all runs, collapsed runs, and collapsed runs that were kept."""
+def count_trainings(cards: Sequence[Row], results: Mapping[str, Row]) -> dict[str, dict[str, int]]:
+    """Count training runs by experiment: all runs, collapsed runs, and collapsed runs that were kept.
+
+    results: results of sweeps and other experiments, by name.
+    """
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
-    for experiment, swept in points.items():
-        trainings[experiment] = [point for point in swept if "collapsed" in point]
-    counted = {experiment: tally(trained) for experiment, trained in trainings.items() if trained}
-    return counted | {name: dict(result["trainings"]) for name, result in experiments.items() if "trainings" in result}
+    counted = {experiment: tally(trained) for experiment, trained in trainings.items()}
+    return counted | {name: dict(result["trainings"]) for name, result in results.items() if "trainings" in result}
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
@@ -444,14 +369,11 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
 
     The scores contain nothing that differs between repeats of a run, such as times, commit or machine.
     """
-    recorded = {
-        name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
-    }
+    recorded = numbers["provenance"]["source"] == "recorded"
     table2, drift = numbers.get("table2", {}) | control_of(numbers), numbers.get("drift", {})
     parts: dict[str, Any] = {
         "table2": {name: _means(row) for name, row in table2.items()},
-        "lobo": {"registered": _means(numbers["lobo"]["registered"])} if "lobo" in recorded else {},
-        "labels": _best_of_labels(numbers["labels"]) if "labels" in recorded else {},
+        "lobo": {"registered": _means(numbers["lobo"]["registered"])} if recorded and "lobo" in numbers else {},
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
@@ -473,17 +395,3 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
 
 def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
     return {name: row[name]["mean"] for name in names if name in row}
-
-
-def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
-    """Select the most accurate method with the fewest labels of the new board, and that with the most labels."""
-    selected = {}
-    counts = [row["labels_n"] for row in rows]
-    for labels_n in sorted({min(counts), max(counts)}):
-        best = max(
-            (row for row in rows if row["labels_n"] == labels_n),
-            key=lambda row: row["as_labelled"]["accuracy_pct"]["mean"],
-        )
-        method = f"{best['method']} ({best['inputs']})"
-        selected[f"best_of_{labels_n}_labels"] = {"method": method} | _means(best["as_labelled"])
-    return selected

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import pyarrow as pa
 
 from pipeline import PLAN, SCENES
 from pipeline.executors import make_executor
@@ -23,7 +22,7 @@ from pipeline.provenance import (
     versions,
 )
 from pipeline.report.costs import cost_pages
-from pipeline.report.experiments import experiment_figures
+from pipeline.report.experiments import experiment_figures, experiment_numbers
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
 from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
 from pipeline.report.numbers import (
@@ -42,12 +41,11 @@ from pipeline.report.page import about_scene, index, page, run_page
 from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, table_2_summary, table_texts
 from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
+from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.statistics import tidy, to_csv
 from pipeline.tracking import Curves, Results, TrackingUnavailable, metrics_of, publishing, read_times, scores_link
 from pipeline.tracking import publish as write_runs
-from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.choice import choose, fingerprint, to_record
 from pipeline.training.final import EXPERIMENT as FINAL_EXPERIMENT
 from pipeline.training.final import FILE as FINAL_FILE
@@ -59,26 +57,28 @@ from reskin.models.recipe import HEADLINE
 from reskin.numerics import device as trained_on
 
 
-def table2(settings: Settings, models: Path, tables: Path) -> None:
+def table2(settings: Settings, scores: Path, tables: Path) -> None:
     """Write our version of the paper's table 2 and its figure, as soon as the networks are trained.
 
     The stage report writes both again, with the other results.
     """
     source, name = settings["source"], settings.scene
-    scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
-    numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
+    table = read_scores(scores / f"{stage}.parquet" for stage in stages(TABLE_2.values(), "models"))
+    numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
     numbers = rounded(numbers)
-    table = to_markdown(table_2_summary(numbers))
-    io.write_texts(tables, {"table2.md": table, **headline_figures(numbers, source)})
-    say(f"{name} ({source})\n{table}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
+    text = to_markdown(table_2_summary(numbers))
+    io.write_texts(tables, {"table2.md": text, **headline_figures(numbers, source)})
+    say(f"{name} ({source})\n{text}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
-def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
+def report(
+    settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path, results: Path, reports: Path
+) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
     name, scene = settings.scene, planned_scene(settings)
     source, inputs = scene.source, read_inputs(name, scene, indentations, folds, models, results)
-    scores = tidy(inputs.cards, inputs.points)
-    numbers = rounded(compute_numbers(settings, scene, inputs, scores))
+    table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
+    numbers = rounded(compute_numbers(settings, scene, inputs, table))
     plot_data = {EXPERIMENTS[name].key: result["drawn"] for name, result in inputs.analyses.items()}
     if "choice" in scene.experiments:
         physics = fingerprint(settings.shared)
@@ -94,7 +94,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
         costs_future = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
-        io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
+        io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(table)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
         of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
         outline = None if of_layout is None else Outline(**of_layout)
@@ -119,22 +119,19 @@ class Inputs:
     """Inputs of stage report, which are the results of other stages.
 
     - cards: model cards (JSON descriptions) of all trained networks.
-    - points: points of the curves of sweeps, by experiment.
-    - analyses, studies: results of experiments, by name.
+    - curves, analyses, studies: results of sweeps and of other experiments, by name.
     - described: descriptions of the captures' fields, noise and forces.
     - final_model: numbers on the final model.
-    - before_touch: scores of places that are predicted before a contact.
     - ingest_counts: counts of read and lost readings of each capture.
     - dropped: numbers of rows that were left out, by reason.
     """
 
     cards: list[dict[str, Any]]
-    points: dict[str, Any]
+    curves: dict[str, Any]
     analyses: dict[str, Any]
     studies: dict[str, Any]
     described: dict[str, Any]
     final_model: dict[str, Any]
-    before_touch: list[pa.Table]
     ingest_counts: list[dict[str, Any]]
     dropped: dict[str, int]
 
@@ -148,29 +145,25 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
     split_of_scene = io.read_json(folds)
     return Inputs(
         cards=read_cards(models, scene.model_stages),
-        points={experiment: read([stage])[stage] for experiment, stage in scene.curves.items()},
+        curves={experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()},
         analyses=read(scene.analyses),
         studies=read(scene.studies),
         described={scene.described: io.read_json(results / "described.json")},
         final_model=final_numbers(models, scene_name) if "lobo" in scene.experiments else {},
-        before_touch=[
-            io.read_table(models / model_stage / BEFORE_CONTACT_FILE)
-            for model_stage in scene.model_stages
-            if model_stage == "train_single"
-        ],
         ingest_counts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
     )
 
 
-def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd.DataFrame) -> dict[str, Any]:
+def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.DataFrame) -> dict[str, Any]:
     """Compute the content of numbers.json and provenance.json."""
     analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
     studies = {EXPERIMENTS[name].key: result for name, result in inputs.studies.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
     seconds = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
     runtime = runtime_numbers(len(inputs.cards), costs, studies.pop("runtime", None), seconds.get("runtime", []))
-    experiments = {key: result["numbers"] for key, result in analyses.items()} | studies
+    experiments = {EXPERIMENTS[name].key: found for name, found in experiment_numbers(inputs.analyses, table).items()}
+    experiments |= studies
     numbers = {
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
@@ -178,10 +171,10 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
             "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
         },
         "capture": add_up(inputs.ingest_counts) | {"left_out": dict(inputs.dropped)},
-        **learning_numbers(scores, headline=HEADLINE),
+        **learning_numbers(table, headline=HEADLINE),
         **inputs.final_model,
-        **before_touch_numbers(inputs.before_touch),
-        "trainings": count_trainings(inputs.cards, inputs.points, analyses),
+        **before_touch_numbers(table),
+        "trainings": count_trainings(inputs.cards, inputs.curves | analyses),
         "described": inputs.described,
         **{entry.key: experiments[entry.key] for entry in scene.entries if entry.key in experiments},
         "runtime": runtime,
@@ -214,7 +207,7 @@ def write_index(reports: Path) -> None:
     io.write_text(reports / "index.html", index(listed, headlines, about, shown))
 
 
-def publish(settings: Settings, indentations: Path, models: Path, results: Path, reports: Path) -> None:
+def publish(settings: Settings, indentations: Path, models: Path, scores: Path, results: Path, reports: Path) -> None:
     """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
     if not publishing():
         return
@@ -222,21 +215,21 @@ def publish(settings: Settings, indentations: Path, models: Path, results: Path,
     # Results of `dvc exp` and results of the checkout are in different MLflow experiments.
     experiment = f"{name} (dvc exp)" if is_experiment() else name
     try:
-        found = published_results(scene, name, indentations, models, results, reports)
+        found = published_results(scene, name, indentations, models, scores, results, reports)
         say(write_scene(found, experiment, home(), register=not is_experiment()))
     except TrackingUnavailable as error:
         say(f"warning: the results of scene {name} were not written to MLflow: {error}")
 
 
 def published_results(
-    scene: Scene, name: str, indentations: Path, models: Path, results: Path, reports: Path
+    scene: Scene, name: str, indentations: Path, models: Path, scores: Path, results: Path, reports: Path
 ) -> Results:
     """Collect what the stages of a scene wrote, for MLflow."""
     scores_file = reports / "scores.json"
     table_2 = io.read_json(scores_file).get("table2", {}) if scores_file.exists() else {}
     return Results(
         models={stage: models / stage for stage in scene.model_stages},
-        curves=read_curves(scene, results),
+        curves=read_curves(scene, scores, results),
         reports=reports,
         scores={EXPERIMENTS[TABLE_2[row]].stage: means for row, means in table_2.items() if row in TABLE_2},
         final=models / FINAL_EXPERIMENT / FINAL_FILE,
@@ -251,14 +244,14 @@ def write_scene(results: Results, experiment: str, root: Path, *, register: bool
     return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
 
 
-def read_curves(scene: Scene, results: Path) -> Curves:
+def read_curves(scene: Scene, scores: Path, results: Path) -> Curves:
     """Read the results that MLflow shows as curves: the points of every sweep, and the numbers of every analysis.
 
     The keys of the result are the names of the stages that computed the curves.
     """
-    points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()}
+    table = read_scores(scores / f"{stage}.parquet" for stage in scene.curves.values())
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
-    curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(points).items()}
+    curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(table).items()}
     for experiment in scene.analyses:
         numbers = io.read_json(results / f"{experiment}.json")["numbers"]
         named_values = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]

@@ -6,13 +6,18 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from pipeline.experiments.results import write_results
+from pipeline.scores import rows_of_networks, write_scores
 from pipeline.settings import Adaptations, Settings, Training
+from pipeline.statistics import tally
 from pipeline.training.jobs import (
     adaptation_jobs,
+    collapse_record,
+    network_keys,
     preload_training,
     read_data,
     read_pretrained,
-    sweep_point,
+    score_test,
     train_jobs,
     write_timings,
 )
@@ -34,7 +39,13 @@ class PokesSweep(Strict):
 
 
 def sweep_pokes(
-    settings: Settings, section: PokesSweep, indentations: Path, folds: Path, pretrained: Path, scores: Path
+    settings: Settings,
+    section: PokesSweep,
+    indentations: Path,
+    folds: Path,
+    pretrained: Path,
+    scores: Path,
+    results: Path,
 ) -> None:
     """Adapt networks with each number of unlabelled indentations, and score them (paper figure 6a)."""
     preload_training()
@@ -54,28 +65,31 @@ def sweep_pokes(
         for job in adaptation_jobs(data, fold, named_recipe, networks, experiment="pokes", pokes_n=pokes_n)
     ]
     jobs = [job for job, _ in pairs]
-    results = train_jobs(data, jobs, "sweep_pokes")
-    points = [
-        sweep_point(data, job, result, "adapted") | {"pokes_n": pokes_n}
-        for (job, pokes_n), result in zip(pairs, results, strict=True)
+    trained = train_jobs(data, jobs, "sweep_pokes")
+    scored = [
+        (network_keys(data, job, "adapted") | {"pokes_n": pokes_n}, score_test(data, job.test, result.predicted))
+        for (job, pokes_n), result in zip(pairs, trained, strict=True)
     ]
-    points += _points_before_adaptation(pretrained, recipe.base, {fold.name for fold in held_out})
-    io.write_json(scores, points)
-    write_timings(settings.scene, "sweep_pokes", jobs, results)
+    scored += _before_adaptation(pretrained, recipe.base, {fold.name for fold in held_out})
+    write_scores(scores, rows_of_networks(scored))
+    write_results(results, {}, {}, trainings=tally(map(collapse_record, trained)))
+    write_timings(settings.scene, "sweep_pokes", jobs, trained)
 
 
-def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[dict[str, Any]]:
-    """Return the scores of the networks before adaptation, as points with 0 pokes."""
+def _before_adaptation(pretrained: Path, base: str, held_out: set[str]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Return the keys and scores of the networks before adaptation, which is adaptation with 0 pokes."""
     cards = [io.read_json(file) for file in sorted(pretrained.glob("*.json"))]
-    kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores")
     return [
-        {name: card[name] for name in kept} | {"method": "triplet", "pokes_n": 0}
+        (
+            {"experiment": "pokes", "method": "triplet", "fold": card["fold"], "seed": card["seed_i"], "pokes_n": 0},
+            card["scores"],
+        )
         for card in cards
         if card["recipe_name"] == base and card["fold"] in held_out
     ]
 
 
-def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
+def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path, results: Path) -> None:
     """Train networks on every draw of skins, adapt them to each held-out skin, and score them (paper figure 6b)."""
     preload_training()
     data, section = read_data(settings, indentations, folds), settings.section(Adaptations, "adapt")
@@ -95,10 +109,10 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         for method, recipe in recipes.items()
         for fold in draws
     ]
-    results = train_jobs(data, jobs, "sweep_sensors")
+    trained = train_jobs(data, jobs, "sweep_sensors")
     pretrained = {
         (adaptation.base, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
-        for job, result in zip(jobs, results, strict=True)
+        for job, result in zip(jobs, trained, strict=True)
         if job.what == "triplet"
     }
     named_recipe = (HEADLINE, adaptation)
@@ -108,9 +122,11 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         for job in adaptation_jobs(data, fold, named_recipe, pretrained, experiment="sensors", pokes_n=section.pokes_n)
     ]
     methods = [job.what for job in jobs] + ["adapted"] * len(adapted)
-    jobs, results = jobs + adapted, results + train_jobs(data, adapted, "sweep_sensors")
-    points = [
-        sweep_point(data, job, result, method) for job, result, method in zip(jobs, results, methods, strict=True)
+    jobs, trained = jobs + adapted, trained + train_jobs(data, adapted, "sweep_sensors")
+    scored = [
+        (network_keys(data, job, method), score_test(data, job.test, result.predicted))
+        for job, result, method in zip(jobs, trained, methods, strict=True)
     ]
-    io.write_json(scores, points)
-    write_timings(settings.scene, "sweep_sensors", jobs, results)
+    write_scores(scores, rows_of_networks(scored))
+    write_results(results, {}, {}, trainings=tally(map(collapse_record, trained)))
+    write_timings(settings.scene, "sweep_sensors", jobs, trained)

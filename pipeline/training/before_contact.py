@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float32, Int64
 
 from pipeline.training.jobs import SceneData
@@ -105,18 +104,23 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
 
 def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
-) -> pa.Table:
+) -> list[dict[str, Any]]:
     """Score places that are predicted without the signal of the contact, and the hover control.
 
     Places are predicted from the no-load field alone, and from the number of the indentation in its pass alone. The
-    hover control uses nearest neighbours and the trained networks of each fold (`networks`). The returned table has one
-    row for each fold and input, and one row for each fold and model of the hover control.
+    hover control uses nearest neighbours and the trained networks of each fold (`networks`). Returns rows of the table
+    of scores: one row for each fold and input, and one row for each fold and model of the hover control.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
     inputs_by_name = {"noload": scan.noload_uT, "scan": scan.scan_i[:, None].astype(np.float32)}
     lines = [
-        {"question": fold.experiment, "fold": fold.name, "told_by": name, **_score(data, inputs, fold.train, fold.test)}
+        {
+            "experiment": fold.experiment,
+            "fold": fold.name,
+            "method": name,
+            **_score(data, inputs, fold.train, fold.test),
+        }
         for fold in data.folds
         if fold.experiment in SAME_SKIN
         for name, inputs in inputs_by_name.items()
@@ -124,9 +128,7 @@ def score_before_contact(
     hover = gather_hover(read)
     for fold in [fold for fold in data.folds if fold.experiment == BY_TIME]:
         lines += _hover(data, fold, hover, networks.get(fold.name, ()))
-    kinds = dict.fromkeys(("question", "fold", "told_by"), pa.string())
-    kinds |= dict.fromkeys((*PLACE, *MAGNITUDES), pa.float64())
-    return pa.Table.from_pylist(lines, schema=pa.schema(kinds))
+    return lines
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
@@ -151,13 +153,13 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
         scores = [score(true, predicted) for predicted in of_models]
         if scores:
             means = {metric: float(np.mean([values[metric] for values in scores])) for metric in PLACE}
-            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": name, **means, **magnitudes})
+            lines.append({"experiment": fold.experiment, "fold": fold.name, "method": name, **means, **magnitudes})
     return lines
 
 
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
-) -> Mapping[str, float]:
+) -> dict[str, float]:
     """Train nearest neighbours on inputs without the contact's signal, and score the places predicted for test rows."""
     rng = rng_for(data.settings.seed, "before-touch")  # `fit` needs it; nearest neighbours do not use it
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from scipy.constants import micro, milli
 
-from pipeline.statistics import over_folds, tidy
+from pipeline.scores import rows_of_cards
+from pipeline.statistics import over_folds
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.physics.board import BoardDesign, Spreads, draw_board
@@ -160,7 +161,7 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
             "settings": ", ".join(f"{key} {value}" for key, value in settings[name].items() if key in VARIED),
             **over_folds(rows),
         }
-        for name, rows in tidy(cards).groupby("recipe", sort=False)
+        for name, rows in rows_of_cards(cards).groupby("recipe", sort=False)
     ]
 
 

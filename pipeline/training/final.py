@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.scores import rows_of_cards, select, whole
 from pipeline.settings import Training
-from pipeline.statistics import records, select, tidy, whole
+from pipeline.statistics import records
 from pipeline.training.jobs import SceneData, model_card, train_jobs
 from reskin import io
 from reskin.metrics import METRICS
@@ -48,7 +49,7 @@ def train_final(folder: Path, data: SceneData, training: Training, held_out: Seq
             np.arange(tensors["target_shift"].size) == F, np.nan, tensors["target_shift"]
         )
     card = model_card(job, result, data.rows, data.scene)
-    scores = whole(select(tidy(held_out), recipe=HEADLINE)).groupby("board")[list(METRICS)].mean()
+    scores = whole(select(rows_of_cards(held_out), recipe=HEADLINE)).groupby("board")[list(METRICS)].mean()
     more = {"git": code, "tested": NOT_TESTED, "held_out": records(scores), "forces_known": forces_known}
     with io.replacing(folder) as temporary:
         temporary.mkdir()

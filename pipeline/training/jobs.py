@@ -342,11 +342,10 @@ def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float3
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 
-def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, method: str) -> dict[str, Any]:
-    """Return the scores of a training run as a point of a sweep's curve."""
-    card: dict[str, Any] = {**scored_card(data, job, result)}
-    kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
-    return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
+def network_keys(data: SceneData, job: TrainingJob, method: str) -> dict[str, Any]:
+    """Return the keys of a network of a sweep in the table of scores."""
+    keys = {"experiment": job.experiment, "method": method, "fold": job.fold, "seed": job.seed_i}
+    return keys | {"trained_on_skins_n": len(np.unique(data.rows.skin[job.train]))}
 
 
 def collapse_record(result: TrainingResult) -> dict[str, Any]:

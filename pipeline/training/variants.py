@@ -5,7 +5,7 @@ as many further steps as the adapted network, but without pokes of the new skin.
 the adapted network is therefore due to the pokes, and not to longer training.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline import statistics
+from pipeline.scores import make_table, select
 from pipeline.settings import Training
 from pipeline.training.jobs import (
     PretrainedNetworks,
@@ -32,8 +33,7 @@ from reskin.numerics import device
 
 FORCE = 2  # column of the force in true and predicted values
 BEFORE, AFTER, CONTROL = "before", "after", "control"  # names of the variants
-# A function that takes true and predicted values (columns x_mm, y_mm, F_N) and returns scores by name.
-Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]
+BIASES = ("bias_f_N", "bias_f_pct")
 
 
 @dataclass(frozen=True)
@@ -86,57 +86,54 @@ def adapt_and_predict(
     return predictions, statistics.tally(map(collapse_record, trained))
 
 
-def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
-    """Return the force bias: the mean of (predicted force - true force), in N and in percent of the mean true force."""
-    true_N = true[:, FORCE].astype(float)
-    bias_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
-    return {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}
+def score_variants(experiment: str, predictions: Sequence[VariantPrediction], **keys: str) -> pd.DataFrame:
+    """Score the predictions: rows of the table of scores, whose method is the variant.
+
+    Besides the metrics, the rows have the force bias, which is the mean of (predicted force - true force), in N and in
+    percent of the mean true force. keys: values of further columns.
+    """
+    rows = []
+    for prediction in predictions:
+        row: dict[str, Any] = {"experiment": experiment, "method": prediction.variant, "board": prediction.board}
+        row |= {"skin": prediction.skin, "seed": prediction.seed_i, "rows_n": len(prediction.true), **keys}
+        true_N = prediction.true[:, FORCE].astype(float)
+        bias_N = float((prediction.predicted[:, FORCE].astype(float) - true_N).mean())
+        bias = {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}
+        rows.append(row | score(prediction.true, prediction.predicted) | bias)
+    return make_table(rows)
 
 
-def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric = score) -> dict[str, dict[str, Any]]:
-    """Summarise the values of every metric over boards, separately for each variant.
+def summarise_variants(rows: pd.DataFrame) -> dict[str, statistics.Summary]:
+    """Summarise the metrics over boards, separately for each variant.
 
     The value of a board is the mean over its skins, and the value of a skin is the mean over its seeds. `sd_seeds` is
     the standard deviation over the networks of one skin, averaged over skins.
     """
-    variants = _tidy(predictions, metric).groupby("method", sort=False)
-    return {
-        str(variant): statistics.add_seed_sd(
-            statistics.summarise(statistics.board_means(rows), boards=True), rows, "board", "skin"
-        )
-        for variant, rows in variants
-    }
+    return {str(variant): _over_boards(group, METRICS) for variant, group in rows.groupby("method", sort=False)}
 
 
-def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str, Any]]:
-    """Summarise the force bias (see `bias`) over boards, for each variant, in N and in percent of the mean force."""
-    by_variant = summarise_variants(predictions, bias)
-    return {
-        name: {variant: summary[name] for variant, summary in by_variant.items()} for name in ("bias_f_N", "bias_f_pct")
-    }
+def force_biases(rows: pd.DataFrame) -> dict[str, statistics.Summary]:
+    """Summarise the force bias over boards, for each variant, in N and in percent of the mean force."""
+    by_variant = {str(variant): _over_boards(group, BIASES) for variant, group in rows.groupby("method", sort=False)}
+    return {name: {variant: summary[name] for variant, summary in by_variant.items()} for name in BIASES}
 
 
-def compare_variants(predictions: Sequence[VariantPrediction], variant: str, reference: str) -> dict[str, Any]:
+def _over_boards(rows: pd.DataFrame, metrics: Sequence[str]) -> statistics.Summary:
+    rows = rows[["board", "skin", *(name for name in metrics if rows[name].notna().all())]]
+    summary = statistics.summarise(statistics.board_means(rows), boards=True)
+    return statistics.add_seed_sd(summary, rows, "board", "skin")
+
+
+def compare_variants(rows: pd.DataFrame, variant: str, reference: str) -> dict[str, Any]:
     """Compare two variants: summarise over boards the differences between their scores on the same skins.
 
     The differences are the scores of `variant` minus the scores of `reference`. The entry `by_board` contains the
     difference on each board. The entry `sd_seeds` is computed from the differences between networks with equal seeds,
     because these networks start from the same weights.
     """
-    rows = _tidy(predictions, score)
-    sides = [statistics.select(rows, method=name) for name in (variant, reference)]
+    network, metrics = ["board", "skin", "seed"], [name for name in METRICS if rows[name].notna().all()]
+    sides = [select(rows, method=name)[[*network, *metrics]] for name in (variant, reference)]
     compared = statistics.paired(*sides)
-    network = ["board", "skin", "seed"]
-    metrics = [name for name in METRICS if name in rows]
     by_network = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
     by_board = compared.pop("by_board")
     return statistics.add_seed_sd(compared, by_network, "board", "skin") | {"by_board": by_board}
-
-
-def _tidy(predictions: Sequence[VariantPrediction], metric: Metric) -> pd.DataFrame:
-    rows = (
-        {"method": prediction.variant, "board": prediction.board, "skin": prediction.skin, "seed": prediction.seed_i}
-        | metric(prediction.true, prediction.predicted)
-        for prediction in predictions
-    )
-    return pd.DataFrame(rows)

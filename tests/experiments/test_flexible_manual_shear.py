@@ -20,7 +20,8 @@ from pipeline.experiments.manual import GRID, summarise_manual
 from pipeline.experiments.shear import score5, summarise_shear
 from pipeline.formatting import to_markdown
 from pipeline.paper import FLEXIBLE, MANUAL, SHEAR
-from pipeline.statistics import by_skin, paired, tidy
+from pipeline.scores import by_skin, rows_of_cards
+from pipeline.statistics import paired
 from pipeline.training.variants import (
     AFTER,
     BEFORE,
@@ -98,7 +99,7 @@ def test_differences_equal_those_computed_from_model_cards():
         ]
         for variant in (BEFORE, AFTER)
     }  # fmt: skip
-    after, before = (by_skin(tidy(cards[variant])) for variant in (AFTER, BEFORE))
+    after, before = (by_skin(rows_of_cards(cards[variant])) for variant in (AFTER, BEFORE))
     result = compare_variants(PREDICTIONS, AFTER, BEFORE)
     for name in METRICS:
         del result[name]["sd_seeds"]

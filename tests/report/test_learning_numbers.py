@@ -15,7 +15,7 @@ from pipeline.report.numbers import (
     learning_numbers,
     learning_times,
 )
-from pipeline.statistics import tidy
+from pipeline.scores import rows_of_cards
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
@@ -62,7 +62,7 @@ CARDS = [
 
 
 def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learning_numbers(tidy(cards, points), headline="paper")
+    return learning_numbers(rows_of_cards(cards, points), headline="paper")
 
 
 def paired(of: str, over: str) -> dict:
@@ -218,7 +218,7 @@ def gains(contrast: dict) -> dict[str, float]:
 
 def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
     found = contrasts_of_pokes(
-        tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
+        rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
     )
     assert {name: (one["from_pokes_n"], one["to_pokes_n"]) for name, one in found.items()} == {
         "pokes_first": (0, 65), "pokes_gain": (0, 780), "pokes_plateau": (780, 3900),
@@ -229,13 +229,15 @@ def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
 
 
 def test_contrasts_at_counts_that_the_sweep_does_not_contain_are_missing():
-    found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
+    found = contrasts_of_pokes(
+        rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})})
+    )
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
-    assert contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80)})})) == {}
+    assert contrasts_of_pokes(rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80)})})) == {}
     only = points("trained_on_skins_n", {1: (50, 60)}, method="multi")
     others = [point | {"method": method} for method in ("triplet", "adapted") for point in only]
-    assert contrasts_of_sensors(tidy([], {"sensors": [*only, *others]})).keys() == {
+    assert contrasts_of_sensors(rows_of_cards([], {"sensors": [*only, *others]})).keys() == {
         "sensors_adapted_over_multi", "sensors_adapted_over_triplet",
     }  # fmt: skip
 
@@ -246,7 +248,7 @@ def test_contrasts_of_sensors_are_differences_between_methods_and_numbers_of_ski
         "adapted": {1: (58, 64), 15: (80, 83)},
     }  # fmt: skip
     rows = [row for name, by_count in scores.items() for row in points("trained_on_skins_n", by_count, method=name)]
-    found = contrasts_of_sensors(tidy([], {"sensors": rows}))
+    found = contrasts_of_sensors(rows_of_cards([], {"sensors": rows}))
     assert gains(found["sensors_more_multi"]) == {"b0": 30.0, "b1": 24.0}
     over = found["sensors_adapted_over_triplet"]
     assert [(one["skins_n"], gains(one)) for one in over] == [

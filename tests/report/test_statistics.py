@@ -10,18 +10,14 @@ from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
 from pipeline.experiments.audit import audit_collapse
+from pipeline.scores import AS_LABELLED, KEYS, REGISTERED, by_skin, rows_of_cards, select, to_csv, whole
 from pipeline.statistics import (
-    AS_LABELLED,
     CONTRADICTED,
     FEW_BOARDS,
-    KEYS,
-    REGISTERED,
     SUPPORTED,
-    UNCERTAINTY,
     UNDECIDED,
     add_seed_sd,
     board_means,
-    by_skin,
     combine_verdicts,
     holm,
     interval,
@@ -31,16 +27,12 @@ from pipeline.statistics import (
     over_pairs,
     paired,
     paired_with_single,
-    select,
     statistic,
     t_interval,
     tally,
-    tidy,
-    to_csv,
     two_way_error,
     verdict,
     verdict_within,
-    whole,
 )
 from reskin.data.splits import Split, draw_folds
 from reskin.errors import SchemaError
@@ -66,7 +58,7 @@ def card_with_offset(fold: str, off_mm: float) -> dict:
 
 
 def skin_scores(**changes: object) -> pd.DataFrame:
-    return by_skin(tidy(adapted_cards(**changes)))
+    return by_skin(rows_of_cards(adapted_cards(**changes)))
 
 
 def score_table(values: dict[str, list[list[float]]]) -> pd.DataFrame:
@@ -88,12 +80,12 @@ def board_scores(values: list[float]) -> pd.DataFrame:
 def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
     # The squared errors of fold b0 are 0 and 4 for its two seeds. The squared error of fold b1 is 16.
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
-    summary = over_folds(tidy(cards))["mse_xy_mm2"]
+    summary = over_folds(rows_of_cards(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
     assert summary["mean"] == pytest.approx((2 + 16) / 2)
     assert summary["sd"] == pytest.approx(14 / 2**0.5)
     assert summary["sd_seeds"] == pytest.approx(8**0.5)
-    assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
+    assert "sd" not in over_folds(rows_of_cards(cards[:2]))["mse_xy_mm2"]
 
 
 def test_standard_deviation_over_seeds_is_computed_within_each_board():
@@ -105,11 +97,11 @@ def test_standard_deviation_over_seeds_is_computed_within_each_board():
 
 
 def test_scores_of_adapted_networks_are_averaged_over_skins_by_fold_and_seed():
-    rows = whole(tidy(adapted_cards()))
+    rows = whole(rows_of_cards(adapted_cards()))
     assert list(zip(rows.fold, rows.seed, strict=True)) == [(fold, i) for i in range(3) for fold in ("b0", "b1")]
     assert set(rows.rows_n) == {20}
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
-        for _, row in whole(tidy(adapted_cards()), places).iterrows():
+        for _, row in whole(rows_of_cards(adapted_cards()), places).iterrows():
             cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
             for name in METRICS[
                 :3
@@ -126,7 +118,7 @@ def test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins():
     board = np.repeat("b0", 30)
     parts = [slice(0, 10), slice(10, 30)]
     skins = [score_groups(TRUE[part], predicted[part], board[part], np.repeat(str(part), 30)[part]) for part in parts]
-    (row,) = whole(tidy([card("adapt", "b0", scores) for scores in skins])).to_dict("records")
+    (row,) = whole(rows_of_cards([card("adapt", "b0", scores) for scores in skins])).to_dict("records")
     whole_board = score_groups(TRUE, predicted, board, SKIN)["all"]
     assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
@@ -134,7 +126,7 @@ def test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins():
 def test_score_table_written_as_csv_is_read_again():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
-    table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
+    table = rows_of_cards([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
     # The table has three parts. These are their numbers of rows, which have scores as labelled, registered, or per
     # skin.
@@ -211,7 +203,7 @@ def test_difference_of_a_method_from_itself_is_zero():
         "n": 2,
         "values": [0.0, 0.0],
     }
-    assert paired(skin_scores(), by_skin(tidy(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
+    assert paired(skin_scores(), by_skin(rows_of_cards(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
 
 
 def test_more_skins_with_equal_scores_do_not_change_the_difference():
@@ -381,7 +373,7 @@ def test_scores_that_are_missing_are_ignored():
 
 
 def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
-    rows = tidy(adapted_cards())
+    rows = rows_of_cards(adapted_cards())
     for name, stat in over_boards(rows).items():
         plain = over_folds(rows)[name]
         assert stat.keys() == {"mean", "n", "sd", "values"}
@@ -398,8 +390,8 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
 
 def test_scores_of_several_draws_are_averaged_within_each_board():
     cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
-    assert over_boards(tidy(cards)) == over_boards(tidy(adapted_cards()))
-    alone = over_boards(tidy([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
+    assert over_boards(rows_of_cards(cards)) == over_boards(rows_of_cards(adapted_cards()))
+    alone = over_boards(rows_of_cards([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
     assert alone["n"] == 1
     assert "ci95" not in alone
     assert alone["sd_seeds"] > 0
@@ -414,7 +406,7 @@ def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins()
         true = rng.uniform(0, 16, (80, 3))
         scores = score_groups(true, true + rng.normal(0, 2, true.shape), boards, skins)
         cards.append(card("transfer", fold, scores))
-    stat = over_pairs(tidy(cards))["mse_xy_mm2"]
+    stat = over_pairs(rows_of_cards(cards))["mse_xy_mm2"]
     assert (stat["n"], stat["training_n"], stat["boards_n"]) == (3 * 8, 3, 4)
     table = pd.DataFrame(
         [[np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for i in range(2)]) for board in tested]

@@ -28,7 +28,7 @@ from pipeline.report.tables import (
     table1,
     verification_table,
 )
-from pipeline.statistics import tidy
+from pipeline.scores import rows_of_cards
 from pipeline.training.universal import METHODS, WAYS
 from reskin.errors import ParamsError, SchemaError
 from reskin.io import read_json
@@ -64,7 +64,7 @@ COUNTS = [
 def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
     capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
-    return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(cards), headline="paper")}
+    return {"provenance": provenance, "capture": capture, **learning_numbers(rows_of_cards(cards), headline="paper")}
 
 
 def test_scores_of_table_2_are_means_over_boards_or_pairs_of_skins():
