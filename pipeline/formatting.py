@@ -32,9 +32,12 @@ SPREAD = (
     "splits. If networks are tested on other skins, n is the number of pairs of a training skin and a test skin. A "
     "standard deviation with the mark (seeds) is that of networks that differ only in their random seed."
 )
-SHORT = {
+# Titles of methods, by their short names in the table of scores.
+TITLES = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",
-    "control": "control",
+    "control": "control", "shipped": "in-context model, as shipped",
+    "rig": "in-context model, made with the rig's other boards", "registration": "multi-sensor, 5 known presses",
+    "gaussian_process": "Gaussian process on own labels", "kernel_ridge": "kernel ridge", "constant": "mean of labels",
 }  # fmt: skip
 CONTROL = "Control: fine-tuned equally long, but without pokes of the new skin (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
@@ -260,14 +263,14 @@ def models(numbers: Results) -> dict[str, Model]:
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
         pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
         titles["adapted"] = titles["adapted"].replace(f"{ADAPTED_POKES_N} indentations", pokes)
-    named = {row: Model(title, SHORT[row], TABLE_2.get(row, {})) for row, title in titles.items()}
+    named = {row: Model(title, TITLES[row], TABLE_2.get(row, {})) for row, title in titles.items()}
     if is_pooled(numbers):
         return named
     one_skin = {row: titles[row].replace("Multi-sensor", ONE_TRAINING_SKIN) for row in ("triplet", "adapted")}
     return named | {
         "multi": Model(f"{ONE_TRAINING_SKIN} (paper: single-sensor)", "one training skin", TABLE_2["single"]),
         "triplet": Model(one_skin["triplet"], "one training skin + triplet", {}),
-        "adapted": Model(one_skin["adapted"], SHORT["adapted"], {}),
+        "adapted": Model(one_skin["adapted"], TITLES["adapted"], {}),
     }
 
 

@@ -62,8 +62,12 @@ class Stat:
 
     @classmethod
     def of(cls, stat: "Stat | Mapping[str, Any]") -> "Stat":
-        """Return a statistic from its entry in numbers.json."""
-        return stat if isinstance(stat, Stat) else cls(**{name: stat[name] for name in _FIELDS if name in stat})
+        """Return a statistic from its entry in numbers.json, which has the values of boards by name or in a list."""
+        if isinstance(stat, Stat):
+            return stat
+        if "by_board" in stat:
+            return cls(stat["mean"], len(stat["by_board"]), values=tuple(stat["by_board"].values()))
+        return cls(**{name: stat[name] for name in _FIELDS if name in stat})
 
     @property
     def ends(self) -> tuple[float, ...]:

@@ -488,11 +488,11 @@ class Publisher:
         the last step. Metrics that end in `_0_labels` are the scores without labels.
         """
         from pipeline.pyfunc import simulated_example
-        from pipeline.report.figures import boards_rows
+        from pipeline.report.figures import unseen_rows
 
         card = io.read_json(weights.with_suffix(".json"))
-        scores = boards_rows(io.read_json(tested) if tested.exists() else {}, [card["name"]])
-        by_labels = {int(row["labels"]): row for row in scores}
+        scores = unseen_rows(io.read_json(tested) if tested.exists() else {}, ["shipped"])
+        by_labels = {row["labels_n"]: row for row in scores}
         rows = [
             (name, row[name]["mean"], labels_n)
             for labels_n, row in sorted(by_labels.items())

@@ -40,7 +40,7 @@ UNIVERSAL_FAILS = dict.fromkeys(
     ],
     OTHER_DATA,
 )  # fmt: skip
-SHORT = {"steps_n": 4, "batch_n": 16}
+TITLES = {"steps_n": 4, "batch_n": 16}
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_default_settings_of_contact_regressor_are_the_recipe_of_the_paper():
 def test_network_equals_that_of_the_training_loop_bit_for_bit(triplet_weight):
     X, y = poke_rows()
     skin = np.repeat(["s0", "s1"], len(X) // 2)
-    regressor = reskin.ContactRegressor(**SHORT, triplet_weight=triplet_weight, random_state=3)
+    regressor = reskin.ContactRegressor(**TITLES, triplet_weight=triplet_weight, random_state=3)
     recipe = parse(Recipe, {name: getattr(regressor, name) for name in Recipe.model_fields}, "test")
     job = TrainingJob("lobo", "paper", recipe, "all", 3, 0, np.arange(len(X)), np.arange(len(X)))
     (expected,) = train_stack([job], TrainingData(X, y, skin))
@@ -97,7 +97,7 @@ def test_network_equals_that_of_the_training_loop_bit_for_bit(triplet_weight):
 
 def test_scores_of_cross_validation_over_boards_equal_the_metrics_of_the_project():
     X, y = (np.concatenate(parts) for parts in zip(*[poke_rows(board=i) for i in range(3)], strict=True))
-    board, regressor = np.repeat(["b0", "b1", "b2"], 48), reskin.ContactRegressor(**SHORT)
+    board, regressor = np.repeat(["b0", "b1", "b2"], 48), reskin.ContactRegressor(**TITLES)
     y[::7, 2] = np.nan  # some forces are unknown
 
     results = cross_validate(regressor, X, y, groups=board, cv=GroupKFold(3), scoring=reskin.SCORERS)
@@ -111,7 +111,7 @@ def test_scores_of_cross_validation_over_boards_equal_the_metrics_of_the_project
 
 def test_scorers_skip_rows_with_unknown_places():
     X, y = poke_rows()
-    regressor = reskin.ContactRegressor(**SHORT).fit(X, y)
+    regressor = reskin.ContactRegressor(**TITLES).fit(X, y)
     half = np.where(np.arange(len(y))[:, None] < 24, y, np.nan)
     for scorer in reskin.SCORERS.values():
         assert scorer(regressor, X, half) == scorer(regressor, X[:24], y[:24])
@@ -120,12 +120,12 @@ def test_scorers_skip_rows_with_unknown_places():
 
 def test_saved_network_is_loaded_as_a_model(tmp_path):
     X, y = poke_rows()
-    regressor = reskin.ContactRegressor(**SHORT, inputs="shape").fit(X, y)
+    regressor = reskin.ContactRegressor(**TITLES, inputs="shape").fit(X, y)
     regressor.save(tmp_path / "mine.safetensors")
     model = reskin.load_model(tmp_path / "mine.safetensors").zero(np.zeros(15))
     np.testing.assert_array_equal(model.predict(X), regressor.predict(X))
     with pytest.raises(SchemaError, match="a saved network must be for 3 channels per chip"):
-        reskin.ContactRegressor(**SHORT).fit(X[:, :14], y).save(tmp_path / "other.safetensors")
+        reskin.ContactRegressor(**TITLES).fit(X[:, :14], y).save(tmp_path / "other.safetensors")
     with pytest.raises(ParamsError, match=r"ends in .safetensors; got mine. Try: mine.safetensors"):
         regressor.save(tmp_path / "mine")
     assert {file.name for file in tmp_path.iterdir()} == {"mine.safetensors", "mine.json"}
@@ -134,16 +134,16 @@ def test_saved_network_is_loaded_as_a_model(tmp_path):
 def test_failed_training_raises_or_warns(monkeypatch):
     X, y = poke_rows()
     with pytest.raises(TrainingError, match="diverged by step 4. Lower rate_max"):
-        reskin.ContactRegressor(**SHORT | {"rate_max": 1e30, "gradient_norm_max": 1e30}).fit(X, y)
+        reskin.ContactRegressor(**TITLES | {"rate_max": 1e30, "gradient_norm_max": 1e30}).fit(X, y)
     with pytest.raises(TrainingError, match="unknown .NaN. in all rows"):
-        reskin.ContactRegressor(**SHORT).fit(X, y * [1, 1, np.nan])
+        reskin.ContactRegressor(**TITLES).fit(X, y * [1, 1, np.nan])
     with pytest.raises(ParamsError, match="steps_n"):
         reskin.ContactRegressor(steps_n=0).fit(X, y)
     with pytest.raises(ParamsError, match="random_state must be a whole number; got None"):
         reskin.ContactRegressor(random_state=None).fit(X, y)
-    monkeypatch.setattr("reskin.models.train.CHECKED_STEPS_N", SHORT["steps_n"])
+    monkeypatch.setattr("reskin.models.train.CHECKED_STEPS_N", TITLES["steps_n"])
     with pytest.warns(ConvergenceWarning, match="collapsed in all of 3 runs"):
-        constant = reskin.ContactRegressor(**SHORT).fit(np.zeros_like(X), y)
+        constant = reskin.ContactRegressor(**TITLES).fit(np.zeros_like(X), y)
     assert constant.network_.card["collapsed"]
 
 

@@ -16,7 +16,7 @@ from pydantic import Field
 from scipy.constants import micro, milli
 
 from pipeline.experiments.results import write_results
-from pipeline.formatting import COLUMNS, SHORT, show, tabulate
+from pipeline.formatting import COLUMNS, TITLES, show, tabulate
 from pipeline.paper import TABLE_2
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.scores import by_skin, rows_of_cards, select, whole
@@ -311,7 +311,7 @@ DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the rows of table 2 for each world."""
     lines = [
-        {"world": _describe(world), "row": SHORT[row], "source": source}
+        {"world": _describe(world), "row": TITLES[row], "source": source}
         | {title: show(world[row].get(metric)) for metric, title in COLUMNS.items()}
         for world in numbers["by_world"]
         for row in TABLE_2
@@ -341,7 +341,7 @@ def _draw(axes: Any, results: Sequence[tuple[float, Mapping[str, Any]]], metric:
     values = [value for value, _ in results]
     for (row, paper), colour, marker in zip(TABLE_2.items(), COLOURS, MARKERS, strict=False):
         means = [world[row][metric]["mean"] for _, world in results]
-        axes.plot(values, means, color=colour, marker=marker, markersize=5, linewidth=1.2, label=SHORT[row])
+        axes.plot(values, means, color=colour, marker=marker, markersize=5, linewidth=1.2, label=TITLES[row])
         axes.axhline(paper[metric][0], color=colour, linestyle="--", linewidth=0.8)
     axes.axvline(default, color="0.5", linestyle=":", linewidth=1, label="default")
     if metric != "accuracy_pct":

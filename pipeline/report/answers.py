@@ -19,8 +19,8 @@ from pipeline.formatting import (
     two_digits,
     universal_rows,
 )
-from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT, TABLE_2
-from pipeline.report.figures import WAYS, boards_rows
+from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT
+from pipeline.report.figures import IN_CONTEXT, constant_force, unseen_rows
 from pipeline.statistics import Stat
 
 PLACE, FORCE = "place", "force"
@@ -43,11 +43,10 @@ IN_BRACKETS = (
     "a tested skin."
 )
 SQUARED = {"mse_xy_mm2": "mm", "mse_f_N2": "N"}  # unit of the square root of each mean squared error
-UNIVERSAL = "universal, "  # prefix of the methods in `labels` that are calibrated to the tested skin
 NOTHING, UNLABELLED = "none", "presses without labels"
 NONE_HELD_OUT = "no board held out"
 ANSWER, SECOND, COMPARED = "answer", "second", "compared"
-RIG, SHIPPED = WAYS  # methods of experiment random_presses
+RIG, SHIPPED = IN_CONTEXT  # methods of experiment new_board
 ADAPTED = "Multi-sensor with triplet loss, adapted"
 NETWORK = "Network of the paper, trained on the other boards"
 OURS = "Universal model (ours), trained on simulated skins"
@@ -153,11 +152,8 @@ def level(score: Statistic, yes: float, partly: float) -> str:
 
 def _efforts(numbers: Results) -> Iterator[Effort]:
     """Yield the models to show; the model that needs the most data from the new skin comes last."""
-    if boards_rows(numbers):
-        yield from _efforts_on_random_presses(numbers)
-        return
-    if numbers.get("labels"):
-        yield from _efforts_by_labels(numbers["labels"])
+    if unseen_rows(numbers):
+        yield from _efforts_on_new_boards(numbers)
         return
     known, table2 = models(numbers), numbers.get("table2", {})
     adapting = f"{numbers.get('adapt', {}).get('pokes_n', ADAPTED_POKES_N)} presses without labels"
@@ -174,40 +170,21 @@ def _efforts(numbers: Results) -> Iterator[Effort]:
         yield Effort(OURS, f"{scores['pokes_n']} presses without labels", scores, {}, role=our_role)
 
 
-def _efforts_on_random_presses(numbers: Results) -> Iterator[Effort]:
-    """Yield the universal models by number of labels, scored as in the figure of boards never seen in training."""
-    rows = sorted(boards_rows(numbers), key=lambda row: int(row["labels"]))
+def _efforts_on_new_boards(numbers: Results) -> Iterator[Effort]:
+    """Yield the in-context models by number of labels, scored as in the figure of boards never seen in training."""
+    rows = sorted((row for row in unseen_rows(numbers) if row["labels_n"] != 1), key=lambda row: row["labels_n"])
     first = RIG if any(row["method"] == RIG for row in rows) else SHIPPED
     for method in dict.fromkeys((SHIPPED, first)):  # the model that gives the answer comes last
         swept = [row for row in rows if row["method"] == method]
         for row in swept:
-            unlabelled, labels_n = f"{row['presses_n']} presses without labels", int(row["labels"])
+            unlabelled, labels_n = f"{row['pokes_n']} presses without labels", row["labels_n"]
             needs = f"{unlabelled}, and {labels_n} with known place and force" if labels_n else unlabelled
             role = ""
             if row is swept[0]:
                 role = ANSWER if method == first else SECOND
             elif row is swept[-1] and method == first:
                 role = COMPARED
-            yield Effort(f"Universal model (ours), {WAYS[method]}", needs, row, {}, labels_n, role)
-
-
-def _efforts_by_labels(rows: Sequence[Mapping[str, Any]]) -> Iterator[Effort]:
-    """Yield the first network without labels, then the universal model, if there is any, for each number of labels."""
-    by_method: dict[tuple[str, str], dict[int, Mapping[str, Any]]] = {}
-    for row in rows:
-        by_method.setdefault((row["method"], row["inputs"]), {})[row["labels_n"]] = row["as_labelled"]
-    network = next(iter(by_method))
-    chosen = next((key for key in by_method if key[0].startswith(UNIVERSAL)), network)
-    if chosen != network and 0 in by_method[network]:
-        paper = {metric: mean for metric, (mean, _) in TABLE_2["multi"].items()}
-        yield Effort(NETWORK, NOTHING, by_method[network][0], paper, role=COMPARED)
-    of_ours = f"Universal model (ours), {chosen[0].removeprefix(UNIVERSAL)}"
-    title, presses = (of_ours, UNLABELLED) if chosen != network else (NETWORK, NOTHING)
-    counts = sorted(by_method[chosen])
-    for labels_n in dict.fromkeys((counts[0], counts[len(counts) // 2], counts[-1])):
-        needs = f"{labels_n} presses with known place and force" if labels_n else presses
-        role = ANSWER if labels_n == counts[0] else COMPARED if labels_n == counts[-1] else ""
-        yield Effort(title, needs, by_method[chosen][labels_n], {}, labels_n, role)
+            yield Effort(f"In-context model (ours), {IN_CONTEXT[method]}", needs, row, {}, labels_n, role)
 
 
 def _tested(numbers: Results, best: Effort) -> str:
@@ -217,7 +194,7 @@ def _tested(numbers: Results, best: Effort) -> str:
     held_out = f"Tested on {boards}; no tested board or skin was in training."
     if source == "simulated":
         held_out += " All readings were simulated, so these results are no evidence about real skins."
-    if boards_rows(numbers) and numbers["provenance"]["scene"] == CHOSEN_ON:
+    if unseen_rows(numbers) and numbers["provenance"]["scene"] == CHOSEN_ON:
         held_out += " However, details of the model were chosen with these boards, so the scores are optimistic."
     return f"{held_out} Model: {best.model}. Data that this model needs from the new skin: {best.needs}."
 
@@ -272,7 +249,8 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         return Answer(FORCE, UNTESTED, "the recordings have no forces")
     second = ""
     sentences = [f"Rms error: {show_with_unit(error, 'N')}; R²: {show(explained)}.", *_forces(numbers)]
-    constant = numbers.get("constant_force", {}).get("table2")
+    table_2 = numbers.get("constant_force", {}).get("table2")
+    constant = constant_force(numbers) or (rms(table_2["mse_f_N2"]) if table_2 else None)
     if best.paper:
         sentences.append(
             f"Paper: rms error {sqrt(best.paper['mse_f_N2']):.2f} N. The paper does not state how large its forces are."
@@ -283,8 +261,8 @@ def _force(numbers: Results, best: Effort, others: Sequence[Effort]) -> Answer:
         sentences.append(f"{_named(other)}: rms error {shown}; R² {show(r2)}{USABLE[force_level(r2)]}.")
         second = sentences[-1] if other.role == SECOND else second
     short = f"rms error {two_digits(error.mean)} N"
-    if constant and (guessing := rms(constant["mse_f_N2"])):
-        short += f" (always predicting the mean force: {two_digits(guessing.mean)} N)"
+    if constant:
+        short += f" (always predicting the mean force: {two_digits(Stat.of(constant).mean)} N)"
     if force_level(explained) == NO:
         short = f"not usable; {short}"
     return Answer(FORCE, force_level(explained), short, tuple(sentences), second)

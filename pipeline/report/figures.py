@@ -14,16 +14,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.formatting import COLUMNS, SHORT, n_of, table_2_rows, two_digits, universal_rows
+from pipeline.formatting import COLUMNS, TITLES, n_of, table_2_rows, two_digits, universal_rows
 from pipeline.paper import ADAPTED_POKES_N, TABLE_2, Number
 from pipeline.plot import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
 from pipeline.plot_layout import WIDTH_IN
+from pipeline.statistics import Stat
 
 HEADLINE = "headline.svg"
 FORCE = "headline_force.svg"
 HEADLINES = {HEADLINE: ("accuracy_pct", "mse_xy_mm2"), FORCE: ("mse_f_N2", "r2_f")}  # metrics of places and of forces
-UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("mse_f_N2",)}  # metrics for boards that were never seen in training
-LABELS = "labels.svg"
+UNSEEN = {HEADLINE: ("accuracy_pct",), FORCE: ("rms_f_N",)}  # metrics for boards that were never seen in training
 OFFSET = 0.17  # distance of both marks of a row from the row's middle, as a fraction of the row's height
 WORST_MM = 2.0  # upper end of the colour scale of all error maps: twice the largest error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
@@ -44,17 +44,16 @@ SENSOR_METHODS = ("multi", "triplet", "adapted")
 PAPER = {"fmt": "D", "color": "black", "markerfacecolor": "white", "markersize": 6, "ecolor": "#00000030"}
 PAPER |= {"elinewidth": 8, "zorder": 1.5}
 PAPER_NAME = "paper's table 2: mean ± standard deviation"
-# For figures of boards that were never seen in training (experiment random_presses): the test that they show, and the
-# names of the models.
-TESTED = "places without labels (checkerboard)"
-WAYS = {
-    "universal, boards of the rig": "trained on simulation and the rig's other board",
-    "universal, simulated alone": "trained on simulation (the model that we ship)",
+# The in-context models in figures of boards that were never seen in training (experiment new_board).
+SPLIT = "checkerboard"
+IN_CONTEXT = {
+    "rig": "trained on simulation and the rig's other board",
+    "shipped": "trained on simulation (the model that we ship)",
 }
 # Names of those rows of the paper's table 2 that are drawn beside our scores.
 PAPERS_ROWS = {"single": "paper, one skin", "multi": "paper, 15 skins", "adapted": "paper, adapted"}
 PLACE_LABEL, FORCE_LABEL = "place: within 1 mm / %", "force: rms error / N"
-CONSTANT_ROW, CONSTANT_NAME = "constant force", "the mean force of all presses as the estimate of each"
+CONSTANT_ROW, CONSTANT_NAME = "constant force", "the mean force of all labels as the estimate of each press"
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -76,17 +75,14 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw the scores on held-out boards, if there are any, with places in one figure and forces in another.
 
     The figures show boards that were never seen in training, by number of labels; or, if there are none, the rows of
-    table 2. If the scene compares methods by number of labels, another figure shows all methods.
+    table 2.
     """
-    figures = {LABELS: labels_figure(numbers, source)} if "labels" in numbers else {}
-    if rows := boards_rows(numbers):
+    if rows := unseen_rows(numbers):
         drawn = {name: metrics for name, metrics in UNSEEN.items() if {*metrics} <= rows[0].keys()}
-        return figures | {name: unseen_boards(numbers, source, metrics) for name, metrics in drawn.items()}
+        return {name: unseen_boards(numbers, source, metrics) for name, metrics in drawn.items()}
     if numbers.get("table2"):
-        figures |= {name: table2_figure(numbers, source, metrics) for name, metrics in HEADLINES.items()}
-    elif LABELS in figures:
-        figures[HEADLINE] = figures[LABELS]
-    return figures
+        return {name: table2_figure(numbers, source, metrics) for name, metrics in HEADLINES.items()}
+    return {}
 
 
 def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str] = HEADLINES[HEADLINE]) -> str:
@@ -156,38 +152,32 @@ def spread_of(scores: Mapping[Any, Mapping[str, Any]]) -> str:
     return "; ".join([most, *others])
 
 
-def _spread(stat: Mapping[str, Any]) -> str:
-    if "ci95" in stat:
-        return "95 % interval over boards"
-    if "values" in stat:
-        return "from lowest to highest board"
-    return "standard deviation over seeds" if "sd_seeds" in stat else "standard deviation" if "sd" in stat else "no bar"
+def _spread(value: Mapping[str, Any]) -> str:
+    stat = Stat.of(value)
+    if stat.ends:
+        return "from lowest to highest board" if stat.few else "95 % interval over boards"
+    if stat.sd_seeds is not None:
+        return "standard deviation over seeds"
+    return "no bar" if stat.sd is None else "standard deviation"
 
 
-def unseen_rows(numbers: Mapping[str, Any], models: Collection[str] = tuple(WAYS)) -> list[Mapping[str, Any]]:
-    """Return the scores of universal models on boards never seen in training, with the most unlabelled presses.
-
-    There is one row for each model and each number of labels, and one for a single press of known weight, where
-    `labels` is "weight".
-    """
-    rows = [
-        row
-        for row in numbers.get("random_presses", {}).get("rows", ())
-        if row["method"] in models and row["tested"] == TESTED
-    ]
-    most_n = max((row["presses_n"] for row in rows), default=0)
-    return [row for row in rows if row["presses_n"] == most_n]
+def unseen_rows(numbers: Mapping[str, Any], methods: Collection[str] = tuple(IN_CONTEXT)) -> list[Mapping[str, Any]]:
+    """Return the rows of experiment new_board for split `checkerboard` and the most unlabelled presses."""
+    rows = [row for row in numbers.get("new_board", ()) if (row["split"], row["method"] in methods) == (SPLIT, True)]
+    most_n = max((row["pokes_n"] for row in rows), default=0)
+    return [row for row in rows if row["pokes_n"] == most_n]
 
 
-def boards_rows(numbers: Mapping[str, Any], models: Collection[str] = tuple(WAYS)) -> list[Mapping[str, Any]]:
-    """Return the rows of `unseen_rows` that are for a number of labels."""
-    return [row for row in unseen_rows(numbers, models) if row["labels"].isdecimal()]
+def constant_force(numbers: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the rms error in N of the mean force of the labels as estimate, with the most labels; None if unknown."""
+    rows = [row for row in unseen_rows(numbers, ("constant",)) if "rms_f_N" in row]
+    return max(rows, key=lambda row: row["labels_n"])["rms_f_N"] if rows else None
 
 
 def unseen_boards(
     numbers: Mapping[str, Any],
     source: str,
-    metrics: Sequence[str] = ("accuracy_pct", "mse_f_N2"),
+    metrics: Sequence[str] = ("accuracy_pct", "rms_f_N"),
     *,
     large: bool = False,
 ) -> str:
@@ -197,11 +187,11 @@ def unseen_boards(
     estimate, and scores of the paper's table 2 with other marks. A metric that the results lack has no panel. With
     `large`, for README.md, panels are beside each other and have large letters.
     """
-    rows = boards_rows(numbers)
+    rows = [row for row in unseen_rows(numbers) if row["labels_n"] != 1]
     metrics = [metric for metric in metrics if all(metric in row for row in rows)]
-    labels = sorted({int(row["labels"]) for row in rows})
-    paper_n = len(PAPERS_ROWS)
-    constant = "mse_f_N2" in metrics and "r2_f" in rows[0]  # R² is missing if all forces of a board are equal
+    labels = sorted({row["labels_n"] for row in rows})
+    paper_n, constant_N = len(PAPERS_ROWS), constant_force(numbers)
+    constant = "rms_f_N" in metrics and constant_N is not None
     y = {f"{n} labels": paper_n + constant + 1.3 * (len(labels) - i) for i, n in enumerate(labels)}
     y |= {CONSTANT_ROW: paper_n + 1.0} if constant else {}
     y |= {name: paper_n - i - 0.5 for i, name in enumerate(PAPERS_ROWS.values())}
@@ -209,15 +199,15 @@ def unseen_boards(
     with drawing(*size_in) as figure:
         panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
         for axes, metric in zip(panels, metrics, strict=True):
-            for i, (method, name) in enumerate(WAYS.items()):
+            for i, (method, name) in enumerate(IN_CONTEXT.items()):
                 look = {"color": COLOURS[1 + i], "marker": MARKERS[i], "markersize": letters_pt * 0.65, "linewidth": 1}
                 for row in (row for row in rows if row["method"] == method):
-                    values = readable(metric, row[metric]["values"])
-                    row_y = y[f"{row['labels']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
+                    values = list(row[metric]["by_board"].values())
+                    row_y = y[f"{row['labels_n']} labels"] + 1.3 * OFFSET * (1 - 2 * i)
                     _draw_boards(axes, metric, values, row_y, letters_pt, label=name, **look)
-            if metric == "mse_f_N2" and constant:
+            if metric == "rms_f_N" and constant_N is not None:
                 look = {"color": "0.45", "marker": "x", "markersize": letters_pt * 0.65, "linewidth": 1}
-                errors_N = mean_force_errors(rows[0])
+                errors_N = list(constant_N["by_board"].values())
                 _draw_boards(axes, metric, errors_N, y[CONSTANT_ROW], letters_pt, label=CONSTANT_NAME, **look)
             _draw_papers_row(axes, metric, [y[name] for name in PAPERS_ROWS.values()], letters_pt)
             axes.set_xlabel(PLACE_LABEL if metric == "accuracy_pct" else FORCE_LABEL, size=letters_pt)
@@ -228,20 +218,17 @@ def unseen_boards(
             axes.tick_params(labelsize=letters_pt)
         panels[0].set_yticks([*y.values()], [*y])
         test = (
-            f"The model was calibrated to {rows[0]['presses_n']} unlabelled presses of the board. Labels are at random "
-            "places, tests at other places. "
-            f"Means of {numbers['random_presses']['draws_n']} draws of presses and labels."
+            f"The model was calibrated to {rows[0]['pokes_n']} unlabelled presses of the board. Labels are at random "
+            "places, tests at other places. Means over draws of presses and labels."
         )
-        boards_n = len(rows[0][metrics[0]]["values"])
+        boards_n = len(rows[0][metrics[0]]["by_board"])
         space = " " if large else "\n"
         title = f"{boards_n} boards never seen in training ({source}):{space}marks are boards, numbers their means"
         _finish(figure, title, letters_pt, note=fill(test, 88) if large else test)
         return svg(figure, column=not large)
 
 
-def _draw_boards(
-    axes: Any, metric: str, values: Float[np.ndarray, " n"], y: float, letters_pt: float, **look: Any
-) -> None:
+def _draw_boards(axes: Any, metric: str, values: Sequence[float], y: float, letters_pt: float, **look: Any) -> None:
     """Draw a mark for each board, a line through them, and the mean of the boards on the right."""
     axes.plot(values, [y] * len(values), **look)
     mean = f"{np.mean(values):.{0 if metric == 'accuracy_pct' else 1}f}"
@@ -249,25 +236,13 @@ def _draw_boards(
     axes.annotate(mean, (max(values), y), color=look["color"], fontsize=0.8 * letters_pt, **beside)
 
 
-def mean_force_errors(row: Mapping[str, Any]) -> Float[np.ndarray, " n"]:
-    """Return the rms error in N on each board if the estimated force of every press were the mean force.
-
-    Its square is the variance of the forces. It follows approximately from R² = 1 - MSE / variance, because R² and MSE
-    are means over draws of presses.
-    """
-    mse_N2, r2 = (np.array(row[metric]["values"]) for metric in ("mse_f_N2", "r2_f"))
-    return readable("mse_f_N2", mse_N2 / (1 - r2))
-
-
-def readable(metric: str, values: Any) -> Float[np.ndarray, " n"]:
-    """Convert mean squared errors of forces to rms errors; return other values unchanged."""
-    return np.sqrt(values) if metric == "mse_f_N2" else np.asarray(values, float)
-
-
 def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: float) -> None:
     """Draw a metric of the paper's table 2, for other skins, below ours; the bars of rms errors are not symmetric."""
-    means, lengths = bars([{metric: {"mean": mean, "sd": sd}} for mean, sd in papers_row(metric)], metric)
-    low, middle, high = (readable(metric, ends) for ends in (means - lengths[0], means, means + lengths[1]))
+    printed = "mse_f_N2" if metric == "rms_f_N" else metric
+    means, lengths = bars([{printed: {"mean": mean, "n": 1, "sd": sd}} for mean, sd in papers_row(printed)], printed)
+    low, middle, high = (means - lengths[0], means, means + lengths[1])
+    if metric == "rms_f_N":
+        low, middle, high = np.sqrt(low), np.sqrt(middle), np.sqrt(high)
     look = PAPER | {"markersize": letters_pt * 0.65, "elinewidth": letters_pt * 0.9}
     name = (
         f"{PAPER_NAME} (other skins, forces and test)"  # the paper's rows are not scores of the tests drawn above them
@@ -278,32 +253,6 @@ def _draw_papers_row(axes: Any, metric: str, y: Sequence[float], letters_pt: flo
 def papers_row(metric: str) -> list[Number]:
     """Return a metric of those rows of the paper's table 2 that a figure of unseen boards shows."""
     return [TABLE_2[row][metric] for row in PAPERS_ROWS]
-
-
-def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
-    """Draw place and force scores of each method on held-out boards, with one point per number of labels."""
-    rows = numbers["labels"]
-    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
-    counts = sorted({row["labels_n"] for row in rows})
-    metrics = ("accuracy_pct", "mse_f_N2")
-    with drawing(4.7, 1.1 + 0.25 * len(methods) * len(metrics)) as figure:
-        for axes, metric in zip(figure.subplots(len(metrics), 1), metrics, strict=True):
-            for i, count in enumerate(counts):
-                count_rows = [row for row in rows if row["labels_n"] == count]
-                means = [row["as_labelled"][metric]["mean"] for row in count_rows]
-                y = [-methods.index((row["method"], row["inputs"])) for row in count_rows]
-                look = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "linestyle": "none"}
-                axes.plot(means, y, label=f"{count} labels", markersize=5, **look)
-            axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 100 if metric == "accuracy_pct" else None))
-            axes.grid(alpha=0.25)
-            axes.set_yticks([-i for i in range(len(methods))], [f"{m} ({inputs})" for m, inputs in methods], fontsize=8)
-        boards_n = rows[0]["as_labelled"]["accuracy_pct"]["n"]
-        _finish(
-            figure,
-            f"Scores on held-out boards, by number of labels (scene {numbers['provenance']['scene']}, {source}): "
-            f"means over {boards_n} boards, positions not corrected",
-        )
-        return svg(figure)
 
 
 def _finish(figure: Any, title: str, letters_pt: float = 9.0, *, note: str = "") -> None:
@@ -443,7 +392,7 @@ def sweep_sensors(rows: Rows, source: str) -> str:
         swept = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
         look = _look(1 + i) | {"fmt": f"{MARKERS[i]}-"}
         if swept:
-            lines.append(Line(SHORT[method], [row["skins_n"] for row in swept], swept, look, shift_pt=4.0 * (i - 1)))
+            lines.append(Line(TITLES[method], [row["skins_n"] for row in swept], swept, look, shift_pt=4.0 * (i - 1)))
     title = (
         f"Scores on held-out boards by number of training skins ({source}; bars: {spread_of(dict(enumerate(rows)))})"
     )
@@ -461,12 +410,12 @@ def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounding could make lengths negative
 
 
-def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
+def _ends(value: Mapping[str, Any]) -> tuple[float, float]:
     """Return the lower and the upper end of an error bar."""
-    sd = stat.get("sd", stat.get("sd_seeds", 0.0))
-    values = stat.get("values", (stat["mean"] - sd, stat["mean"] + sd))
-    low, high = stat.get("ci95", (min(values), max(values)))
-    return low, high
+    stat = Stat.of(value)
+    sd = (stat.sd_seeds or 0.0) if stat.sd is None else stat.sd
+    ends = stat.ends or (stat.mean - sd, stat.mean + sd)
+    return min(ends), max(ends)
 
 
 def _sweep(lines: Sequence[Line], title: str, xlabel: str, *, log: bool) -> str:

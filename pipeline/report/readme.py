@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 
 from pipeline import FLOW
-from pipeline.benchmark import entries
 from pipeline.catalogue import module_name
 from pipeline.formatting import tabulate, to_markdown
 from pipeline.paper import TABLE_2, TABLE_2_ROWS
-from pipeline.report.figures import TESTED, mean_force_errors, readable, unseen_boards, unseen_rows
+from pipeline.report.figures import constant_force, unseen_boards, unseen_rows
 from pipeline.report.numbers import join
-from pipeline.report.tables import make_tables, skins_table
+from pipeline.report.tables import NOLOAD_AGES, make_tables, skins_table
 from pipeline.scenes import ANALYSES
+from pipeline.statistics import Stat
 from reskin import io
 from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
@@ -32,7 +32,8 @@ TABLES = (
     "flexible",
     "single_sensor",
 )  # tables of simulated scenes that docs/results.md shows
-COMPARED = ("compare", "compare_parameters", "compare_frames")
+COMPARED = ("compare",)
+NEW_BOARD = ("new_board", "new_board_contact")
 MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
@@ -40,11 +41,9 @@ COSTS_MEANING = (
     "another. By default, two training runs run at the same time, so less time passes. Column collapsed counts the "
     "training runs whose network had a nearly constant output; they were repeated."
 )
-BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # simulated scenes on the pages; README.md shows only HEADLINE
-# The scene that tests the shipped universal model, and the name of the model in this scene.
-SHIPPED_SCENE, SHIPPED_NAME = "lab", "universal, simulated alone"
+SHIPPED_SCENE, SHIPPED_FILE = "lab", "reskin/universal/universal.safetensors"  # scene that tests the shipped model
 MEASURED = "reskin/universal/measured.json"  # results of this model that the live page shows
 # What README.md shows of the paper's table 2, and of presses at random places of recorded boards (scene lab). Each
 # metric has a title and a number of decimals.
@@ -55,22 +54,15 @@ SIMULATED_MEANING = (
     "skins. An earlier simulation was tuned to the paper's "
     "*Single-sensor*, so this row proves nothing. The paper does not state its forces, so MSE_F may not be comparable."
 )
-HALVES = "half of the skin without labels"
-TRAINED_ON = {
-    "universal, simulated alone": "simulation (shipped model)",
-    "universal, boards of the rig": "simulation and the rig's other board",
-}
-SHORT_NAMES = {
-    "universal, simulated alone": "shipped model",
-    "universal, boards of the rig": "model trained with the other board",
-}
-LABELS = {"0": "no label", "weight": "one known weight, mid-skin", "10": "10 labels", "40": "40 labels"}
+TRAINED_ON = {"shipped": "simulation (shipped model)", "rig": "simulation and the rig's other board"}
+SHORT_NAMES = {"shipped": "shipped model", "rig": "model trained with the other board"}
+LABELS = {0: "no label", 1: "one known weight, mid-skin", 10: "10 labels", 40: "40 labels"}
 RECORDED_METRICS = {
-    "accuracy_pct": ("within 1 mm in x and y, %", 0), "mse_f_N2": ("force error (rms), N", 1),
+    "accuracy_pct": ("within 1 mm in x and y, %", 0), "rms_f_N": ("force error (rms), N", 1),
     "r2_f": ("R² of force", 2),
 }  # fmt: skip
 RECORDED_MEANING = (
-    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2), over {draws_n} draws of "
+    "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2), over draws of "
     "presses and labels. In all columns, the model is first calibrated to {presses_n} presses without labels. {halves} "
     "The mean force as estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
 )
@@ -101,14 +93,13 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(page): page.read_text(encoding="utf-8") for page in pages}
     blocks = blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times)
-    blocks |= entries.blocks(entries.read_entries(root / BENCHMARK), numbers.get("lab", {}))
     after = fill(before, blocks)
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
         io.write_text(Path(page), after[page])
     if SHIPPED_SCENE in numbers:
         shipped = numbers[SHIPPED_SCENE]
-        file, measured = root / MEASURED, measured_of(shipped)
+        file, measured = root / MEASURED, measured_of(shipped, io.sha256(root / SHIPPED_FILE))
         if not file.exists() or io.read_json(file) != measured:
             changed.append(str(file))
             if write:
@@ -121,37 +112,33 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
 
 
-def measured_of(numbers: Numbers) -> dict[str, Any]:
-    """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
+def measured_of(numbers: Numbers, model_sha256: str) -> dict[str, Any]:
+    """Return the results of the shipped model that the live page shows (`reskin.live.used_model.Measured`).
 
-    Scores of places are for presses at random places. The places are coloured like the squares of a checkerboard.
-    Labels are at places of one colour, and tests are at places of the other colour.
+    Places are for presses at random places, with labels and tests on different colours of a checkerboard.
     """
 
-    def by_board(row: Numbers) -> dict[str, list[float]]:
-        return {name: row[name]["values"] for name in ("accuracy_pct", "median_mm", "mse_xy_mm2")}
+    def by_board(row: Numbers, metric: str) -> list[float]:
+        return list(row[metric]["by_board"].values())
 
-    limits = numbers["recorded_limits"]
+    rows = [row for row in numbers["new_board"] if (row["method"], row["split"]) == ("shipped", "checkerboard")]
     places = [
-        {"presses_n": 0, "labels_n": 0} | by_board(row)
-        for row in limits["registration"]["rows"]
-        if (row["method"], row["presses_n"], row["known"]) == (SHIPPED_NAME, 0, "not used")
-    ] + [
-        {"presses_n": row["presses_n"], "labels_n": int(row["labels"])} | by_board(row)
-        for row in numbers["random_presses"]["rows"]
-        if (row["method"], row["tested"]) == (SHIPPED_NAME, TESTED) and row["labels"].isdecimal()
+        {"presses_n": row["pokes_n"], "labels_n": row["labels_n"]}
+        | {name: by_board(row, name) for name in ("accuracy_pct", "median_mm", "mse_xy_mm2")}
+        for row in rows
+        if row["labels_n"] != 1
     ]
-    detection = [
-        row
-        for row in limits["detection"]["rows"]
-        if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")
-    ]
-    columns = {"lightest_N": "smallest_N", "detected_pct": "detected_pct", "false_alarm_pct": "false_alarm_pct"}
+    touch = next(row for row in numbers["new_board"] if (row["method"], row["split"]) == ("contact", "each"))
     return {
         "scene": numbers["provenance"]["scene"],
         "source": numbers["provenance"]["source"],
+        "model_sha256": model_sha256,
         "places": sorted(places, key=lambda row: (row["presses_n"], row["labels_n"])),
-        "detection": {name: [row[column] for row in detection] for name, column in columns.items()},
+        "detection": {
+            "lightest_N": by_board(touch, "force_min_N"),
+            "detected_pct": [100 - missed for missed in by_board(touch, "missed_pct")],
+            "false_alarm_pct": by_board(touch, "false_pct"),
+        },
     }
 
 
@@ -180,7 +167,6 @@ def blocks_of(
     The last scene in `results` is the headline scene. README.md shows its scores, and the table of skins compares its
     simulated skins with recorded skins.
     """
-    labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
     moving = [numbers for numbers in recorded if "moving_hand" in numbers]
     skins = {
@@ -192,11 +178,13 @@ def blocks_of(
     }
     return {
         "headline": _simulated(list(reversed(results))),
-        "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "random_presses" in numbers) or NONE_YET,
+        "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "new_board" in numbers) or NONE_YET,
         "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
         "time": "Not timed yet. Run `make time-repro`." if times is None else _time(times),
         "costs": to_markdown(costs_table([*results, *recorded])),
-        "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
+        "new_board": "
+
+".join(_tables(each, NEW_BOARD) for each in recorded if "new_board" in each) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
         "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
@@ -223,46 +211,28 @@ def _simulated(scenes: Sequence[Numbers]) -> str:
 def _recorded(numbers: Numbers) -> str:
     """Tabulate place and force scores of the universal model, by labels, on recorded boards never seen in training."""
     unseen = unseen_rows(numbers, tuple(TRAINED_ON))
-    rows = {(row["method"], row["labels"]): row for row in unseen}
+    rows = {(row["method"], row["labels_n"]): row for row in unseen}
     lines = [
         {"trained on": trained_on, "on new boards": title}
-        | {name: _compact(_readable(rows.get((method, labels)), metric), digits) for labels, name in LABELS.items()}
+        | {name: _compact(rows.get((method, labels), {}).get(metric), digits) for labels, name in LABELS.items()}
         for method, trained_on in TRAINED_ON.items()
         if any(method == row["method"] for row in unseen)
         for metric, (title, digits) in RECORDED_METRICS.items()
     ]
     provenance = numbers["provenance"]
     meaning = RECORDED_MEANING.format(
-        scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["presses_n"],
-        draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), constant=_mean_force_error(unseen[0]),
-        touch=_touches(numbers),
+        scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["pokes_n"],
+        halves=_halves(numbers), constant=_compact(constant_force(numbers), 1), touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
-
-
-def _readable(row: Numbers | None, metric: str) -> Numbers | None:
-    """Return a score of a row; mean squared errors of forces become rms errors of each board, and their mean."""
-    if row is None or metric not in row:
-        return None
-    stat = row[metric]
-    if metric != "mse_f_N2":
-        return stat
-    values = readable(metric, stat["values"])
-    return {"mean": values.mean(), "values": values}
-
-
-def _mean_force_error(row: Numbers) -> str:
-    """Write the rms error in N, as mean and by board, if the estimated force of every press were the mean force."""
-    values = mean_force_errors(row)
-    return _compact({"mean": values.mean(), "values": values}, RECORDED_METRICS["mse_f_N2"][1])
 
 
 def _halves(numbers: Numbers) -> str:
     """State the accuracy of each model on one half of the skin if all labels are on the other half."""
     scores = {
         row["method"]: f"{row['accuracy_pct']['mean']:.0f} %"
-        for row in numbers["random_presses"]["rows"]
-        if (row["tested"], row["labels"]) == (HALVES, "40")
+        for row in numbers["new_board"]
+        if (row["split"], row.get("labels_n")) == ("halves", 40)
     }
     shown = [f"{scores[method]} ({name})" for method, name in SHORT_NAMES.items() if method in scores]
     if not shown:
@@ -272,20 +242,17 @@ def _halves(numbers: Numbers) -> str:
 
 
 def _touches(numbers: Numbers) -> str:
-    """State the range of forces, and how many touches are missed or reported without cause, by age of the baseline."""
-    detection = numbers.get("recorded_limits", {}).get("detection", {})
-    by_baseline: dict[str, list[Numbers]] = {}
-    for row in detection.get("rows", ()):
-        if row["rule"] == "as in reskin live":
-            by_baseline.setdefault(row["baseline"], []).append(row)
-    if not by_baseline:
+    """State the range of forces, and how many touches are missed or false, by age of the no-load reading."""
+    rows = {row["split"]: row for row in numbers["new_board"] if row["method"] == "contact"}
+    if not rows:
         return ""
-    missed = max(100 - row["detected_pct"] for rows in by_baseline.values() for row in rows)
+    missed = max(value for row in rows.values() for value in row["missed_pct"]["by_board"].values())
     false = []
-    for baseline, rows in by_baseline.items():
-        rates = [f"{row['false_alarm_pct']:.0f}" for row in rows]  # in the order of the boards
-        false.append(f"{baseline}, {rates[0] if len(set(rates)) == 1 else ' and '.join(rates)} %")
-    ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
+    for age, row in rows.items():
+        rates = [f"{value:.0f}" for value in row["false_pct"]["by_board"].values()]
+        false.append(f"{NOLOAD_AGES[age]}, {rates[0] if len(set(rates)) == 1 else ' and '.join(rates)} %")
+    ends = zip(*(rows["each"][f"force_{end}_N"]["by_board"].values() for end in ("min", "max")), strict=True)
+    ranges = " and ".join(f"{low:.1f} to {high:.1f} N" for low, high in ends)
     share = f"at most {missed:.2g} %" if missed else "none"
     return (
         f"Forces of the presses: {ranges}. With the threshold of the live page, {share} of these presses are "
@@ -303,12 +270,11 @@ def _compact(value: Numbers | None, digits: int) -> str:
     """Write a mean with `digits` decimals, and the interval over boards or the values of the boards."""
     if value is None:
         return "–"
-    mean, *others = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
-    if "ci95" in value:
-        return f"{mean} [{', '.join(others)}]"
-    return (
-        f"{mean} ({'; '.join(others)})" if others else f"{mean} ± {value['sd']:.{digits}f}" if "sd" in value else mean
-    )
+    stat = Stat.of(value)
+    mean, *others = [f"{number:.{digits}f}" for number in (stat.mean, *stat.ends)]
+    if others:
+        return f"{mean} ({'; '.join(others)})" if stat.few else f"{mean} [{', '.join(others)}]"
+    return mean if stat.sd is None else f"{mean} ± {stat.sd:.{digits}f}"
 
 
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:

@@ -4,9 +4,9 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from pipeline.formatting import SHORT
+from pipeline.formatting import TITLES
 from pipeline.paper import TABLE_2
-from pipeline.report.figures import FORCE, HEADLINE, LABELS, WAYS, boards_rows, readable
+from pipeline.report.figures import FORCE, HEADLINE, IN_CONTEXT, unseen_rows
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 # Places where no line break is allowed: between a number and its unit.
@@ -14,8 +14,6 @@ UNIT, NO_BREAK = re.compile(r"(?<=\d) (?=%|N\b|mm\b)"), "\u00a0"
 MAPS = "Colours show the mean error at each place of the skin. A colour means the same error in all maps."
 # The sentences that contain no results, by figure. They tell the reader what to look for in the figure.
 LOOK = {
-    LABELS: "Each row is one method. Compare its mark for 0 labels with its mark for the most labels to see how much "
-    "labels of the new board improve the score.",
     "variation_time.svg": "Each line shows how much the field has changed since the first press at this place. The "
     "colour of a line is the number of contacts before it.",
     "variation_skins.svg": "The indentations are equal on all skins, but the fields differ. A network has to cope with "
@@ -69,11 +67,11 @@ def sentences(numbers: Numbers) -> dict[str, str]:
 def _table2(numbers: Numbers) -> dict[str, str]:
     ours = {name: row for name, row in numbers["table2"].items() if name in ("single", "multi", "adapted")}
     parts = [
-        f"{SHORT[name]} {row['accuracy_pct']['mean']:.0f} % (paper: {TABLE_2[name]['accuracy_pct'][0]:.0f} %)"
+        f"{TITLES[name]} {row['accuracy_pct']['mean']:.0f} % (paper: {TABLE_2[name]['accuracy_pct'][0]:.0f} %)"
         for name, row in ours.items()
     ]
     errors = [
-        f"{SHORT[name]} {row['mse_f_N2']['mean'] ** 0.5:.1f} N (paper: {TABLE_2[name]['mse_f_N2'][0] ** 0.5:.1f} N)"
+        f"{TITLES[name]} {row['mse_f_N2']['mean'] ** 0.5:.1f} N (paper: {TABLE_2[name]['mse_f_N2'][0] ** 0.5:.1f} N)"
         for name, row in ours.items()
         if "mse_f_N2" in row
     ]
@@ -83,16 +81,16 @@ def _table2(numbers: Numbers) -> dict[str, str]:
 
 
 def _unseen(numbers: Numbers) -> dict[str, str]:
-    rows = sorted(boards_rows(numbers), key=lambda row: int(row["labels"]))
+    rows = sorted((row for row in unseen_rows(numbers) if row["labels_n"] != 1), key=lambda row: row["labels_n"])
     written = {}
-    for file, metric, digits, unit in ((HEADLINE, "accuracy_pct", 0, "%"), (FORCE, "mse_f_N2", 1, "N")):
+    for file, metric, digits, unit in ((HEADLINE, "accuracy_pct", 0, "%"), (FORCE, "rms_f_N", 1, "N")):
         parts = []
-        for method, name in WAYS.items():
+        for method, name in IN_CONTEXT.items():
             swept = [row for row in rows if row["method"] == method and metric in row]
             if swept:
-                first, last = (readable(metric, row[metric]["values"]).mean() for row in (swept[0], swept[-1]))
-                ends = f"{first:.{digits}f} {unit} with {swept[0]['labels']} labels"
-                parts.append(f"{name}: {ends}, {last:.{digits}f} {unit} with {swept[-1]['labels']}")
+                first, last = (row[metric]["mean"] for row in (swept[0], swept[-1]))
+                ends = f"{first:.{digits}f} {unit} with {swept[0]['labels_n']} labels"
+                parts.append(f"{name}: {ends}, {last:.{digits}f} {unit} with {swept[-1]['labels_n']}")
         if parts:
             what = "Share of readings within 1 mm" if metric == "accuracy_pct" else "Rms error of the force"
             written[file] = f"{what}, mean over the boards: {'; '.join(parts)}."
@@ -184,6 +182,6 @@ def _sleeve(numbers: Numbers) -> dict[str, str]:
 
 
 WRITERS: dict[str, Callable[[Numbers], dict[str, str]]] = {
-    "table2": _table2, "random_presses": _unseen, "sweep_pokes": _pokes, "sweep_sensors": _sensors,
+    "table2": _table2, "new_board": _unseen, "sweep_pokes": _pokes, "sweep_sensors": _sensors,
     "drift": _drift, "shear": _shear, "flexible": _flexible, "sleeve": _sleeve,
 }  # fmt: skip

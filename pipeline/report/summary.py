@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.formatting import PAPER_METRICS, models
+from pipeline.formatting import PAPER_METRICS, TITLES, models
+from pipeline.report.figures import unseen_rows
 
 SHORT_TITLES = {
     "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F",
@@ -11,19 +12,15 @@ SHORT_TITLES = {
 MEANING = "R² of F is 1 for exact forces, and 0 for the mean force. Intervals are on the report page."
 RECORDED = "Recorded"
 LABELLED = ("accuracy_pct", "r2_f")  # metrics that are shown for methods that use labels
-CALIBRATED, REFERENCE = (
-    "universal",
-    "universal map",
-)  # names of methods that are shown start with the first prefix, but not with the second
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 
 
 def summarise(numbers: Numbers) -> list[str]:
     """Return lines with the main scores of a scene on held-out boards; no lines if the scene holds out no board."""
     data = str(numbers["provenance"]["source"]).capitalize()
-    if numbers.get("labels"):
-        title = f"{data} boards not seen in training, by number of labelled indentations:"
-        lines = [title, *_table(_rows_of_labels(numbers["labels"])), MEANING]
+    if new_boards := unseen_rows(numbers):
+        title = f"{data} boards not seen in training, by number of labelled presses:"
+        lines = [title, *_table(_rows_of_new_boards(new_boards)), MEANING]
     elif numbers.get("table2"):
         rows = _rows_of_table_2(numbers)
         paper = " (in parentheses: the paper's, on recorded boards)" if "(" in str(rows[1:]) else ""
@@ -48,20 +45,18 @@ def _rows_of_table_2(numbers: Numbers) -> list[list[str]]:
     return rows
 
 
-def _rows_of_labels(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return scores with the fewest and the most labels, of the universal models and then of the first method."""
-    scores = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
-    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
-    shown = [method for method in methods if method[0].startswith(CALIBRATED) and not method[0].startswith(REFERENCE)]
+def _rows_of_new_boards(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the scores of the in-context models with the fewest and the most labels."""
+    scores = {(row["method"], row["labels_n"]): row for row in rows}
     counts = sorted({row["labels_n"] for row in rows})
     ends = list(dict.fromkeys((counts[0], counts[-1])))
     table = [
         ["", *(cell for metric in LABELLED for cell in (SHORT_TITLES[metric], *[""] * (len(ends) - 1)))],
         ["labels:", *(str(labels_n) for _ in LABELLED for labels_n in ends)],
     ]
-    for method in list(dict.fromkeys([*shown, methods[0]])):
-        cells = [_show(scores.get((*method, labels_n), {}), metric) for metric in LABELLED for labels_n in ends]
-        table.append([method[0], *cells])
+    for method in dict.fromkeys(row["method"] for row in rows):
+        cells = [_show(scores.get((method, labels_n), {}), metric) for metric in LABELLED for labels_n in ends]
+        table.append([TITLES[method], *cells])
     return table
 
 

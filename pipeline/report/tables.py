@@ -12,17 +12,15 @@ from pipeline import scenes
 from pipeline.experiments.neglected_effects import neglected_effects_table
 from pipeline.formatting import (
     COLUMNS,
-    FORCE_METRICS,
     INTERVAL,
     PAPER_METRICS,
-    SHORT,
+    TITLES,
     Model,
     beside,
     models,
     n_of,
     reworded,
     scored,
-    scores,
     show,
     show_both,
     show_difference,
@@ -36,6 +34,7 @@ from pipeline.formatting import (
 from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
 from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.experiments import experiment_tables
+from pipeline.report.figures import unseen_rows
 from pipeline.report.protocol import protocol_table, protocols
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
@@ -165,7 +164,14 @@ SKINS_MEANING = (
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
 HELD_OUT = "model, tested on held-out boards"  # heading of the first column of a summary
-UNIVERSAL = "universal, "  # prefix of the names of methods that are calibrated to the skin
+NEW_BOARD = {
+    "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "rms_f_N": "rms error of F, N", "r2_f": "R² of F",
+    "coverage_pct": "place in 90 % interval, %", "coverage_f_pct": "force in 90 % interval, %",
+}  # fmt: skip
+DIFFERENCE = "within 1 mm, minus the shipped model (± over draws)"
+NEW_BOARD_SPREAD = "Scores are means over draws, then over boards; (a; b) are the values of the boards."
+NOLOAD_AGES = {"each": "before each press", "previous": "before the press before", "initial": "at the start"}
+CONTACT = {"false_pct": "false touches, %", "missed_pct": "missed touches, %"}
 CHECKS = {
     "subject": "subject", "law": "law", "against": "compared with", "error": "error", "tolerance": "allowed",
     "reason": "reason for the tolerance",
@@ -206,10 +212,10 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         "variants": _variants,
     }  # fmt: skip
     tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
-    if "labels" in numbers:
-        constant = numbers.get("constant_force", {}).get("labels")
-        tables["labels"] = labels_table(numbers["labels"], source, constant)
-        tables["labels_boards"] = labels_boards_table(numbers["labels"], source)
+    if "new_board" in numbers:
+        tables["new_board"] = new_board_table(numbers["new_board"], source)
+        contact = new_board_contact_table(numbers["new_board"], source)
+        tables |= {} if contact.empty else {"new_board_contact": contact}
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     if "final_model" in numbers:
@@ -254,8 +260,8 @@ def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
 def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
     """List scores by the number of training skins for each method."""
     lines = [
-        {"training skins": str(row["skins_n"]), "method": SHORT[row["method"]], "source": source} | scored(row)
-        for row in sorted(rows, key=lambda row: (row["skins_n"], list(SHORT).index(row["method"])))
+        {"training skins": str(row["skins_n"]), "method": TITLES[row["method"]], "source": source} | scored(row)
+        for row in sorted(rows, key=lambda row: (row["skins_n"], list(TITLES).index(row["method"])))
     ]
     return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
 
@@ -270,38 +276,37 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
     return tabulate(lines, meaning=TRAINING_ROWS)
 
 
-def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
-    """List scores by number of labelled indentations of the new skin; a constant predicted force, if given, is last."""
-    registered = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
-    uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
+def new_board_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List the scores on held-out boards by method, split and number of labels."""
     lines = [
-        {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
-        | scores(row["as_labelled"])
-        | scores(row["registered"], registered)
-        | scores(row["as_labelled"], uncertainty)
-        | {"n": n_of(row["as_labelled"])}
-        for row in rows
-    ]
-    if constant:
-        line = {"method": CONSTANT, "inputs": "–", "labels": "all", "source": source}
-        lines.append(line | scores(constant) | {"n": n_of(constant)})
-    return tabulate(lines, meaning=REGISTERED_MEANING)
-
-
-def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the scores on each held-out board by number of labelled indentations."""
-    lines = [
-        {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "held-out board": board}
-        | {title: f"{board_scores[metric]:.3g}" for metric, title in COLUMNS.items() if metric in board_scores}
+        {"method": TITLES[row["method"]], "split": row["split"], "unlabelled presses": row["pokes_n"]}
+        | {"labels": row["labels_n"]}
+        | {title: show(row.get(metric)) for metric, title in NEW_BOARD.items()}
+        | {DIFFERENCE: _over_draws(row.get("minus_shipped", {}).get("accuracy_pct"))}
         | {"source": source}
         for row in rows
-        for board, board_scores in row.get("by_board", {}).items()
+        if row["method"] != "contact"
     ]
-    return tabulate(
-        lines,
-        spread="The predicted positions are compared with the labels without a correction of offsets. Each score is "
-        "the mean over all networks and random draws that were tested on the board.",
-    )
+    return tabulate(lines, spread=NEW_BOARD_SPREAD)
+
+
+def _over_draws(difference: Numbers | None) -> str:
+    """Write a paired difference with its standard deviation over draws."""
+    if difference is None:
+        return "–"
+    return f"{difference['mean']:+.1f}" + (f" ± {difference['sd_draws']:.1f}" if "sd_draws" in difference else "")
+
+
+def new_board_contact_table(rows: Rows, source: str) -> pd.DataFrame:
+    """List missed and false contacts by the age of the no-load reading."""
+    lines = [
+        {"no-load reading": NOLOAD_AGES[row["split"]]}
+        | {title: show(row[metric]) for metric, title in CONTACT.items()}
+        | {"source": source}
+        for row in rows
+        if row["method"] == "contact"
+    ]
+    return pd.DataFrame(lines)
 
 
 def audit_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -539,30 +544,27 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
     return tabulate(lines, spread=SUMMARY_SPREAD)
 
 
-def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on held-out boards with the fewest and the most labels.
-
-    Methods that are calibrated to the skin come first, followed by the first method of `rows`.
-    """
-    methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
-    by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
-    counts = {row["labels_n"] for row in rows}
+def new_board_summary(numbers: Numbers) -> pd.DataFrame:
+    """Tabulate the in-context models' scores on held-out boards with the fewest and the most labels."""
+    rows = unseen_rows(numbers)
+    ends = sorted({min(row["labels_n"] for row in rows), max(row["labels_n"] for row in rows)})
+    by_method = {(row["method"], row["labels_n"]): row for row in rows}
     lines = [
-        {HELD_OUT: method}
+        {HELD_OUT: TITLES[method]}
         | {
-            f"{title}, {labels_n} labels": show(by_method.get((method, inputs, labels_n), {}).get(metric))
+            f"{title}, {labels_n} labels": show(by_method[method, labels_n].get(metric))
             for metric, title in SUMMARY_TITLES.items()
-            for labels_n in sorted({min(counts), max(counts)})
+            for labels_n in ends
         }
-        for method, inputs in dict.fromkeys([*(key for key in methods if key[0].startswith(UNIVERSAL)), methods[0]])
+        for method in dict.fromkeys(row["method"] for row in rows)
     ]
     return tabulate(lines, spread=INTERVAL)
 
 
 def summary_table(numbers: Numbers) -> pd.DataFrame | None:
     """Tabulate a scene's main scores on held-out boards; None if no board was held out."""
-    if numbers.get("labels"):
-        return labels_summary(numbers["labels"])
+    if unseen_rows(numbers):
+        return new_board_summary(numbers)
     return table_2_summary(numbers) if numbers.get("table2") else None
 
 

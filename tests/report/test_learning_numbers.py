@@ -6,6 +6,7 @@ points of a sweep.
 
 import json
 
+import pandas as pd
 import pytest
 
 from pipeline.report.numbers import (
@@ -15,7 +16,8 @@ from pipeline.report.numbers import (
     learning_numbers,
     learning_times,
 )
-from pipeline.scores import rows_of_cards
+from pipeline.scores import join, rows_of_cards, rows_of_networks
+from pipeline.statistics import as_json
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
@@ -61,8 +63,18 @@ CARDS = [
 ]  # fmt: skip
 
 
+def rows(experiment: str, points: list[dict]) -> pd.DataFrame:
+    """Return the rows of a sweep's points in the table of scores."""
+    keys = {"seed_i": "seed"}
+    named = [
+        {keys.get(key, key): value for key, value in point.items()} | {"experiment": experiment} for point in points
+    ]
+    return rows_of_networks(({key: row[key] for key in row if key != "scores"}, row["scores"]) for row in named)
+
+
 def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learning_numbers(rows_of_cards(cards, points), headline="paper")
+    table = join([rows_of_cards(cards), *(rows(name, of_sweep) for name, of_sweep in points.items())])
+    return as_json(learning_numbers(table, headline="paper"))
 
 
 def paired(of: str, over: str) -> dict:
@@ -170,33 +182,6 @@ def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
-def test_training_times_are_medians_over_networks():
-    rows = [
-        {"method": "ridge", "inputs": "raw", "name": "ridge"},
-        {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
-        {"method": "network, adapted", "inputs": "raw", "name": "long", "base": "paper"},
-        {"method": "network", "inputs": "raw", "name": "paper"},
-    ]
-
-    def timed_model(name: str, seconds: float) -> dict:
-        return {"name": name, "train_s": seconds, "one_reading_s": 1e-6 * seconds}
-
-    seconds = {
-        "train_classical": [
-            timed_model("ridge.b0", 1),
-            timed_model("ridge.b1", 2),
-            timed_model("ridge.b2", 9),
-            timed_model("ridge-shape.b0", 100),
-        ],
-        "train_triplet": [timed_model("triplet.paper.b0.seed0", 30), timed_model("triplet.other.b0.seed0", 999)],
-        "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
-    }
-    timed = learning_times({"baselines": rows}, seconds)["learning"]
-    # These are the medians of the times of each method. The last method was not timed.
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]
-    assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
-
-
 def test_times_of_adaptation_are_given_for_each_number_of_pokes():
     numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
     seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
@@ -218,26 +203,24 @@ def gains(contrast: dict) -> dict[str, float]:
 
 def test_contrasts_of_pokes_are_the_gains_of_few_many_and_additional_pokes():
     found = contrasts_of_pokes(
-        rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
+        rows("pokes", points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)}))
     )
     assert {name: (one["from_pokes_n"], one["to_pokes_n"]) for name, one in found.items()} == {
         "pokes_first": (0, 65), "pokes_gain": (0, 780), "pokes_plateau": (780, 3900),
     }  # fmt: skip
     assert gains(found["pokes_gain"]) == {"b0": 10.0, "b1": 4.0}
     assert gains(found["pokes_plateau"]) == {"b0": 1.0, "b1": -1.0}
-    assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
+    assert found["pokes_gain"]["accuracy_pct"].values == pytest.approx([10.0, 4.0])
 
 
 def test_contrasts_at_counts_that_the_sweep_does_not_contain_are_missing():
-    found = contrasts_of_pokes(
-        rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})})
-    )
+    found = contrasts_of_pokes(rows("pokes", points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
-    assert contrasts_of_pokes(rows_of_cards([], {"pokes": points("pokes_n", {0: (70, 80)})})) == {}
+    assert contrasts_of_pokes(rows("pokes", points("pokes_n", {0: (70, 80)}))) == {}
     only = points("trained_on_skins_n", {1: (50, 60)}, method="multi")
     others = [point | {"method": method} for method in ("triplet", "adapted") for point in only]
-    assert contrasts_of_sensors(rows_of_cards([], {"sensors": [*only, *others]})).keys() == {
+    assert contrasts_of_sensors(rows("sensors", [*only, *others])).keys() == {
         "sensors_adapted_over_multi", "sensors_adapted_over_triplet",
     }  # fmt: skip
 
@@ -247,12 +230,12 @@ def test_contrasts_of_sensors_are_differences_between_methods_and_numbers_of_ski
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},
     }  # fmt: skip
-    rows = [row for name, by_count in scores.items() for row in points("trained_on_skins_n", by_count, method=name)]
-    found = contrasts_of_sensors(rows_of_cards([], {"sensors": rows}))
+    swept = [row for name, by_count in scores.items() for row in points("trained_on_skins_n", by_count, method=name)]
+    found = contrasts_of_sensors(rows("sensors", swept))
     assert gains(found["sensors_more_multi"]) == {"b0": 30.0, "b1": 24.0}
     over = found["sensors_adapted_over_triplet"]
     assert [(one["skins_n"], gains(one)) for one in over] == [
         (1, {"b0": 10.0, "b1": 6.0}), (15, {"b0": 2.0, "b1": 1.0}),
     ]  # fmt: skip
     assert gains(found["sensors_gain_fewer"]) == {"b0": 8.0, "b1": 5.0}
-    assert found["sensors_gain_fewer"]["accuracy_pct"]["mean"] == 6.5
+    assert found["sensors_gain_fewer"]["accuracy_pct"].mean == 6.5

@@ -10,18 +10,30 @@ from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
 from pipeline.experiments.audit import audit_collapse
-from pipeline.scores import AS_LABELLED, KEYS, REGISTERED, by_skin, rows_of_cards, select, to_csv, whole
+from pipeline.scores import (
+    AS_LABELLED,
+    KEYS,
+    REGISTERED,
+    by_skin,
+    make_table,
+    read_scores,
+    rows_of_cards,
+    select,
+    to_csv,
+    whole,
+    write_scores,
+)  # fmt: skip
 from pipeline.statistics import (
     CONTRADICTED,
     FEW_BOARDS,
     SUPPORTED,
     UNDECIDED,
+    Stat,
     add_seed_sd,
     board_means,
     combine_verdicts,
     holm,
     interval,
-    negate,
     over_boards,
     over_folds,
     over_pairs,
@@ -81,18 +93,18 @@ def test_scores_are_averaged_over_the_seeds_of_a_fold_before_folds():
     # The squared errors of fold b0 are 0 and 4 for its two seeds. The squared error of fold b1 is 16.
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(rows_of_cards(cards))["mse_xy_mm2"]
-    assert summary["n"] == 2
-    assert summary["mean"] == pytest.approx((2 + 16) / 2)
-    assert summary["sd"] == pytest.approx(14 / 2**0.5)
-    assert summary["sd_seeds"] == pytest.approx(8**0.5)
-    assert "sd" not in over_folds(rows_of_cards(cards[:2]))["mse_xy_mm2"]
+    assert summary.n == 2
+    assert summary.mean == pytest.approx((2 + 16) / 2)
+    assert summary.sd == pytest.approx(14 / 2**0.5)
+    assert summary.sd_seeds == pytest.approx(8**0.5)
+    assert over_folds(rows_of_cards(cards[:2]))["mse_xy_mm2"].sd is None
 
 
 def test_standard_deviation_over_seeds_is_computed_within_each_board():
     rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
-    found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
-    assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
-    alone = {"accuracy_pct": {"mean": 8.0, "n": 1}}
+    found = add_seed_sd({"accuracy_pct": Stat(5.5, 2)}, rows, "board", "skin")["accuracy_pct"]
+    assert found == Stat(5.5, 2, sd_seeds=float(np.mean([2**0.5, 0])))
+    alone = {"accuracy_pct": Stat(8.0, 1)}
     assert add_seed_sd(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
@@ -123,20 +135,21 @@ def test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins():
     assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
 
-def test_score_table_written_as_csv_is_read_again():
-    points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
-                          "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
-    table = rows_of_cards([card_with_offset("b0", 1), *adapted_cards()], points)
-    assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    # The table has three parts. These are their numbers of rows, which have scores as labelled, registered, or per
-    # skin.
-    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)
-    (row,) = by_skin(select(table, question="labels")).to_dict("records")
-    assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
-    again = pd.read_csv(io.StringIO(to_csv(table)), keep_default_na=False, na_values={name: "" for name in METRICS})
-    assert again["labels_n"].iloc[-1] == "5"
-    # Tolerance: the CSV has six digits.
-    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)
+def test_table_is_equal_after_it_was_written_and_read(tmp_path):
+    cards = rows_of_cards([card_with_offset("b0", 1), *adapted_cards()])
+    # The parts are joint rows as labelled and registered, and one row per skin.
+    assert len(cards) == (2 + 3) + (2 * 6 + 12)
+    assert list(cards.columns) == [*KEYS, *METRICS]
+    swept = make_table([{"experiment": "pokes", "board": "b0", "pokes_n": 65, "accuracy_pct": 80.0, "bias_f_N": 0.5}])
+    for name, part in (("a", cards), ("b", swept)):
+        write_scores(tmp_path / name, part)
+    table = read_scores([tmp_path / "a", tmp_path / "b"])
+    pd.testing.assert_frame_equal(table[: len(cards)][list(cards)], cards)
+    row = table.iloc[-1]
+    assert (row["experiment"], row["method"], row["pokes_n"], row["bias_f_N"]) == ("pokes", "", 65, 0.5)
+    again = pd.read_csv(io.StringIO(to_csv(table)))
+    assert "draw" not in again  # columns without any value are left out
+    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)  # the CSV text has six digits
 
 
 @given(VALUES)
@@ -146,8 +159,8 @@ def test_interval_equals_students_interval_of_scipy(values):
 
 
 def test_single_value_has_no_standard_deviation():
-    assert statistic([5.0]) == statistic([5.0], boards=True) == {"mean": 5.0, "n": 1}
-    assert statistic([80.0, 90.0]) == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
+    assert statistic([5.0]) == statistic([5.0], boards=True) == Stat(5.0, 1)
+    assert statistic([80.0, 90.0]).to_json() == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
 
 
 @FEW
@@ -156,7 +169,7 @@ def test_paired_difference_equals_scipys_paired_t_test(pairs):
     stat = paired(*(board_scores([pair[side] for pair in pairs]) for side in (0, 1)))["accuracy_pct"]
     test = ttest_rel(*np.array(pairs).T)
     low, high = test.confidence_interval(0.95)
-    assert stat["ci95"] == pytest.approx([low, high], abs=DOUBLE)
+    assert stat.ci95 == pytest.approx([low, high], abs=DOUBLE)
     if abs(test.pvalue - 0.05) > 1e-6:
         assert (verdict(stat) == UNDECIDED) == (test.pvalue > 0.05)
 
@@ -167,7 +180,7 @@ def test_differences_are_averaged_over_networks_then_skins_then_boards():
     second = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # The means on the skins of b0 are 1 and 2.
     found = paired(first, second)
     assert found["by_board"] == {"b0": {"accuracy_pct": (1 + 8) / 2}, "b1": {"accuracy_pct": -4.0}}
-    assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (0.25, 2)
+    assert (found["accuracy_pct"].mean, found["accuracy_pct"].n) == (0.25, 2)
 
 
 def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str, float]:
@@ -189,21 +202,16 @@ def test_paired_difference_equals_loops_over_skins_and_seeds():
         assert {board: one[name] for board, one in found["by_board"].items()} == pytest.approx(looped)
         mean = sum(looped.values()) / 2
         sd = sum((one - mean) ** 2 for one in looped.values()) ** 0.5
-        assert found[name] == {
+        assert found[name].to_json() == {
             "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
-    assert found["mse_xy_mm2"]["mean"] < 0  # The first method has the smaller error.
+    assert found["mse_xy_mm2"].mean < 0  # The first method has the smaller error.
 
 
 def test_difference_of_a_method_from_itself_is_zero():
-    assert paired(skin_scores(), skin_scores())["accuracy_pct"] == {
-        "mean": 0.0,
-        "sd": 0.0,
-        "n": 2,
-        "values": [0.0, 0.0],
-    }
-    assert paired(skin_scores(), by_skin(rows_of_cards(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
+    assert paired(skin_scores(), skin_scores())["accuracy_pct"] == Stat(0.0, 2, 0.0, values=(0.0, 0.0))
+    assert paired(skin_scores(), by_skin(rows_of_cards(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"].n == 2
 
 
 def test_more_skins_with_equal_scores_do_not_change_the_difference():
@@ -225,9 +233,9 @@ def test_order_of_rows_does_not_change_the_difference(values, seed):
 def test_swapping_the_methods_negates_the_difference(values):
     first, second = board_scores(values), board_scores([1.0] * len(values))
     forward, backward = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
-    negated = negate(forward)
-    assert backward["ci95"] == pytest.approx(negated["ci95"], abs=DOUBLE)
-    assert backward["mean"] == pytest.approx(negated["mean"], abs=DOUBLE)
+    negated = -forward
+    assert backward.ci95 == pytest.approx(negated.ci95, abs=DOUBLE)
+    assert backward.mean == pytest.approx(negated.mean, abs=DOUBLE)
     opposite = {SUPPORTED: CONTRADICTED, CONTRADICTED: SUPPORTED, UNDECIDED: UNDECIDED}
     assert verdict(negated) == opposite[verdict(forward)]
 
@@ -236,7 +244,7 @@ def test_swapping_the_methods_negates_the_difference(values):
 @given(VALUES, st.floats(-50, 50))
 def test_comparing_values_with_a_threshold_equals_comparing_shifted_values_with_zero(values, above):
     stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
-    if min(abs(end) for end in moved["ci95"]) > DOUBLE:
+    if min(abs(end) for end in moved.ci95) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
 
 
@@ -245,7 +253,7 @@ def test_comparing_values_with_a_threshold_equals_comparing_shifted_values_with_
     [([0.1, 4.0], SUPPORTED), ([-4.0, -0.1], CONTRADICTED), ([-0.1, 4.0], UNDECIDED), ([0.0, 1.0], UNDECIDED)],
 )
 def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
-    assert verdict({"mean": 1.0, "n": 6, "ci95": ends}) == expected
+    assert verdict(Stat(1.0, 6, ci95=tuple(ends))) == expected
 
 
 @pytest.mark.parametrize(
@@ -259,18 +267,18 @@ def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
     ],
 )
 def test_verdict_on_equivalence_depends_on_the_whole_interval(ends, expected):
-    assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == expected
+    assert verdict_within(Stat(1.0, 6, ci95=tuple(ends)), 5.0) == expected
 
 
 def test_difference_on_a_single_board_has_no_verdict():
     stat = paired(score_table({"b0": [[3.0], [4.0]]}), score_table({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
-    assert stat == {"mean": 2.5, "n": 1}
-    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negate(stat)) == FEW_BOARDS
+    assert stat == Stat(2.5, 1)
+    assert verdict(stat) == verdict_within(stat, 5.0) == verdict(-stat) == FEW_BOARDS
 
 
 def test_repeats_on_one_skin_do_not_count_as_boards():
     # The number n is that of repeats on one skin, so there is no interval over boards.
-    assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
+    assert verdict(Stat(96.0, 5, 0.1), above=90.0) == FEW_BOARDS
 
 
 def test_claim_of_several_parts_is_supported_only_if_all_parts_are():
@@ -308,13 +316,13 @@ def test_interval_of_a_difference_is_wider_if_the_gain_depends_on_the_training_s
     )
     many = board_scores([80.0, 81.0, 82.0, 83.0])
     certain, uncertain = (paired_with_single(many, one)["accuracy_pct"] for one in (equal_gains, different_gains))
-    assert certain["mean"] == pytest.approx(60.0)
-    assert certain["ci95"] == pytest.approx([60.0, 60.0])  # All gains are equal, so the interval has no width.
+    assert certain.mean == pytest.approx(60.0)
+    assert certain.ci95 == pytest.approx([60.0, 60.0])  # All gains are equal, so the interval has no width.
     # The mean gain is 50 on every board. For the three training skins it is 60, 50 and 40, so the variance of the mean
     # is 100 / 3 with two degrees of freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
-    assert uncertain["ci95"] == pytest.approx([low, high])
-    assert uncertain["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
+    assert uncertain.ci95 == pytest.approx([low, high])
+    assert uncertain.p == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
     assert paired_with_single(board_scores([80.0] * 4), transfer_scores({"t0": {"b1": 79.0}}))["by_board"] == {
         "b1": {"accuracy_pct": 1.0}
     }
@@ -376,8 +384,8 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
     rows = rows_of_cards(adapted_cards())
     for name, stat in over_boards(rows).items():
         plain = over_folds(rows)[name]
-        assert stat.keys() == {"mean", "n", "sd", "values"}
-        assert [stat[key] for key in ("mean", "sd", "n")] == [plain[key] for key in ("mean", "sd", "n")]
+        assert stat.to_json().keys() == {"mean", "n", "sd", "values"}
+        assert (stat.mean, stat.sd, stat.n) == (plain.mean, plain.sd, plain.n)
         means = [
             np.mean([one["scores"]["all"][name] for one in adapted_cards() if one["fold"] == board])
             for board in ("b0", "b1")
@@ -385,16 +393,16 @@ def test_means_over_boards_equal_means_over_folds_if_each_fold_is_a_board():
         if (
             name != "r2_f"
         ):  # R^2 has a test of its own, test_score_of_a_board_is_computed_from_the_rows_of_all_its_skins.
-            assert stat["values"] == pytest.approx(means)
+            assert stat.values == pytest.approx(means)
 
 
 def test_scores_of_several_draws_are_averaged_within_each_board():
     cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
     assert over_boards(rows_of_cards(cards)) == over_boards(rows_of_cards(adapted_cards()))
     alone = over_boards(rows_of_cards([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
-    assert alone["n"] == 1
-    assert "ci95" not in alone
-    assert alone["sd_seeds"] > 0
+    assert alone.n == 1
+    assert alone.ci95 is None
+    assert alone.sd_seeds > 0
 
 
 def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins():
@@ -407,15 +415,13 @@ def test_number_of_transfer_scores_is_that_of_pairs_of_training_and_test_skins()
         scores = score_groups(true, true + rng.normal(0, 2, true.shape), boards, skins)
         cards.append(card("transfer", fold, scores))
     stat = over_pairs(rows_of_cards(cards))["mse_xy_mm2"]
-    assert (stat["n"], stat["training_n"], stat["boards_n"]) == (3 * 8, 3, 4)
+    assert (stat.n, stat.training_n, stat.boards_n) == (3 * 8, 3, 4)
     table = pd.DataFrame(
         [[np.mean([one["scores"]["by_skin"][f"{board}_s{i}"]["mse_xy_mm2"] for i in range(2)]) for board in tested]
          for one in cards]
     )  # fmt: skip
-    assert stat["ci95"] == pytest.approx(
-        t_interval(float(table.to_numpy().mean()), *two_way_error(table), "mse_xy_mm2")
-    )
-    assert stat["ci95"][0] > 0
+    assert stat.ci95 == pytest.approx(t_interval(float(table.to_numpy().mean()), *two_way_error(table), "mse_xy_mm2"))
+    assert stat.ci95[0] > 0
 
 
 def test_experiment_transfer_tests_each_skin_on_the_same_rows_as_experiment_lobo():
