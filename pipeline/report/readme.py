@@ -182,9 +182,7 @@ def blocks_of(
         "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
         "time": "Not timed yet. Run `make time-repro`." if times is None else _time(times),
         "costs": to_markdown(costs_table([*results, *recorded])),
-        "new_board": "
-
-".join(_tables(each, NEW_BOARD) for each in recorded if "new_board" in each) or NONE_YET,
+        "new_board": "\n\n".join(_tables(each, NEW_BOARD) for each in recorded if "new_board" in each) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
         "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
