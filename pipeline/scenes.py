@@ -120,9 +120,12 @@ class Scene(Strict, extra="allow"):
         return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
 
     def named_file(self, experiment: str) -> str:
-        """Return the path of the file that is given in the settings of an experiment, relative to the checkout."""
+        """Return the path of the file that is given in the settings of an experiment, relative to the checkout.
+
+        If none is given, this is `params.yaml`, on which the experiment depends in any case.
+        """
         entry = EXPERIMENTS[experiment]
-        return str((self.model_extra or {})[entry.stage].get(entry.file, ""))
+        return str((self.model_extra or {})[entry.stage].get(entry.file) or PARAMS)
 
     @property
     def unused(self) -> list[str]:

@@ -13,10 +13,8 @@ from reskin.recordings.header import NAME, NAME_RULE
 from reskin.universal.layout import FOLDER, BoardLayout, paper_layout, read_layout
 from reskin.universal.model import FILE
 
-POOL_MAX_N = (
-    40  # largest number of indentations of a held-out skin for calibration; scene lab also uses at most 40 labels
-)
-LABELS_N = (0, 5, 10, 20, 40)
+PRESSES_MAX_N = 65  # largest number of unlabelled presses of a held-out skin, as in scene lab
+LABELS_N = (0, 1, 10, 20, 40)
 SHIPPED = str(FILE.relative_to(Path(__file__).parents[2]))
 TEMPLATE = """\
 # Scene {scene}: leave-one-board-out on boards {boards}. Written by `reskin new`; docs/parameters.md explains the keys.
@@ -30,39 +28,9 @@ selection:
 split:
   transfer_skins_n: {transfer_n} # experiment transfer trains networks on one skin each; number of their boards
 {pool_passes}\
-  labels_pool_n: {pool_n} # indentations of a held-out skin for calibration, with or without labels; not tested
-  labels_draws_n: 1 # random draws of these indentations; more draws take longer and make the scores more precise
 train_single: {{recipe: paper, steps_n: 3000, seeds_n: 1, variants: {{}}}}
 train_multi: {{recipe: paper, steps_n: 3000, seeds_n: 3, variants: {{}}}}
 train_triplet: {{recipe: triplet, steps_n: 3000, seeds_n: 3, variants: {{}}}}
-{adapt}\
-few_labels:
-  labels_n: {labels_n}
-  recipe: paper
-  steps_n: 3000
-  recipes: # each entry lists the settings that differ from the recipe that is named above
-    network: {{}}
-    network-shape: {{inputs: shape}}
-  adapted: []
-  adapting: {{adaptation: paper, steps_n: 300}}
-  labelling: {{labelling: few, steps_n: 300}}
-  rows_max_n: 20000
-  methods: few-labels
-{about_model}\
-calibrated:
-  model: {model}
-  labels_n: {labels_n}
-  even: false # true if the places are a grid around the board's centre, and each is pressed equally often
-audit: # optional: similar_skins, weak_skins
-  settings: chosen
-compare:
-  labels_mirrored: false # true if the y axis of the labels is opposite to the y axis of the board
-  memory: 0.065 # part of a field change that remains in the next no-load reading; assumed, as in scene lab
-  # The layout of your boards: all experiments that simulate skins or use the universal model refer to it.
-  layout:{layout}
-"""
-POOL_PASSES = "  pool_passes_n: 1 # the first pass of each held-out skin is for adaptation; it is not tested\n"
-ADAPT = """\
 adapt:
   adaptation: paper
   base: paper # recipe of section train_triplet whose networks are adapted
@@ -70,11 +38,23 @@ adapt:
   pokes_n: {pokes_n} # unlabelled indentations: those of the first pass
   variants:
     control: {{unlabelled_weight: 0.0}} # equally many steps, but without the new skin's indentations
+new_board:
+  presses_n: [{presses_n}] # unlabelled presses of a new board
+  labels_n: {labels_n} # presses with a known place and force; 1 is a press in the middle of the skin
+  draws_n: 4 # random draws of these presses; more draws take longer and make the scores more precise
+{about_model}\
+  model: {model}
+audit: # optional: similar_skins, weak_skins
+  settings: chosen
+compare:
+  labels_mirrored: false # true if the y axis of the labels is opposite to the y axis of the board
+  # The layout of your boards: all experiments that simulate skins or use the in-context model refer to it.
+  layout:{layout}
 """
+POOL_PASSES = "  pool_passes_n: 1 # the first pass of each held-out skin is for adaptation; it is not tested\n"
 ABOUT_MODEL = """\
-# Experiment calibrated tests a universal model for the layout below. To run it, make the model:
-#   reskin model make --layout {file} --out {model}
-# and add calibrated to the list of experiments.
+  # To test an in-context model for the layout below, make it, and name its file here:
+  #   reskin model make --layout {file} --out {scene}.safetensors
 """
 ONE_BOARD = (
     "two or more boards are needed, because one board cannot be held out and also be trained on. To train on the "
@@ -134,17 +114,17 @@ def scene_text(
     """Return the text of the scene's file; see `new`."""
     given = paper_layout() if layout is None else read_layout(layout)
     fits, adapted = layout is not None and is_shipped(given), passes_n > 1
-    model = SHIPPED if fits else f"{scene}.safetensors"
-    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "labels", "audit"]
+    experiments = ["transfer", "lobo", "triplet", *["adapt"] * adapted, "audit"]
     # Experiment compare compares recorded fields with simulated fields.
     experiments += ["compare"] * (source == "recorded")
-    pool_n = min(POOL_MAX_N, presses_n * passes_n // 2)
+    unlabelled_n = min(PRESSES_MAX_N, presses_n * passes_n // 3)
     return TEMPLATE.format(
         scene=scene, source=source, boards=", ".join(boards),
-        experiments=", ".join(experiments + ["calibrated"] * fits),
-        transfer_n=max(1, len(boards) // 2), pool_n=pool_n, pool_passes=POOL_PASSES if adapted else "",
-        adapt=ADAPT.format(pokes_n=presses_n) if adapted else "", labels_n=[n for n in LABELS_N if n <= pool_n],
-        model=model, about_model="" if fits else ABOUT_MODEL.format(file=f"{SCENES}/{scene}.yaml", model=model),
+        experiments=", ".join([*experiments, "new_board"]),
+        transfer_n=max(1, len(boards) // 2), pool_passes=POOL_PASSES if adapted else "", pokes_n=presses_n,
+        presses_n=unlabelled_n, labels_n=[n for n in LABELS_N if n <= unlabelled_n],
+        model=SHIPPED if fits else "null",
+        about_model="" if fits else ABOUT_MODEL.format(file=f"{SCENES}/{scene}.yaml", scene=scene),
         layout=_layout_text(layout, scene),
     )  # fmt: skip
 
@@ -171,11 +151,6 @@ def _next_steps(file: Path, scene: str, layout: str | None, experiments: Sequenc
     steps = [f"wrote {file}"]
     if "adapt" not in experiments:
         steps.append("experiment adapt is left out, because it needs two or more passes over each skin (--passes 2)")
-    if "calibrated" not in experiments:
-        steps.append(
-            "experiment calibrated is left out, because it needs a universal model for your layout; a comment in the "
-            "scene's file says how to make this model"
-        )
     add = f"reskin add BOARD_SKIN.csv ... --layout table --scene {scene}"
     if source == "simulated":
         add = f"reskin add captures/BOARD_SKIN ... --layout capture --scene {scene}"
