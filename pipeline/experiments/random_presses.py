@@ -10,7 +10,7 @@ had put the weight there.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,14 +18,13 @@ from jaxtyping import Bool, Float, Int64
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
 from pipeline.formatting import show, tabulate
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic
-from pipeline.training.universal import FORCE_MIN_N, WAYS, coverage
-from pipeline.training.universal_variants import KnownBoards, Variants, read_variants
+from pipeline.training.recorded import RecordedBoards, read_boards
+from pipeline.training.shipping import coverage
 from reskin.config import Strict
 from reskin.errors import SchemaError
 from reskin.metrics import ACCURACY_LIMIT_MM, interval_score
@@ -39,7 +38,7 @@ from reskin.universal.calibration import (
     variance_inflations,
 )
 from reskin.universal.force import NORMAL_90, ForceLine, prior_line
-from reskin.universal.map import Estimate
+from reskin.universal.map import FORCES_N, Estimate, new_map
 from reskin.universal.model import (
     Evaluation,
     HeldOutLabels,
@@ -57,8 +56,17 @@ MIDDLE_MM = 1.0  # a press is in the middle of the skin if |x| and |y| are below
 CHECKERBOARD, HALVES = "places without labels (checkerboard)", "half of the skin without labels"
 # Names of the random streams. They are earlier names of the two ways, which are kept so that results do not change.
 STREAMS = {CHECKERBOARD: "other colour of a checkerboard", HALVES: "other half of the skin"}
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
+FORCE_MIN_N = float(FORCES_N[0])  # labelled presses with smaller forces are set to this force
 WEIGHT = "weight"
 NEAREST = "nearest label"
+
+
+class Variants(NamedTuple):
+    """The shipped model, and for each held-out board the model that was made from the other boards."""
+
+    nominal: PriorModel
+    rig: Mapping[str, PriorModel]
 
 
 class RandomPresses(Strict):
@@ -119,12 +127,15 @@ class Draw:
     tested: Int64[np.ndarray, " t"]
 
 
-def random_presses(
-    settings: Settings, section: RandomPresses, indentations: Path, folds: Path, models: Path, results: Path
-) -> None:
+def random_presses(settings: Settings, section: RandomPresses, indentations: Path, models: Path, results: Path) -> None:
     """Score the universal model on every held-out board, with presses and labels at random places."""
-    known = read_known_boards(settings, indentations, folds)
-    variants, powers = read_variants(known, models), load_universal().powers
+    known, shipped = read_boards(settings, indentations), load_universal()
+    rig = {board: load_universal(file=models / f"{board}.safetensors") for board in known.presses}
+    powers, (nominal, *of_rig) = (
+        shipped.powers,
+        [PriorModel(new_map(model.tables, model.residual), model.networks) for model in (shipped, *rig.values())],
+    )
+    variants = Variants(nominal, dict(zip(rig, of_rig, strict=True)))
     rows: list[dict[str, Any]] = []
     for board in known.presses:
         presses = board_presses(known, board)
@@ -140,9 +151,9 @@ def mean_by(group: Int64[np.ndarray, " f"], values: Float[np.ndarray, "f c"]) ->
     return sums / np.bincount(group)[:, None]
 
 
-def board_presses(known: KnownBoards, board: str) -> BoardPresses:
+def board_presses(known: RecordedBoards, board: str) -> BoardPresses:
     """Return the presses of a board that have a force."""
-    rows, frame = known.data.rows, known.frame
+    rows, frame = known.rows, known.axes
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     press_i = np.unique(rows.indentation[own], return_inverse=True)[1]
     place_mm, force_N = frame.place(rows.target[own, :2].astype(float)), rows.target[own, 2].astype(float)
@@ -193,7 +204,7 @@ def score_draw(
             tested = board.readings[draw.tested]
             where = {"board": board.board, "tested": split, "presses_n": presses_n, "draw_i": draw_i}
             for way, variant in {"rig": variants.rig[board.board], "nominal": variants.nominal}.items():
-                model = calibrate(variant.model, board, draw)
+                model = calibrate(variant, board, draw)
                 for labels, name in label_sets(board, draw, section.labels_n if presses_n == most_n else (0,)):
                     scored = model.score(labels, tested, powers, presses_n)
                     rows.append(where | {"method": f"universal, {WAYS[way]}", "labels": name} | scored)

@@ -57,7 +57,6 @@ audit: # optional: similar_skins, weak_skins
   settings: chosen
 compare:
   labels_mirrored: false # true if the y axis of the labels is opposite to the y axis of the board
-  memory: 0.065 # part of a field change that remains in the next no-load reading; assumed, as in scene lab
   # The layout of your boards: all experiments that simulate skins or use the universal model refer to it.
   layout:{layout}
 """

@@ -32,7 +32,6 @@ TABLES = (
     "flexible",
     "single_sensor",
 )  # tables of simulated scenes that docs/results.md shows
-COMPARED = ("compare", "compare_parameters", "compare_frames")
 MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
 NONE_YET = "None yet."
 COSTS_MEANING = (
@@ -197,7 +196,7 @@ def blocks_of(
         "time": "Not timed yet. Run `make time-repro`." if times is None else _time(times),
         "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
-        "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
+        "compare": "\n\n".join(_tables(numbers, ("compare",)) for numbers in compared) or NONE_YET,
         "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pipeline.training.universal_variants import Variant, Variants
 from sklearn.metrics import mean_squared_error, median_absolute_error, r2_score
 
 from pipeline.experiments.random_presses import (
@@ -23,7 +24,6 @@ from pipeline.experiments.random_presses import (
     summarise_rows,
     tables,
 )
-from pipeline.training.universal_variants import Variant, Variants
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
 from reskin.universal.batches import SkinPrior
