@@ -20,20 +20,21 @@ STAGES = {
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
     "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
-    "universal": ("few_labels", "universal", "calibrated"),
+    "universal": ("few_labels", "calibrated"),
+    "rig": ("rig",),
     "report": ("table2", "report", "publish"),
 }
 MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
 EXPERIMENTS_PACKAGE = "pipeline.experiments"
-Kind = Literal["models", "curve", "analysis", "study", "report"]
+Kind = Literal["models", "files", "curve", "analysis", "study", "report"]
 
 
 class Experiment(Strict):
     """An experiment that scenes can run, and its requirements for a scene.
 
-    kind: what the stage writes. `models`: networks with JSON cards. `curve`: points of a curve. `analysis`: numbers,
-    figure data and capture losses. `study`: numbers only. `report`: nothing, because the report stage computes it.
-    Each analysis or study is a module of `pipeline.experiments`.
+    kind: what the stage writes. `models`: networks with JSON cards. `files`: model files that other experiments score.
+    `curve`: points of a curve. `analysis`: numbers, figure data and capture losses. `study`: numbers only. `report`:
+    nothing, because the report stage computes it. Each analysis or study is a module of `pipeline.experiments`.
     stage: the DVC stage that runs the experiment.
     key: the name of the results in numbers.json; it stays the same if the experiment is renamed.
     needs: other experiments that the scene must also run.
@@ -100,7 +101,7 @@ def _learning(
         folds=folds,
         settings=settings,
         recorded=True,
-        scores=kind != "report",
+        scores=kind in ("models", "curve"),
         reads=reads,
         file=file,
     )
@@ -123,7 +124,7 @@ LEARNING = (
     ),
     _learning("baselines", "curve", "train_classical", needs=("lobo",)),
     _learning("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n")),
-    _learning("universal", "curve", "universal", needs=("labels", "compare")),
+    _learning("rig", "files", "rig", reads=("compare",)),
     _learning("calibrated", "curve", "calibrated", needs=("labels",), reads=("compare",), file="model"),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip

@@ -212,16 +212,16 @@ def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
 
 def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
     """Warn if chips, labels or skin seem to be oriented differently from section `compare` of the scene."""
-    from pipeline.experiments.compare import (
-        Compare,
-        find_departure,  # imported here, because importing the physics takes seconds
-    )
+    # imported here, because importing the physics takes seconds
+    from pipeline.training.recorded import Compare
     from reskin.physics.skin import SkinDesign
+    from reskin.universal.frames import find_departure
 
     _, blocks, _ = open_capture(folder, policy)
     section = settings.section(Compare, "compare")
     try:
-        sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
+        axes = section.axes(config.parse(SkinDesign, skin, "nominal.yaml: skin"))
+        sentence = find_departure(list(blocks), axes)
     except ReskinError as error:
         sentence = f"The orientation of labels, chips and skin was not compared with the scene's settings: {error}"
     if sentence:

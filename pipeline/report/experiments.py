@@ -32,7 +32,8 @@ def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.D
     """Make the tables of every experiment with results in numbers.json; return them by name."""
     tables: dict[str, pd.DataFrame] = {}
     for key, module in _modules(numbers).items():
-        tables |= module.tables(numbers[key], source)
+        if hasattr(module, "tables"):
+            tables |= module.tables(numbers[key], source)
     return tables
 
 

@@ -34,12 +34,8 @@ LOOK = {
     "stated tolerance.",
     "population_scaling.svg": "Look at the right end of the lines: if they still fall there, more simulated training "
     "skins would reduce the errors further.",
-    "compare_arrows.svg": "If the arrows in the recorded row and in the simulated row have the same directions, the "
-    "simulation describes the board well.",
     "compare_growth.svg": "If the recorded and the simulated points lie on each other, the field grows with the force "
     "in the simulation as it does on the board.",
-    "compare_touch.svg": "For forces smaller than those of the recorded presses (on the left), there are only "
-    "simulations, which differ from each other. Recordings of light touches would show which of them is right.",
     "recorded_limits.svg": "A press above the line of a threshold is detected. The lightest press that would be "
     "detected is where an extrapolated line crosses the threshold.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "

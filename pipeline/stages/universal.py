@@ -1,19 +1,15 @@
-"""Stages few_labels, universal and calibrated: score methods on held-out boards, for different numbers of labels.
+"""Stages few_labels and calibrated: score methods on held-out boards, for different numbers of labels.
 
-A label is a press of the held-out board whose place and force are known. All three stages use the same folds and test
+A label is a press of the held-out board whose place and force are known. Both stages use the same folds and test
 rows, so that their scores can be compared.
 """
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.experiments.compare import Compare
-from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import read_captures
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -22,17 +18,9 @@ from pipeline.training.calibrated import Calibrated, Frame, read_model, rest_by_
 from pipeline.training.calibrated import score_fold as score_calibrated
 from pipeline.training.few_labels import FewLabels
 from pipeline.training.jobs import SceneData, collapse_record, read_data, score_test, train_jobs, training_data
-from pipeline.training.universal import (
-    EXPERIMENT,
-    Benchmark,
-    calibrate_on_boards,
-    calibrate_on_simulated,
-    score_fold,
-)
-from pipeline.training.universal_variants import make_variants, write_networks
+from pipeline.training.recorded import Compare
 from reskin import io
 from reskin.models.classical import run_classical_jobs
-from reskin.universal.batches import TrainingSettings
 
 
 def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
@@ -80,38 +68,7 @@ def calibrated(
     frame = Frame(compare.labels_middle_mm, compare.labels_mirrored)
     rest_uT = rest_by_skin(read_captures(indentations, tuple(settings.captures_in(indentations))))
     points = []
-    for fold in data.folds_of(EXPERIMENT):
+    for fold in data.folds_of(few.EXPERIMENT):
         points += score_calibrated(data, fold, universal_model, frame, rest_uT, section)
         say(f"{settings.scene} calibrated: {fold.name} done")
-    io.write_json(scores, points)
-
-
-class UniversalSection(TrainingSettings):
-    """Settings of stage universal: section `universal` of a scene's file.
-
-    The section consists of training settings and of `labels_n`, the numbers of labelled presses of the held-out board
-    for which the model is scored.
-    """
-
-    labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-
-
-def universal(
-    settings: Settings, section: UniversalSection, indentations: Path, folds: Path, models: Path, scores: Path
-) -> None:
-    """Train the universal model, and score it on every held-out board, for every number of labels.
-
-    The test rows are those of `few_labels`. Four methods are scored. The universal model can estimate with its map (a
-    probabilistic model of one skin) alone, or with map and networks together. Both are scored in two variants: variant
-    `rig` is made with the other boards of the rig, and variant `nominal` is made from simulated skins alone.
-    """
-    known = read_known_boards(settings, indentations, folds)
-    variants = make_variants(known, section)
-    write_networks(models, variants, section, settings.seed)
-    nominal_powers = calibrate_on_simulated(variants.nominal, section.labels_n, settings.seed)
-    benchmark, points = Benchmark(known, variants.nominal, {}, nominal_powers), []
-    benchmark = replace(benchmark, board_powers=calibrate_on_boards(benchmark, section.labels_n))
-    for fold in known.data.folds_of(EXPERIMENT):
-        points += score_fold(benchmark, fold, variants.rig, section.labels_n)
-        say(f"{settings.scene} universal: {fold.name} done")
     io.write_json(scores, points)

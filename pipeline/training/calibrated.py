@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from pydantic import Field
 
 from pipeline.settings import Settings
 from pipeline.training.jobs import SceneData, score_test
-from pipeline.training.universal import pool_rows
 from reskin.config import Strict
-from reskin.data.splits import Fold
+from reskin.data.splits import Fold, labelling_order
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 from reskin.universal.force import NORMAL_90
@@ -138,3 +137,9 @@ def _calibrate(
         b_uT = rest_uT + np.array([db_uT for db_uT, _ in labelled])
         calibrated.label(frame.convert(target[:, :2]), force_N, b_uT)
     return calibrated
+
+
+def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
+    """Return the rows of each press in a fold's pool, in the order in which experiment `labels` adds labels."""
+    indentation = data.rows.indentation[fold.pool]
+    return [fold.pool[indentation == press] for press in labelling_order(data.rows, fold, data.settings.seed)]

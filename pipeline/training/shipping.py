@@ -2,44 +2,45 @@
 
 Command `reskin model make` makes a model for a user's own board. Command `python -m pipeline.training.shipping` makes
 the model that comes with the project. It takes a few minutes, and writes reskin/universal/universal.safetensors and the
-card of the model. The networks are trained with the settings and the seed of scene lab. The report of scene lab
-contains the scores of this model under the name `universal, simulated alone`. Likelihood powers (exponents that set how
-wide the stated intervals are) are chosen on simulated skins.
+card of the model. The networks are trained with the settings (section `rig`) and the seed of scene lab, but without
+its recordings. Likelihood powers (exponents that set how wide the stated intervals are) are chosen on simulated skins.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
-from pipeline.training.universal import (
-    AS_TRAINED,
-    CALIBRATION_ERRORS,
-    CALIBRATION_SKINS_N,
-    NOMINAL_POWERS,
-    best_powers,
-    coverage,
-    draw_prior_skins,
-    split_presses,
-)
 from reskin.config import parse, read_yaml
 from reskin.errors import ParamsError, require
-from reskin.universal.batches import NOMINAL_NAME, SkinPrior, TrainingSettings
-from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
+from reskin.seeds import rng_for
+from reskin.universal.batches import (
+    ERROR_OF_NOMINAL,
+    NOMINAL_NAME,
+    NOISE_uT,
+    SkinPrior,
+    TrainingSettings,
+    add_error,
+)
+from reskin.universal.calibration import LabelledPresses, LikelihoodPowers, lower_by_misfit, lower_by_residuals
+from reskin.universal.force import NORMAL_90
 from reskin.universal.layout import BoardLayout, as_layout, paper_layout, read_layout
-from reskin.universal.map import tabulate
+from reskin.universal.map import Estimate, tabulate
 from reskin.universal.model import FILE, Universal, write
 from reskin.universal.network import FULL_SET_N
-from reskin.universal.population import Population
+from reskin.universal.population import PLACES_N, Population, draw_population
 
 # Numbers of unlabelled presses for which likelihood powers are chosen. `reskin live` asks users for 12 presses.
 PRESSES_N = (0, 12, FULL_SET_N)
 # Pairs of a number of presses, and whether the presses are spread evenly over the skin.
 PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))
+LABELS_N = (0, 5, 10, 20, 40)  # numbers of labels for which likelihood powers are chosen
+# Candidate likelihood powers, for a skin on which the misfit of the map is 1.
+NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "source": "simulated",
@@ -73,13 +74,97 @@ MADE = {
 }
 
 
+# Number of skins that are simulated with each of CALIBRATION_ERRORS, to choose likelihood powers.
+CALIBRATION_SKINS_N = 24
+
+LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns field changes with errors of the law added
+
+
+def law_error(scale: float = 1.0) -> LawError:
+    """Return a function that adds random errors of the law to field changes.
+
+    The law is the physical model of a skin, from which the map is computed. The errors are `scale` times as large as in
+    the training of the model.
+    """
+    least, most = ERROR_OF_NOMINAL
+
+    def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
+        return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (scale * least, scale * most), rng)
+
+    return add
+
+
+# Sizes of two errors that the map does not model, and that calibration presses hardly reveal.
+# - MEMORY_MAX: largest fraction of an earlier press's field change that remains in the no-load reading. In the
+#   recordings of scenes lab and eflesh, 5 to 8 % were measured.
+# - DIFFERENCE_MAX: largest scale of the random relative difference between equal presses. The value is assumed. The
+#   difference has heavy tails; its median length over 15 channels is 1.4 times the scale.
+MEMORY_MAX, DIFFERENCE_MAX = 0.15, 0.3
+HEAVY_TAILS = 3  # degrees of freedom of Student's t
+
+
+def unmodelled_error(scale: float = 1.0) -> LawError:
+    """Return a function that adds three kinds of errors to field changes.
+
+    - Errors of the law, which are `scale` times as large as in training.
+    - Memory: a fraction of another press's field change remains. For each skin, this fraction is drawn uniformly from 0
+      to `MEMORY_MAX`.
+    - Differences between equal presses. For each skin, their size is drawn uniformly from 0 to `DIFFERENCE_MAX`.
+    """
+    add_law_error = law_error(scale)
+
+    def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
+        db_uT = add_law_error(skins, rng)
+        skins_n, presses_n, channels_n = db_uT.shape
+        other = rng.permuted(np.tile(np.arange(presses_n), (skins_n, 1)), axis=1)
+        memory = rng.uniform(0, MEMORY_MAX, (skins_n, 1, 1)) * np.take_along_axis(db_uT, other[..., None], axis=1)
+        size_uT = np.linalg.norm(db_uT, axis=2, keepdims=True) / np.sqrt(channels_n)
+        difference = rng.uniform(0, DIFFERENCE_MAX, (skins_n, 1, 1)) * rng.standard_t(HEAVY_TAILS, db_uT.shape)
+        return (db_uT - memory + size_uT * difference).astype(np.float32)
+
+    return add
+
+
+# Errors of the simulated skins on which likelihood powers are chosen, by name. The names also select the random
+# streams.
+AS_TRAINED = "further"
+CALIBRATION_ERRORS = {AS_TRAINED: unmodelled_error(), "further, missed twice": unmodelled_error(2.0)}
+
+
+def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
+    """Simulate skins drawn from a prior, with noise and errors of the law in their field changes."""
+    rng = rng_for(seed, "universal", prior.name, name)
+    skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng, prior.forces)
+    db_uT = error(skins, rng).reshape(skins.db_uT.shape)
+    sd_uT = np.tile(np.array(NOISE_uT), skins.rest_uT.shape[1] // len(NOISE_uT))
+    return replace(skins, db_uT=(db_uT + sd_uT * rng.standard_normal(skins.db_uT.shape)).astype(np.float32))
+
+
+def split_presses(skins: Population, i: int, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
+    """Split the presses of a simulated skin at random into a pool for calibration and test presses."""
+    order = rng_for(seed, "universal", "pool", i).permutation(skins.db_uT.shape[1])
+    parts = (skins.place_mm, skins.force_N, skins.db_uT)
+    presses = LabelledPresses(*(part[i][order].astype(float) for part in parts))
+    return presses[:PLACES_N], presses[PLACES_N:]
+
+
+def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
+    """Return the fraction of true coordinates that are inside the 90 % intervals of the estimate."""
+    return float((np.abs(estimate.place_mm - place_mm) <= NORMAL_90 * estimate.sd_mm).mean())
+
+
+def best_power(candidates: Sequence[float], coverages: Sequence[Float[np.ndarray, " t"]]) -> float:
+    """Choose the power for which the coverage of 90 % intervals, averaged over skins, is closest to 90 %."""
+    return candidates[int(np.abs(np.mean(coverages, axis=0) - 0.9).argmin())]
+
+
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
     """Choose the likelihood powers of a model, for each number of presses and labels.
 
     The chosen powers are those for which the 90 % intervals have a coverage of 90 % on simulated skins. They are valid
     for a skin with a misfit of 1. On any other skin, the power is divided by the misfit of this skin.
     """
-    by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
+    by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, " t"]]] = {}
     for name, error in CALIBRATION_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
         for i in range(len(skins)):
@@ -87,7 +172,7 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
                 for n in labels_n if name == AS_TRAINED else [n for n in labels_n if n]:
                     tested = calibrate(model, skins, i, (presses_n, n), even=even, seed=seed)
                     by_setting.setdefault((presses_n, even, n), []).append(_coverages(model, *tested))
-    best = {key: best_powers(NOMINAL_POWERS, of_skins).combined for key, of_skins in by_setting.items()}
+    best = {key: best_power(NOMINAL_POWERS, of_skins) for key, of_skins in by_setting.items()}
     anywhere = {presses_n: {n: best[presses_n, False, n] for n in labels_n} for presses_n in PRESSES_N}
     return LikelihoodPowers(anywhere, {n: best[FULL_SET_N, True, n] for n in labels_n})
 
@@ -115,15 +200,11 @@ def calibrate(
 
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
-) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each likelihood power.
-
-    The result has two equal columns, because `best_powers` expects one column for the map and one for the combination.
-    """
+) -> Float[np.ndarray, " t"]:
+    """Return the coverage of 90 % intervals for each likelihood power in `NOMINAL_POWERS`."""
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
-    covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
-    return np.column_stack([covered, covered])
+    return np.array([coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)])
 
 
 @dataclass(frozen=True)
@@ -140,11 +221,10 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml"), layout: BoardLay
     """Read a scene's training settings, for skins on the board of a layout (by default, the paper's)."""
     board = layout or paper_layout()
     settings = read_yaml(scene)
-    training = {name: settings["universal"][name] for name in TrainingSettings.model_fields}
     return Inputs(
         SkinPrior(NOMINAL_NAME, board.law, board.all_spreads, board.setup(), forces=board.forces),
-        parse(TrainingSettings, training, f"{scene}: universal"),
-        tuple(settings["universal"]["labels_n"]),
+        parse(TrainingSettings, settings["rig"], f"{scene}: rig"),
+        LABELS_N,
         settings["seed"],
     )
 

@@ -66,6 +66,7 @@ from reskin.universal.map import (
     Estimate,
     Likelihoods,
     MapEvaluator,
+    Residual,
     SkinMap,
     Tables,
     begin_day,
@@ -123,6 +124,7 @@ OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")
 SAME_SLIDE_LOG_ODDS_MIN = 2.0
 # Fields of `Tables` that model files do not contain, because the model card determines them.
 UNSTORED = ("names", "area")
+RESIDUAL = tuple(field.name for field in fields(Residual))  # each is stored as `residual.<name>`
 CHOICE_EVERY_N = 3  # to propose the next labelled press, only every third place of the lattice is considered
 
 
@@ -537,6 +539,7 @@ class Universal:
     layout : the board and the skin that the model was made for
     card : model card, which states how the model was trained and what it must not be used for
     external_uT : expected size of external fields (see `load_universal`)
+    residual : predicted errors of the law, for a model that was made with other boards of the same rig; otherwise None
     """
 
     tables: Tables
@@ -545,6 +548,7 @@ class Universal:
     layout: BoardLayout = field(default_factory=paper_layout)
     card: Mapping[str, Any] = field(default_factory=dict)
     external_uT: float = 0.0
+    residual: Residual | None = None
 
     def __post_init__(self) -> None:
         """Start without any calibration data; raise SchemaError if `external_uT` is out of range."""
@@ -559,7 +563,7 @@ class Universal:
         self._centre_mm = np.array(self.layout.centre_mm)
         # Matrix that converts readings along the chips' axes to the board's axes. Each estimate needs it.
         self._board_from_chips = self.layout.to_board(np.eye(self.channels_n))
-        self._prior_map = new_map(self.tables, external_cov=self.external_cov)
+        self._prior_map = new_map(self.tables, self.residual, self.external_cov)
         self._noload_map: SkinMap
         self._data: CalibrationData
         # `_last` is the calibration to the earlier days. For each press of the current day, `_press_odds` (presses at
@@ -1096,7 +1100,8 @@ def load_universal(
     SchemaError : a file is damaged, `external_uT` is not from 0 to `EXTERNAL_MAX_uT`, or `new_day` is set without a
         calibration
     """
-    model = Universal(*_read_parts(Path(file)), external_uT=external_uT)
+    tables, networks, powers, layout, card, residual = _read_parts(Path(file))
+    model = Universal(tables, networks, powers, layout, card, external_uT, residual)
     if calibration is not None:
         return model.remember(calibration, new_day=new_day)
     if new_day:
@@ -1122,7 +1127,9 @@ def _format_of(card: Any) -> str:
 
 
 @lru_cache(maxsize=2)
-def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers, BoardLayout, Mapping[str, Any]]:
+def _read_parts(
+    file: Path,
+) -> tuple[Tables, Sequence[Weights], LikelihoodPowers, BoardLayout, Mapping[str, Any], Residual | None]:
     card_file = file.with_suffix(".json")
     if file.is_file() and not card_file.is_file():
         problem = f"{file}: its model card {card_file.name} is missing. Copy the card to the same folder"
@@ -1138,13 +1145,18 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     map_arrays = {
         field.name: parts.pop(field.name).astype(float) for field in fields(Tables) if field.name not in UNSTORED
     }
+    of_residual = {name: parts.pop(key) for name in RESIDUAL if (key := f"residual.{name}") in parts}
+    residual = None
+    if of_residual:
+        noise = float(of_residual.pop("noise"))
+        residual = Residual(**{name: values.astype(float) for name, values in of_residual.items()}, noise=noise)
     layout = as_layout(card["layout"], f"{card_file}: layout")
     tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.places)
     if len(tables.rest_uT) != layout.channels_n:
         chips_n, remedy = len(tables.rest_uT) // 3, "Use the card that was written with the model."
         raise SchemaError(card_file, "layout", f"of {chips_n} chips", f"{len(layout.chips)} chips", remedy)
     powers = LikelihoodPowers.from_card(card["sureness" if form == FORMAT_3 else "likelihood_powers"])
-    return tables, network.from_tensors(parts), powers, layout, card
+    return tables, network.from_tensors(parts), powers, layout, card, residual
 
 
 def write(
@@ -1154,14 +1166,18 @@ def write(
     layout: BoardLayout,
     about: Mapping[str, Any],
     file: Path = FILE,
+    residual: Residual | None = None,
 ) -> None:
     """Write a universal model to a file, and its model card to a JSON file of the same name.
 
-    The model file contains the prior of the map (in single precision) and the networks. The card contains the items of
+    The model file contains the prior of the map (in single precision), the networks and, if it is given, the residual,
+    which predicts errors of the law (in single precision). The card contains the items of
     `about`, the layout, the likelihood powers, and the spreads of the parameters.
     """
     names = [field.name for field in fields(tables) if field.name not in UNSTORED]
     map_arrays = {name: getattr(tables, name).astype(np.float32) for name in names}
+    if residual is not None:
+        map_arrays |= {f"residual.{name}": np.asarray(getattr(residual, name), np.float32) for name in RESIDUAL}
     io.write_tensors(file, map_arrays | network.to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
     own = layout.model_dump(mode="json")

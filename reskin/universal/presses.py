@@ -4,12 +4,11 @@ The statistics are:
 
 - the cosine of the angle between recorded and simulated field changes;
 - the fraction of the recorded field change that the simulation explains;
-- the growth of the field change with force;
-- the memory of the skin, which is the fraction of the field change of a press that remains after the press.
+- the growth of the field change with force.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,11 +17,6 @@ from jaxtyping import Bool, Float, Int
 from reskin.errors import SchemaError
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-# The drift of the no-load reading over a capture is described by a polynomial of this degree. In scene lab, the
-# estimated memory is 10 % smaller with degree 8 and 50 % smaller with degree 12, because such polynomials also fit a
-# part of the memory.
-DRIFT_DEGREE = 4
-SERIES_MIN_N = 20  # captures with fewer presses are not used to estimate the memory
 # If a capture has more depths than this, the depths were arbitrary, so only few presses have the same depth.
 DEPTHS_MAX_N = 10
 SPREAD_MIN = 0.2  # places with a smaller range of the logarithm of the force are not used to estimate the growth
@@ -93,6 +87,26 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
         place_mm=place_mm[known], force_N=force_N[known], db_uT=db_uT[known], noload_uT=noload_uT[known],
         noise_uT=_noise_uT(var_uT2), excluded_n=int((~known).sum()), forces_known=forces_known,
     )  # fmt: skip
+
+
+def pool_skins(captures: Sequence[Readings], *, with_force: bool = True) -> dict[str, RecordedPresses]:
+    """Combine the captures of each skin (see `pool`).
+
+    The keys of the result are names of boards, or `board/skin` for boards with several skins.
+    """
+    skins: dict[str, list[Readings]] = {}
+    for capture in captures:
+        skins.setdefault(f"{capture.board}/{capture.skin}", []).append(capture)
+    boards = [name.partition("/")[0] for name in skins]
+    names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
+    return {names[name]: pool(captures_of_skin, with_force=with_force) for name, captures_of_skin in skins.items()}
+
+
+def thin(presses: RecordedPresses, most_n: int) -> RecordedPresses:
+    """Select at most `most_n` presses, evenly distributed over the recording."""
+    kept = np.unique(np.linspace(0, len(presses) - 1, most_n).round().astype(int))
+    names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
+    return replace(presses, **{name: getattr(presses, name)[kept] for name in names})
 
 
 def _noise_uT(var_uT2: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "3"]:
@@ -168,27 +182,3 @@ def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float
         if np.ptp(x) > SPREAD_MIN:
             slopes.append(float(x @ y / (x @ x)))
     return float(np.median(slopes)) if slopes else None
-
-
-def memory(
-    presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]
-) -> float | None:
-    """Return the fraction of the field change of a press that remains in the next no-load reading.
-
-    In each capture, a linear regression explains the no-load readings by three terms: the field change of the previous
-    press, the field change of the next press, and a polynomial in time, which describes the drift. The result is the
-    coefficient of the previous press, averaged over captures. A capture is skipped if it is too short, or if it does
-    not have a new no-load reading before each press. The result is None if all captures are skipped.
-    """
-    coefficients = []
-    for capture_i in np.unique(presses.capture_i):
-        own = np.flatnonzero(presses.capture_i == capture_i)
-        rest = noload_uT[own].reshape(len(own), -1)
-        if len(own) < SERIES_MIN_N or (np.diff(rest, axis=0) == 0).all(axis=1).any():
-            continue  # the capture is too short, or has no new no-load reading before some press
-        drift = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(own) - 1), DRIFT_DEGREE)
-        db = db_uT[own].reshape(len(own), -1)
-        residuals = [part - drift @ np.linalg.lstsq(drift, part)[0] for part in (rest[1:], db[:-1], db[1:])]
-        rest_change, own_db, next_db = (residual.ravel() for residual in residuals)
-        coefficients.append(np.linalg.lstsq(np.stack([own_db, next_db], axis=1), rest_change)[0][0])
-    return float(np.mean(coefficients)) if coefficients else None

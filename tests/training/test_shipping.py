@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-
-from pipeline.training import shipping
-from pipeline.training.shipping import calibrate, calibrate_powers, read_inputs
 from pipeline.training.universal import (
     NOMINAL_POWERS,
     Powers,
@@ -12,6 +9,9 @@ from pipeline.training.universal import (
     estimate,
     lower_by_labels,
 )
+
+from pipeline.training import shipping
+from pipeline.training.shipping import calibrate, calibrate_powers, read_inputs
 from reskin.seeds import rng_for
 from reskin.universal.batches import SkinPrior
 from reskin.universal.calibration import LikelihoodPowers

@@ -5,8 +5,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-
-from pipeline.training import universal
 from pipeline.training.universal import (
     NOMINAL_POWERS,
     PoolCalibration,
@@ -29,6 +27,8 @@ from pipeline.training.universal_variants import (
     recorded_board,
     write_networks,
 )
+
+from pipeline.training import universal
 from reskin import io
 from reskin.data.rows import Rows
 from reskin.seeds import rng_for
