@@ -20,7 +20,6 @@ STAGES = {
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
     "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
-    "universal": ("few_labels", "calibrated"),
     "rig": ("rig",),
     "report": ("table2", "report", "publish"),
 }
@@ -123,9 +122,7 @@ LEARNING = (
         settings=False,
     ),
     _learning("baselines", "curve", "train_classical", needs=("lobo",)),
-    _learning("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n")),
     _learning("rig", "files", "rig", reads=("compare",)),
-    _learning("calibrated", "curve", "calibrated", needs=("labels",), reads=("compare",), file="model"),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
 from reskin.data.splits import Split
 from reskin.errors import ParamsError, did_you_mean
-from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recipe, Schedule
+from reskin.models.recipe import AdaptationRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
@@ -45,7 +45,6 @@ SharedRow = dict[str, Any]  # a row without `steps_n`, which each scene sets
 SHARED_ROWS: dict[str, type[Schedule]] = {
     "recipes": Recipe,
     "adaptations": AdaptationRecipe,
-    "labellings": FineTuningRecipe,
 }
 Source = Literal["simulated", "recorded"]
 
@@ -205,7 +204,6 @@ class Shared(Strict):
     faults: FaultPolicy
     recipes: dict[Name, SharedRow]
     adaptations: dict[Name, SharedRow]
-    labellings: dict[Name, SharedRow]
     methods: dict[Name, dict[Name, SharedRow]]
 
 

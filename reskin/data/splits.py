@@ -15,7 +15,6 @@ from jaxtyping import Int64, Shaped
 from pydantic import Field, field_validator
 
 from reskin.config import Strict
-from reskin.data.lines import take_pokes
 from reskin.data.rows import Rows
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
@@ -46,9 +45,6 @@ class Split(Strict):
     sensors_draws_n: Count | None = None
     # Number of passes of each held-out skin that adaptation may use. These are the first passes of the skin.
     pool_passes_n: Count | None = None
-    # Number of indentations of each held-out skin that may be labelled.
-    labels_pool_n: Count | None = None
-    labels_draws_n: Count | None = None
 
     @field_validator("sensors_skins_n")
     @classmethod
@@ -63,7 +59,7 @@ class Fold:
     """A split of the rows of a dataset into training rows, test rows and a pool.
 
     `train`, `test` and `pool` are row numbers in `Rows`. The pool contains those rows of held-out skins that may be
-    used for adaptation or as labels. No method is tested on the pool, not even a method that does not use it, so that
+    used for adaptation. No method is tested on the pool, not even a method that does not use it, so that
     all methods are tested on the same rows.
     """
 
@@ -72,19 +68,6 @@ class Fold:
     train: Int64[np.ndarray, " a"]
     test: Int64[np.ndarray, " b"]
     pool: Int64[np.ndarray, " c"]
-
-    @property
-    def board(self) -> str:
-        """Name of the held-out board. This property is defined only for folds of experiment `labels`."""
-        return self.name.rpartition(DRAW)[0]
-
-    @property
-    def draw_i(self) -> int:
-        """Number of the random draw of the pool, counted from 0.
-
-        This property is defined only for folds of experiment `labels`.
-        """
-        return int(self.name.rpartition(DRAW)[2])
 
 
 NO_POOL = np.zeros(0, np.int64)
@@ -170,43 +153,6 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
                 name = f"{board}-{skins_n:02d}skins{DRAW}{draw_i}" if skins_n < len(skins) else str(board)
                 folds.append(hold_out_skins(rows, "sensors", name, (train, held), split))
     return folds
-
-
-def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Make folds that hold out a board as in experiment `lobo`, and that have a random pool of its indentations.
-
-    The pool contains the indentations that may be labelled. The whole pool is excluded from the test rows, even if only
-    a part of it is labelled, so that the test rows are the same for all numbers of labels. There is one fold for each
-    combination of board and random draw.
-    """
-    assert split.labels_pool_n is not None
-    assert split.labels_draws_n is not None
-    without_pool = split.model_copy(update={"pool_passes_n": None})
-    folds = []
-    for board_fold in leave_one_board_out(rows, without_pool, seed):
-        skins = np.unique(rows.skin[board_fold.test])
-        for draw_i in range(split.labels_draws_n):
-            pools = []
-            for skin in skins:
-                on_skin = board_fold.test[rows.skin[board_fold.test] == skin]
-                rng = rng_for(seed, "labels", str(skin), draw_i)
-                pools.append(take_pokes(rows, on_skin, split.labels_pool_n, rng))
-            pool = np.sort(np.concatenate(pools))
-            test = np.setdiff1d(board_fold.test, pool)
-            if not len(test):
-                what, rule = "split.labels_pool_n", "less than the number of indentations per skin"
-                remedy = "Reduce split.labels_pool_n in the scene, or record more indentations of each skin."
-                raise ParamsError(f"fold labels/{board_fold.name}", what, rule, split.labels_pool_n, remedy)
-            folds.append(Fold("labels", f"{board_fold.name}{DRAW}{draw_i}", board_fold.train, test, pool))
-    return folds
-
-
-def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled.
-
-    To label n indentations, use the first n.
-    """
-    return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
@@ -350,7 +296,6 @@ def _check_disjoint(rows: Rows, fold: Fold) -> None:
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
     "lobo": leave_one_board_out,
     "sensors": fewer_sensors,
-    "labels": few_labels,
     "transfer": one_skin_to_others,
     "single_temporal": last_passes,
     **{experiment: partial(within_first_skin, experiment=experiment) for experiment in WITHIN_SKIN},

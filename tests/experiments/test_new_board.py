@@ -52,11 +52,12 @@ def make_board(seed: int = 1) -> Board:
     """Return a board whose skin was pressed twice at each place of the grid, with two readings per press."""
     place_mm = np.repeat(grid() + MIDDLE_MM, 2, axis=0)
     depth_mm = np.tile([0.6, 1.0], len(place_mm) // 2)
-    noload_uT, b_uT, force_N = reskin.simulate_pokes(
+    before_uT, pressed_uT, force_N = reskin.simulate_pokes(
         reskin.draw_skin(seed=seed), np.column_stack([place_mm, depth_mm]), board=reskin.draw_board(seed=seed)
     )
-    presses, press_i = Presses(place_mm, force_N, b_uT), np.repeat(np.arange(len(place_mm)), 2)
-    return Board(f"b{seed}", f"b{seed}_s0", noload_uT.ravel(), presses, presses[press_i], press_i, press_i, MIDDLE_MM)
+    noload_uT = before_uT.mean(axis=0, dtype=float)
+    presses, press_i = Presses(place_mm, force_N, noload_uT + pressed_uT - before_uT), np.repeat(np.arange(len(place_mm)), 2)
+    return Board(f"b{seed}", f"b{seed}_s0", noload_uT, presses, presses[press_i], press_i, press_i, MIDDLE_MM)
 
 
 def case_of(board: Board, labels: np.ndarray, tested: np.ndarray) -> Case:
