@@ -195,19 +195,15 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
 
 
 def _warn_of_small_pool(header: Header, scene: Scene, counts: Counts) -> None:
-    """Warn if the first capture of a skin has too few passes or indentations for section `split` of the scene."""
-    for what, have_n, key in (
-        ("passes", counts.passes_n, "pool_passes_n"), ("indentations", counts.indentations_n, "labels_pool_n")
-    ):  # fmt: skip
-        pool_n = getattr(scene.split, key)
-        if pool_n is not None and have_n <= pool_n:
-            column = "fill in column pass of the file (needed if the order of places differs between passes), "
-            say(
-                f"warning: capture {header.capture} has {have_n} {what}, but with split.{key}: {pool_n} the scene "
-                f"needs more than {pool_n} {what} of each skin. Add further recordings of skin {header.skin}, "
-                f"{column if (what, header.layout) == ('passes', 'table') else ''}or reduce split.{key} in the "
-                "scene's file."
-            )
+    """Warn if the first capture of a skin has too few passes for setting `split.pool_passes_n` of the scene."""
+    pool_n = scene.split.pool_passes_n
+    if pool_n is not None and counts.passes_n <= pool_n:
+        column = "fill in column pass of the file (needed if the order of places differs between passes), "
+        say(
+            f"warning: capture {header.capture} has {counts.passes_n} passes, but with split.pool_passes_n: {pool_n} "
+            f"the scene needs more than {pool_n} passes of each skin. Add further recordings of skin {header.skin}, "
+            f"{column if header.layout == 'table' else ''}or reduce split.pool_passes_n in the scene's file."
+        )
 
 
 def _warn_of_departures(folder: Path, settings: Settings, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
