@@ -12,7 +12,6 @@ from typing import Any
 import pandas as pd
 
 from pipeline import FLOW
-from pipeline.benchmark import entries
 from pipeline.catalogue import module_name
 from pipeline.formatting import tabulate, to_markdown
 from pipeline.paper import TABLE_2, TABLE_2_ROWS
@@ -40,7 +39,6 @@ COSTS_MEANING = (
     "another. By default, two training runs run at the same time, so less time passes. Column collapsed counts the "
     "training runs whose network had a nearly constant output; they were repeated."
 )
-BENCHMARK = "benchmark"
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # simulated scenes on the pages; README.md shows only HEADLINE
 # The scene that tests the shipped universal model, and the name of the model in this scene.
@@ -101,7 +99,6 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
     before = {str(page): page.read_text(encoding="utf-8") for page in pages}
     blocks = blocks_of(results, recorded, read_yaml(root / FLOW)["stages"], times)
-    blocks |= entries.blocks(entries.read_entries(root / BENCHMARK), numbers.get("lab", {}))
     after = fill(before, blocks)
     changed = [page for page in after if after[page] != before[page]]
     for page in changed if write else ():
