@@ -46,7 +46,6 @@ LOOK = {
     "detected is where an extrapolated line crosses the threshold.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
     "places is still high.",
-    "worlds.svg": "If the lines in a column are steep, the factor of this column changes the scores much.",
     "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "inference.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "

@@ -53,7 +53,6 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "touches",
     "moving_hand",
     "population",
-    "worlds",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
 # The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
