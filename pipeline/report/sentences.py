@@ -34,8 +34,6 @@ LOOK = {
     "during a reading.",
     "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
     "stated tolerance.",
-    "population_scaling.svg": "Look at the right end of the lines: if they still fall there, more simulated training "
-    "skins would reduce the errors further.",
     "compare_arrows.svg": "If the arrows in the recorded row and in the simulated row have the same directions, the "
     "simulation describes the board well.",
     "compare_growth.svg": "If the recorded and the simulated points lie on each other, the field grows with the force "

@@ -31,7 +31,6 @@ from pipeline.formatting import (
     tabulate,
     three_digits,
     to_markdown,
-    universal_rows,
 )
 from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
 from pipeline.report.checklist import checklist, claims_table
@@ -530,7 +529,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 def table_2_summary(numbers: Numbers) -> pd.DataFrame:
     """Tabulate the main scores on held-out boards, with the paper's means in parentheses."""
     lines = []
-    for model, row in [*universal_rows(numbers), *table_2_rows(numbers).values()]:
+    for model, row in table_2_rows(numbers).values():
         line = {HELD_OUT: model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")}
         for metric, title in COLUMNS.items():
             paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""

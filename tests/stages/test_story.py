@@ -52,7 +52,6 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "recorded_limits",
     "touches",
     "moving_hand",
-    "population",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
 # The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
