@@ -236,7 +236,7 @@ def fetch(
     source: Annotated[
         str | None,
         Argument(
-            help="Name of a set of recordings: lab, ini, eflesh, eflash7 or leaphand. Default: nothing is fetched, and "
+            help="Name of a set of recordings: lab, ini, eflesh or leaphand. Default: nothing is fetched, and "
             "all sets are described."
         ),
     ] = None,

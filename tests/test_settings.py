@@ -76,7 +76,7 @@ def test_settings_of_all_stages_with_a_section_are_tested():
 
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
 def test_params_in_dvc_yaml_cover_the_settings_that_a_stage_reads(stage):
-    scenes = ("ci", "lab", "eflash7", "hand")
+    scenes = ("ci", "lab", "hand")
     scene = next((one for one in scenes if scene_runs(one, stage)), None)
     of_scene = NEW_SCENE if scene is None else read_settings(scene, ROOT).of_scene
     scene_mapping, shared_mapping = RecordingMapping(of_scene), RecordingMapping(read_shared_files(ROOT))

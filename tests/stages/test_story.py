@@ -50,7 +50,6 @@ EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "random_presses",
     "mounting",
     "recorded_limits",
-    "touches",
     "moving_hand",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
