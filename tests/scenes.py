@@ -65,7 +65,6 @@ SECTIONS |= {
             "training": TRAINING,
         },
     },
-    "contacts": {"contacts": {"pairs_n": 10, "separations_mm": [8.0], "false_alarm_fraction": 0.05}},
 }  # fmt: skip
 # Settings in section `split` that each experiment needs.
 SPLIT_SETTINGS: dict[str, dict[str, object]] = {

@@ -75,7 +75,6 @@ def scene(*experiments: str, **changes: object) -> Scene:
         ("labels", ("lobo",)),
         ("audit", ("lobo",)),
         ("choice", ADAPTED),
-        ("contacts", ("lobo",)),
     ],
 )
 def test_missing_required_experiment_is_an_error(experiment, others):

@@ -149,7 +149,7 @@ SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_P
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
-WHOLE = {"contacts", "neglected_effects"}  # These experiments depend on the whole section `simulate` and all terms.
+WHOLE = {"neglected_effects"}  # This experiment depends on the whole section `simulate` and all terms.
 WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
@@ -160,17 +160,17 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
     (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime", "bound"}),
     (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient", "bound"}),
     (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),
-    (SCENE, "split.pool_passes_n=2", {"split", "flexible", "contacts"}),
+    (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
     (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *WHOLE}),
     (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", *WHOLE}),
     (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper", *WHOLE}),
     (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS | WHOLE),
-    (SCENE, "train_single.steps_n=10", {"train_single", "contacts"}),
-    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient", "contacts"}),
-    (SCENE, "adapt.steps_n=4", {*ADAPTING, "contacts"}),
-    (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes", "contacts"}),
-    (SCENE, "shear.repeats_n=1", {"shear", "contacts"}),
-    (SCENE, "runtime.repeats_n=2", {"runtime", "contacts"}),
+    (SCENE, "train_single.steps_n=10", {"train_single"}),
+    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient"}),
+    (SCENE, "adapt.steps_n=4", {*ADAPTING}),
+    (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes"}),
+    (SCENE, "shear.repeats_n=1", {"shear"}),
+    (SCENE, "runtime.repeats_n=2", {"runtime"}),
 ]
 
 

@@ -61,14 +61,7 @@ def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
         {"pokes": str(row["pokes_n"]), "adaptation, s": _time(row, "seconds"), "source": source} | scored(row)
         for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
     ]
-    references = [
-        {"method": row["method"], "time until ready, s": _time(row, "train_s")}
-        | {"per reading, µs": _time(row, "inference_us"), "source": source}
-        | scored(row)
-        for row in runtime.get("rivals_costs", [])
-        if "train_s" in row
-    ]
-    lines = {"learning": methods, "adaptation": adaptations, "rivals_costs": references}
+    lines = {"learning": methods, "adaptation": adaptations}
     tables = {name: tabulate(lines[name]) for name in lines if name in runtime}
     timed = [name for name in STUDIES if any("median_s" in row for row in runtime.get(name, []))]
     tables |= {name: study_table(runtime[name], source) for name in timed}

@@ -55,7 +55,6 @@ TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt
 NETWORKS = {
     METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN
 }  # name of the experiment, by name of the method
-OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
 # For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
@@ -128,13 +127,6 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
         for row in numbers["sweep_pokes"]:
             times_s = [training["train_s"] for training in timed if f".{row['pokes_n']}pokes." in training["name"]]
             joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
-    if "rivals" in numbers:
-        timed = seconds.get("reference_methods", [])
-        joined["rivals_costs"] = [
-            {"method": row["method"]} | row[AS_LABELLED] | _median_times(timed, f"{row['method']}.")
-            for row in numbers["rivals"]["methods"]
-            if row["pokes"] == OWN_POKES
-        ]
     return joined
 
 

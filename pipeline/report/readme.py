@@ -1,4 +1,4 @@
-"""Write the generated blocks of README.md and docs, the figure of README.md, and what the live page shows.
+"""Write the generated blocks of README.md and docs, and the figure of README.md.
 
 Everything is made from the results in `reports/`.
 """
@@ -15,7 +15,7 @@ from pipeline import FLOW
 from pipeline.catalogue import module_name
 from pipeline.formatting import tabulate, to_markdown
 from pipeline.paper import TABLE_2, TABLE_2_ROWS
-from pipeline.report.figures import TESTED, mean_force_errors, readable, unseen_boards, unseen_rows
+from pipeline.report.figures import mean_force_errors, readable, unseen_boards, unseen_rows
 from pipeline.report.numbers import join
 from pipeline.report.tables import make_tables, skins_table
 from pipeline.scenes import ANALYSES
@@ -41,9 +41,7 @@ COSTS_MEANING = (
 )
 TIMES = "reports/time.json"  # written by `make time-repro`
 FULL_SIZE, HEADLINE = "paper", "quick"  # simulated scenes on the pages; README.md shows only HEADLINE
-# The scene that tests the shipped universal model, and the name of the model in this scene.
-SHIPPED_SCENE, SHIPPED_NAME = "lab", "universal, simulated alone"
-MEASURED = "reskin/universal/measured.json"  # results of this model that the live page shows
+SHIPPED_SCENE = "lab"  # the scene that tests the shipped universal model
 # What README.md shows of the paper's table 2, and of presses at random places of recorded boards (scene lab). Each
 # metric has a title and a number of decimals.
 SIMULATED_METRICS = {"accuracy_pct": ("within 1 mm, %", 0), "mse_f_N2": ("MSE_F, N²", 2)}
@@ -70,7 +68,7 @@ RECORDED_METRICS = {
 RECORDED_MEANING = (
     "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2), over {draws_n} draws of "
     "presses and labels. In all columns, the model is first calibrated to {presses_n} presses without labels. {halves} "
-    "The mean force as estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
+    "The mean force as estimate would give an R² of 0 and an error of {constant} N."
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
@@ -105,51 +103,12 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
         io.write_text(Path(page), after[page])
     if SHIPPED_SCENE in numbers:
         shipped = numbers[SHIPPED_SCENE]
-        file, measured = root / MEASURED, measured_of(shipped)
-        if not file.exists() or io.read_json(file) != measured:
-            changed.append(str(file))
-            if write:
-                io.write_json(file, measured)
         file, figure = root / FIGURE, unseen_boards(shipped, shipped["provenance"]["source"], large=True)
         if not file.exists() or file.read_text(encoding="utf-8") != figure:
             changed.append(str(file))
             if write:
                 io.write_text(file, figure)
     return changed, [result["provenance"]["scene"] for result in (*results, *recorded)]
-
-
-def measured_of(numbers: Numbers) -> dict[str, Any]:
-    """Return the results of the shipped universal model that the live page shows (`reskin.live.used_model.Measured`).
-
-    Scores of places are for presses at random places. The places are coloured like the squares of a checkerboard.
-    Labels are at places of one colour, and tests are at places of the other colour.
-    """
-
-    def by_board(row: Numbers) -> dict[str, list[float]]:
-        return {name: row[name]["values"] for name in ("accuracy_pct", "median_mm", "mse_xy_mm2")}
-
-    limits = numbers["recorded_limits"]
-    places = [
-        {"presses_n": 0, "labels_n": 0} | by_board(row)
-        for row in limits["registration"]["rows"]
-        if (row["method"], row["presses_n"], row["known"]) == (SHIPPED_NAME, 0, "not used")
-    ] + [
-        {"presses_n": row["presses_n"], "labels_n": int(row["labels"])} | by_board(row)
-        for row in numbers["random_presses"]["rows"]
-        if (row["method"], row["tested"]) == (SHIPPED_NAME, TESTED) and row["labels"].isdecimal()
-    ]
-    detection = [
-        row
-        for row in limits["detection"]["rows"]
-        if (row["baseline"], row["rule"]) == ("before each press", "as in reskin live")
-    ]
-    columns = {"lightest_N": "smallest_N", "detected_pct": "detected_pct", "false_alarm_pct": "false_alarm_pct"}
-    return {
-        "scene": numbers["provenance"]["scene"],
-        "source": numbers["provenance"]["source"],
-        "places": sorted(places, key=lambda row: (row["presses_n"], row["labels_n"])),
-        "detection": {name: [row[column] for row in detection] for name, column in columns.items()},
-    }
 
 
 def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
@@ -232,7 +191,6 @@ def _recorded(numbers: Numbers) -> str:
     meaning = RECORDED_MEANING.format(
         scene=provenance["scene"], code=provenance["trained"], presses_n=unseen[0]["presses_n"],
         draws_n=numbers["random_presses"]["draws_n"], halves=_halves(numbers), constant=_mean_force_error(unseen[0]),
-        touch=_touches(numbers),
     )  # fmt: skip
     return f"{_unpadded(to_markdown(tabulate(lines)))}\n\n{meaning}"
 
@@ -266,29 +224,6 @@ def _halves(numbers: Numbers) -> str:
         return ""
     of_presses = f"{' and '.join(shown)} of the presses on the other half are within 1 mm"
     return f"With all 40 labels on one half of the skin, {of_presses}."
-
-
-def _touches(numbers: Numbers) -> str:
-    """State the range of forces, and how many touches are missed or reported without cause, by age of the baseline."""
-    detection = numbers.get("recorded_limits", {}).get("detection", {})
-    by_baseline: dict[str, list[Numbers]] = {}
-    for row in detection.get("rows", ()):
-        if row["rule"] == "as in reskin live":
-            by_baseline.setdefault(row["baseline"], []).append(row)
-    if not by_baseline:
-        return ""
-    missed = max(100 - row["detected_pct"] for rows in by_baseline.values() for row in rows)
-    false = []
-    for baseline, rows in by_baseline.items():
-        rates = [f"{row['false_alarm_pct']:.0f}" for row in rows]  # in the order of the boards
-        false.append(f"{baseline}, {rates[0] if len(set(rates)) == 1 else ' and '.join(rates)} %")
-    ranges = " and ".join(f"{law['force_min_N']:.1f} to {law['force_max_N']:.1f} N" for law in detection["laws"])
-    share = f"at most {missed:.2g} %" if missed else "none"
-    return (
-        f"Forces of the presses: {ranges}. With the threshold of the live page, {share} of these presses are "
-        f"missed. False touches depend on when the no-load reading was taken: {'; '.join(false)}. So take a new "
-        "no-load reading often (key z on the live page)."
-    )
 
 
 def _unpadded(table: str) -> str:

@@ -28,8 +28,6 @@ LOOK = {
     "exist, or estimates a wrong force.",
     "ambient.svg": "Where a line falls, the estimates become worse because of a magnetic field that appeared after the "
     "no-load reading.",
-    "contacts.svg": "A model of single contacts estimates only one place for two contacts. Look how far apart two "
-    "contacts must be before they are detected as two.",
     "dynamics.svg": "If the errors are larger for shorter presses (on the left), the cause is the motion of the tip "
     "during a reading.",
     "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
@@ -40,8 +38,6 @@ LOOK = {
     "in the simulation as it does on the board.",
     "compare_touch.svg": "For forces smaller than those of the recorded presses (on the left), there are only "
     "simulations, which differ from each other. Recordings of light touches would show which of them is right.",
-    "recorded_limits.svg": "A press above the line of a threshold is detected. The lightest press that would be "
-    "detected is where an extrapolated line crosses the threshold.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
     "places is still high.",
     "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",

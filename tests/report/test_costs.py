@@ -23,7 +23,6 @@ from pipeline.report.costs import (
     trade_off,
     trade_off_points,
 )
-from pipeline.report.numbers import learning_times
 from reskin.physics.magnet import DEFAULT_QUADRATURE
 from tests.report.synthetic import cost, texts_of
 
@@ -304,15 +303,3 @@ def test_cost_tables_have_dashes_for_methods_that_were_not_timed():
     assert tables["learning"]["training, s"].tolist() == ["0.0123", "–"]
     assert tables["learning"]["per reading, µs"].tolist() == ["4.56", "–"]
     assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
-
-
-def test_table_gives_times_and_errors_of_reference_methods():
-    methods = [
-        {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
-        for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))
-    ]
-    took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
-    found = learning_times({"rivals": {"methods": methods}}, {"reference_methods": took})
-    (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
-    assert (line["method"], line["accuracy, %"]) == ("map", "40.00 ± 0.10")
-    assert (line["time until ready, s"], line["per reading, µs"]) == ("3", "50")

@@ -126,7 +126,7 @@ def test_lost_bytes_and_rows_are_counted_for_each_protocol():
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
         "variation": wear,  # This experiment uses the captures of `drift`, which are counted once.
         "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
-        "contacts": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
+        "ambient": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
     }
     found = lost_by_protocol(losses)
     assert set(found) == {"wear", "drag"}

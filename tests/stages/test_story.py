@@ -42,14 +42,12 @@ LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
-RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
+RANDOM = ("drift", "manual", "ambient")  # experiments with random draws
 # Scene ci runs all experiments except these, which need recordings or many skins.
 EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
-    "reference_methods",
     "random_presses",
     "mounting",
-    "recorded_limits",
     "moving_hand",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
