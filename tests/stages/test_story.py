@@ -47,7 +47,6 @@ RANDOM = ("drift", "manual", "ambient")  # experiments with random draws
 EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
     "random_presses",
-    "mounting",
     "moving_hand",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
