@@ -189,7 +189,7 @@ def test_each_protocol_is_simulated_and_ingested_by_stages_of_its_own(tmp_path):
     root = simulated_checkout(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages
-    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
     # The log of an SD card has no probe log.
     assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}

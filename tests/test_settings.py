@@ -143,22 +143,22 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
             (root / file).write_bytes(content)
 
 
-FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
 WHOLE = {"neglected_effects"}  # This experiment depends on the whole section `simulate` and all terms.
-WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # They read the boards and few protocols.
+WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime"}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
     (PARAMS, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
-    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime", "bound"}),
-    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient", "bound"}),
+    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime"}),
+    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient"}),
     (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
     (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *WHOLE}),

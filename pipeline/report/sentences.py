@@ -28,8 +28,6 @@ LOOK = {
     "exist, or estimates a wrong force.",
     "ambient.svg": "Where a line falls, the estimates become worse because of a magnetic field that appeared after the "
     "no-load reading.",
-    "dynamics.svg": "If the errors are larger for shorter presses (on the left), the cause is the motion of the tip "
-    "during a reading.",
     "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
     "stated tolerance.",
     "compare_arrows.svg": "If the arrows in the recorded row and in the simulated row have the same directions, the "

@@ -185,7 +185,7 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
     assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"bound", "drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"drift", "variation", "manual"}
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 
