@@ -18,7 +18,7 @@ FOLDER = Path(__file__).parent / "experiments"
 STAGES = {
     "simulate": ("simulate",),
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
-    "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
+    "train": ("train_single", "train_multi", "train_triplet", "adapt"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
     "universal": ("few_labels", "universal", "calibrated"),
     "report": ("table2", "report", "publish"),
@@ -118,7 +118,6 @@ LEARNING = (
         "sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n"),
         settings=False,
     ),
-    _learning("baselines", "curve", "train_classical", needs=("lobo",)),
     _learning("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n")),
     _learning("universal", "curve", "universal", needs=("labels", "compare")),
     _learning("calibrated", "curve", "calibrated", needs=("labels",), reads=("compare",), file="model"),

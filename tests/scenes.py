@@ -49,10 +49,9 @@ SECTIONS: dict[str, dict[str, object]] = {
         "few_labels": {
             "labels_n": [0], "recipe": "paper", "steps_n": 1, "recipes": {"network": {}}, "adapted": [],
             "adapting": {"adaptation": "paper", "steps_n": 1}, "labelling": {"labelling": "few", "steps_n": 1},
-            "rows_max_n": 10, "methods": "all",
+            "rows_max_n": 10, "methods": "tiny",
         },
     },
-    "baselines": {"train_classical": {"rows_max_n": 10, "methods": "all"}},
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
 }  # fmt: skip

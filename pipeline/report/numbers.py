@@ -14,7 +14,6 @@ from pipeline.paper import PLATEAU_POKES_N
 from pipeline.scenes import EXPERIMENTS, TABLE_2
 from pipeline.statistics import (
     AS_LABELLED,
-    METHODS,
     REGISTERED,
     by_skin,
     differences,
@@ -51,10 +50,6 @@ PAPERS_SPLITS = (
 # Splits in which the readings of an indentation, or of a pass, are never divided between training and test.
 STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}
 SWEPT = ("multi", "triplet", "adapted")
-TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
-NETWORKS = {
-    METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN
-}  # name of the experiment, by name of the method
 # For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
@@ -117,10 +112,8 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of methods with their training times on this machine, if these were measured."""
+    """Join the errors after adaptation with the times of adaptation on this machine, if these were measured."""
     joined: dict[str, Any] = {}
-    if "baselines" in numbers:
-        joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
     if "sweep_pokes" in numbers:
         timed = seconds.get("sweep_pokes", [])
         joined["adaptation"] = []
@@ -191,10 +184,8 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
-    """Summarise sweeps over pokes, training skins and labels, and classical methods."""
-    pokes, sensors, classical, labels = (
-        select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
-    )
+    """Summarise sweeps over pokes, training skins and labels."""
+    pokes, sensors, labels = (select(table, question=name) for name in ("pokes", "sensors", "labels"))
     labels = pd.concat([labels, *(select(table, question=name) for name in ("calibrated", "universal"))])
     numbers: dict[str, Any] = {}
     if len(pokes):
@@ -207,10 +198,6 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
             for n, group in _groups(select(sensors, method=method), "trained_on_skins_n")
         ]
         numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(sensors)
-    if len(classical):
-        networks = select(table[table["question"].isin(list(TRAINED_IN))], architecture="paper")
-        networks = networks[networks["recipe"] != CONTROL]
-        numbers["baselines"] = list(_methods(pd.concat([networks, classical])))
     if len(labels):
         numbers["labels"] = list(_labels(labels))
     return numbers
@@ -260,15 +247,6 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     return adapted | more | {"sensors_gain_fewer": counts_n | summarise_differences(gain_few - gain_many)}
 
 
-def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Summarise the scores of each recipe of each experiment over boards."""
-    for (_, recipe), group in _groups(rows, ["question", "recipe"], sort=False):
-        first = group.iloc[0]
-        names = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
-        names |= {"base": first["base"]} if first["base"] else {}
-        yield {**names, "rows_n": int(first["trained_on_rows_n"]), **over_boards(group)}
-
-
 def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """Summarise the scores of each method over boards, by number of labels."""
     for (method, inputs), group in _groups(rows, ["method", "inputs"], sort=False):
@@ -290,29 +268,6 @@ def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
 def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Iterator[tuple[Any, pd.DataFrame]]:
     """Group rows by columns; unsorted groups are in the order of their first rows."""
     yield from rows.groupby(by, sort=sort)
-
-
-def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Return the median times of a method's training runs; the times of adapted networks include pretraining."""
-    experiment = NETWORKS.get(row["method"])
-    if experiment is None:
-        return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
-    times = _median_times(seconds.get(TRAINED_IN[experiment], []), f"{experiment}.{row['name']}.")
-    if experiment != "adapt" or not times:
-        return times
-    base = _median_times(seconds.get("train_triplet", []), f"triplet.{row['base']}.")
-    return times | {"train_s": times["train_s"] + base["train_s"]} if base else {}
-
-
-def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
-    """Return the median times of the training runs whose names start with `prefix`."""
-    trainings = [training for training in timed if training["name"].startswith(prefix)]
-    if not trainings:
-        return {}
-    return {
-        "train_s": float(np.median([training["train_s"] for training in trainings])),
-        "inference_us": 1e6 * float(np.median([training["one_reading_s"] for training in trainings])),
-    }
 
 
 def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:

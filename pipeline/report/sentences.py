@@ -38,8 +38,6 @@ LOOK = {
     "simulations, which differ from each other. Recordings of light touches would show which of them is right.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
     "places is still high.",
-    "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
-    "inference.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "
     "time.",
     "integrators.svg": "The best points are at the lower left: they have small errors and take little time. Failures "

@@ -106,10 +106,6 @@ REGISTERED_MEANING = (
     "scores are only a diagnosis. The labelled and unlabelled indentations that a method receives are at the same "
     "places of the new board as the tested indentations, but at other depths."
 )
-TRAINING_ROWS = (
-    "Column training rows contains the number of training rows in the first fold. For classical methods, this number "
-    "is limited, and the training rows are drawn at random. The settings of classical methods were not tuned."
-)
 CONTROLLED = (
     "The row with 0 pokes has the scores of the network before fine-tuning. To see what fine-tuning changes without "
     "pokes of the new skin, see row Control of table 2."
@@ -199,7 +195,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["hover"] = _hover(numbers, source)
     tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
-        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
+        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
         "audit": audit_table, "chosen": chosen_table, "verification": verification_table,
         "stability": stability_table, "left_out": neglected_effects_table, "trainings": _trainings,
         "variants": _variants,
@@ -257,16 +253,6 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
         for row in sorted(rows, key=lambda row: (row["skins_n"], list(SHORT).index(row["method"])))
     ]
     return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
-
-
-def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List classical methods and networks on the same folds, starting with the most accurate."""
-    lines = [
-        {"method": row["method"], "inputs": row["inputs"], "training rows": str(row["rows_n"]), "source": source}
-        | scored(row)
-        for row in sorted(rows, key=lambda row: -row["accuracy_pct"]["mean"])
-    ]
-    return tabulate(lines, meaning=TRAINING_ROWS)
 
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:

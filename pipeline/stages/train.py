@@ -1,17 +1,11 @@
 """Stages that train models on the folds of a scene.
 
-They train networks on one skin or on many skins, adapt networks to new skins, and fit classical methods.
+They train networks on one skin or on many skins, and adapt networks to new skins.
 """
 
 from pathlib import Path
-from typing import Annotated
 
-import numpy as np
-from pydantic import Field
-
-from pipeline.executors import make_executor
-from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Training
-from pipeline.stage import say
+from pipeline.settings import Adaptations, Settings, Training
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.before_contact import BY_TIME, score_before_contact
 from pipeline.training.final import train_final
@@ -22,19 +16,12 @@ from pipeline.training.jobs import (
     preload_training,
     read_data,
     read_pretrained,
-    score_test,
     train_jobs,
-    training_data,
     write_models,
-    write_timings,
 )
 from reskin import io
 from reskin.data.splits import ONE_SKIN
-from reskin.models.classical import Classical, ClassicalJob, run_classical_jobs
-from reskin.models.recipe import Name
 from reskin.models.trained import networks_by_fold
-
-NO_LABELS = np.zeros(0, np.int64)
 
 
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
@@ -91,41 +78,3 @@ def adapt(
         for job in adaptation_jobs(data, fold, named_recipe, networks, experiment="adapt", pokes_n=section.pokes_n)
     ]
     write_models(models, data, jobs, train_jobs(data, jobs, "adapt"), "adapt")
-
-
-class ClassicalMethods(SectionWithRows):
-    """Settings of stage train_classical: section `train_classical` of a scene's file.
-
-    rows_max_n: largest number of training rows to which a method is fitted.
-    methods: settings of the classical methods, by name.
-    """
-
-    rows_max_n: Annotated[int, Field(ge=1)]
-    methods: dict[Name, Classical]
-
-    @classmethod
-    def expand(cls, section: Row, settings: Settings, where: str) -> Row:
-        return section | {"methods": settings.row("methods", section, "methods", where)}
-
-
-def train_classical(
-    settings: Settings, section: ClassicalMethods, indentations: Path, folds: Path, scores: Path
-) -> None:
-    """Fit classical methods on the same folds on which stage train_multi trains networks, and score them."""
-    data = read_data(settings, indentations, folds)
-    pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in section.methods.items()]
-    jobs = [
-        ClassicalJob(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)
-        for fold, name, method in pairs
-    ]
-    with make_executor(imports="sklearn.ensemble") as executor:
-        results = run_classical_jobs(
-            jobs, training_data(data), executor, lambda line: say(f"{settings.scene} classical: {line}")
-        )
-    points = [
-        {"name": name, "method": method.title, "inputs": method.inputs, "fold": fold.name, "seed_i": 0}
-        | {"rows_n": result.rows_n, "scores": score_test(data, fold.test, result.predicted)}
-        for (fold, name, method), result in zip(pairs, results, strict=True)
-    ]
-    io.write_json(scores, points)
-    write_timings(settings.scene, "train_classical", jobs, results)

@@ -170,33 +170,6 @@ def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
-def test_training_times_are_medians_over_networks():
-    rows = [
-        {"method": "ridge", "inputs": "raw", "name": "ridge"},
-        {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
-        {"method": "network, adapted", "inputs": "raw", "name": "long", "base": "paper"},
-        {"method": "network", "inputs": "raw", "name": "paper"},
-    ]
-
-    def timed_model(name: str, seconds: float) -> dict:
-        return {"name": name, "train_s": seconds, "one_reading_s": 1e-6 * seconds}
-
-    seconds = {
-        "train_classical": [
-            timed_model("ridge.b0", 1),
-            timed_model("ridge.b1", 2),
-            timed_model("ridge.b2", 9),
-            timed_model("ridge-shape.b0", 100),
-        ],
-        "train_triplet": [timed_model("triplet.paper.b0.seed0", 30), timed_model("triplet.other.b0.seed0", 999)],
-        "adapt": [timed_model("adapt.long.b0.s.390pokes.seed0", 5)],
-    }
-    timed = learning_times({"baselines": rows}, seconds)["learning"]
-    # These are the medians of the times of each method. The last method was not timed.
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]
-    assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
-
-
 def test_times_of_adaptation_are_given_for_each_number_of_pokes():
     numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
     seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
