@@ -85,7 +85,6 @@ LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even bey
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: "seems to plateau" beyond this number
 MONOTONIC = '"monotonically increasing sensor measurements"'
-DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'
 
 SINGLE_TRAIN_N = 45_000  # section 4: "random 45K for training and 5K for test"

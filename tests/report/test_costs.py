@@ -1,5 +1,6 @@
 """Tests of figures and tables that compare errors with run times."""
 
+import re
 from dataclasses import asdict
 
 import numpy as np
@@ -161,3 +162,8 @@ def test_table_of_adaptations_has_dashes_for_those_that_were_not_timed():
     assert set(pages) == {"adaptation.md"}
     assert cost_tables({"adaptation": rows}, "simulated")["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
     assert cost_pages({"choice": {}}, "simulated") == {}
+
+
+def count_marks(svg: str) -> int:
+    """Return the number of marks in a figure (SVG), which are <use> elements that refer to a path."""
+    return len(re.findall("<use ", svg))
