@@ -71,7 +71,7 @@ compiled: $(STAMP)
 # Imports all tests once after each edit, so that their bytecode exists before the workers of `make test` import them at
 # the same time.
 collected: .pytest_cache/collected
-.pytest_cache/collected: $(STAMP) $(shell find pipeline reskin tests release -name '*.py')
+.pytest_cache/collected: $(STAMP) $(shell find pipeline reskin tests release tools -name '*.py')
 	@output=$$($(BIN)/python -m pytest -q --collect-only -p no:xdist) || { echo "$$output" | tail -40; exit 1; }
 	@mkdir -p $(@D) && touch $@
 

@@ -18,7 +18,7 @@ FOLDER = Path(__file__).parent / "experiments"
 STAGES = {
     "simulate": ("simulate",),
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
-    "train": ("train_single", "train_multi", "train_triplet", "adapt", "train_classical"),
+    "train": ("train_single", "train_multi", "train_triplet", "adapt"),
     "sweeps": ("sweep_pokes", "sweep_sensors"),
     "rig": ("rig",),
     "report": ("table2", "report", "publish"),
@@ -121,7 +121,6 @@ LEARNING = (
         "sensors", "curve", "sweep_sensors", needs=("adapt",), folds=("sensors_skins_n", "sensors_draws_n"),
         settings=False,
     ),
-    _learning("baselines", "curve", "train_classical", needs=("lobo",)),
     _learning("rig", "files", "rig", reads=("compare",)),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip

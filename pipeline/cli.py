@@ -236,7 +236,7 @@ def fetch(
     source: Annotated[
         str | None,
         Argument(
-            help="Name of a set of recordings: lab, ini, eflesh, eflash7 or leaphand. Default: nothing is fetched, and "
+            help="Name of a set of recordings: lab, ini, eflesh or leaphand. Default: nothing is fetched, and "
             "all sets are described."
         ),
     ] = None,
@@ -329,40 +329,6 @@ def summary(
     from pipeline.manage.summary import print_summary
 
     print_summary(ROOT, [scene] if scene else list(checked_plan().scenes), typer.echo)
-
-
-@app.command(rich_help_panel=PIPELINE)
-def score(
-    predictions: Annotated[Path, Argument(help="A .csv or .parquet file in the format of docs/benchmark.md.")],
-    enter: Annotated[
-        bool,
-        Option(
-            "--enter",
-            help="Also write the scores to benchmark/entries, as an entry of the benchmark. Options --method, --by, "
-            "--trained-on and --code must then be given.",
-        ),
-    ] = False,
-    method: Annotated[str | None, Option(help="Name of your method.")] = None,
-    by: Annotated[str | None, Option(help="Names of the authors.")] = None,
-    trained_on: Annotated[
-        str | None,
-        Option(help='Data on which your method was trained, such as "labels" or "other boards".'),
-    ] = None,
-    code: Annotated[str | None, Option(help="Where your code or paper is, such as a URL.")] = None,
-    data: Annotated[
-        Path | None,
-        Option(help="Folder of the recordings. Default: the folder to which `reskin fetch` writes recordings."),
-    ] = None,
-) -> None:
-    """Check a file of predictions for the benchmark; print its scores and write them as JSON beside the file."""
-    from pipeline.benchmark.entries import score_and_write
-    from pipeline.benchmark.scoring import table_of
-    from pipeline.formatting import to_markdown
-
-    about = {"method": method, "by": by, "trained_on": trained_on, "code": code}
-    entry, written = score_and_write(predictions, about, data, enter=enter)
-    typer.echo(to_markdown(table_of([entry])))
-    typer.echo(f"dataset {entry.dataset} ({entry.version}), {entry.source}; wrote {written}")
 
 
 @app.command(rich_help_panel=PIPELINE)

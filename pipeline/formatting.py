@@ -41,8 +41,6 @@ TITLES = {
 }  # fmt: skip
 CONTROL = "Control: fine-tuned equally long, but without pokes of the new skin (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
-# `way` and `labels_n` of the rows of experiment population in which the complete universal model has no labels.
-UNIVERSAL = ("universal", 0)
 INCONCLUSIVE = "inconclusive"
 DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
 
@@ -278,16 +276,6 @@ def table_2_rows(numbers: Results) -> dict[str, tuple[Model, Mapping[str, Any]]]
     """Return the computed rows of table 2 in the paper's order; the control, which the paper lacks, comes last."""
     ours = numbers["table2"] | control_of(numbers)
     return {row: (model, ours[row]) for row, model in models(numbers).items() if row in ours}
-
-
-def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
-    """Return the universal model's row with the most unlabelled pokes and no labels, from experiment population."""
-    rows = [row for row in numbers.get("population", {}).get("told", ()) if (row["way"], row["labels_n"]) == UNIVERSAL]
-    if not rows:
-        return []
-    most = max(rows, key=lambda row: row["pokes_n"])
-    title = f"Universal model, trained on simulated skins, {most['pokes_n']} unlabelled pokes (ours)"
-    return [(Model(title, "universal", {}), most)]
 
 
 def control_of(numbers: Results) -> dict[str, Any]:

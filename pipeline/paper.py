@@ -79,14 +79,12 @@ SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2
 SENSITIVITY_ML = 20.0
 LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
 SLEEVE: dict[str, float] = {"rate_hz": 133.0, "chips_n": 40}  # section 6: "samples all 40 magnetometers at 133 Hz"
-RATE_HZ = 400.0  # sections 1 and 2: "up to 400Hz"
 FORCE_RESOLUTION_MAX_N = 0.1  # section 1: requirement for a good skin
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
 LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even beyond 50K interactions"
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: "seems to plateau" beyond this number
 MONOTONIC = '"monotonically increasing sensor measurements"'
-DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'
 
 SINGLE_TRAIN_N = 45_000  # section 4: "random 45K for training and 5K for test"

@@ -204,7 +204,6 @@ class Shared(Strict):
     faults: FaultPolicy
     recipes: dict[Name, SharedRow]
     adaptations: dict[Name, SharedRow]
-    methods: dict[Name, dict[Name, SharedRow]]
 
 
 class Plan(Strict):

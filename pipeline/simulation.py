@@ -9,13 +9,13 @@ from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulatio
 # The protocols that experiments read, and the kind that each of these protocols must have.
 KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
-    "grip": "load", "press": "press", "log": "walk",
+    "grip": "load", "log": "walk",
 }  # fmt: skip
 # Protocols on the main boards. Their captures are compared with the captures of the main protocol, or are used to test
 # networks that were trained on the main boards.
-ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "press", "log")
+ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "log")
 ON_OTHER_BOARDS = ("flexible",)  # protocols on boards other than the main ones
-OF_ONE_SKIN = ("wear", "glass", "press", "log")  # protocols whose experiments read one capture
+OF_ONE_SKIN = ("wear", "glass", "log")  # protocols whose experiments read one capture
 
 
 def simulation_settings(settings: Settings) -> SimulationSettings:

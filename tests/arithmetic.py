@@ -1,7 +1,7 @@
-"""Print digests of the weights after three tiny training runs, on this processor or on emulated processors.
+"""Print digests of the weights after two tiny training runs, on this processor or on emulated processors.
 
-The runs train three models: the paper's networks (several at once, as a stack, with all terms of the loss), the
-adversarial network, and the network of the universal model. `python -m tests.arithmetic` prints one digest per run;
+The runs train the paper's networks (several at once, as a stack, with all terms of the loss) and the network of the
+universal model. `python -m tests.arithmetic` prints one digest per run;
 test_numerics.py calls this command with several environment variables. `python -m tests.arithmetic Haswell-v2 EPYC-v1`
 also runs on these two processors, emulated by QEMU (package qemu-user; about two minutes per processor; `qemu-x86_64
 -cpu help` lists the processors), and fails if the digests differ. MKL and PyTorch select code by the maker and the
@@ -18,7 +18,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from reskin.models.adversarial import Domains, train_adversarial
 from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 from reskin.models.train import train
@@ -27,7 +26,7 @@ from reskin.universal.batches import SkinPrior
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import PRESSES_N, Population
 from reskin.universal.training import train as train_universal
-from tests.models.example_jobs import some_job, some_rows
+from tests.models.example_jobs import some_job
 from tests.universal.skins import SETUP
 
 STEPS_N = 10
@@ -45,14 +44,6 @@ def paper_networks() -> str:
     jobs = [some_job(name, n=300, terms=True) for name in range(3)]
     outcomes = train(jobs, "paper", SCHEDULE, LossWeights(0.1, 0.1, 0.1), "cpu")
     return digest(outcome.weights[name] for outcome in outcomes for name in sorted(outcome.weights))
-
-
-def adversarial_network() -> str:
-    known, target = some_rows(300, "known")
-    weights = train_adversarial(
-        Domains(known, target, some_rows(200, "new")[0]), SCHEDULE, 0.5, rng_for(0, "adversarial")
-    )
-    return digest(weights[name] for name in sorted(weights))
 
 
 def universal_network() -> str:
@@ -76,7 +67,7 @@ def digests_on(name: str) -> str:
 
 
 def main(processors: Sequence[str]) -> None:
-    here = f"{paper_networks()} {adversarial_network()} {universal_network()}"
+    here = f"{paper_networks()} {universal_network()}"
     print(here, flush=True)
     different = []
     for name in processors:

@@ -49,10 +49,9 @@ SECTIONS: dict[str, dict[str, object]] = {
         "few_labels": {
             "labels_n": [0], "recipe": "paper", "steps_n": 1, "recipes": {"network": {}}, "adapted": [],
             "adapting": {"adaptation": "paper", "steps_n": 1}, "labelling": {"labelling": "few", "steps_n": 1},
-            "rows_max_n": 10, "methods": "all",
+            "rows_max_n": 10, "methods": "tiny",
         },
     },
-    "baselines": {"train_classical": {"rows_max_n": 10, "methods": "all"}},
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
 }  # fmt: skip
@@ -65,7 +64,6 @@ SECTIONS |= {
             "training": TRAINING,
         },
     },
-    "contacts": {"contacts": {"pairs_n": 10, "separations_mm": [8.0], "false_alarm_fraction": 0.05}},
 }  # fmt: skip
 # Settings in section `split` that each experiment needs.
 SPLIT_SETTINGS: dict[str, dict[str, object]] = {

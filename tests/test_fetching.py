@@ -21,7 +21,7 @@ from pipeline.scenes import read_plan
 from reskin.errors import ReskinError
 from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
-from reskin.recordings.readers import eflash7, eflesh, ini, lab, leaphand
+from reskin.recordings.readers import eflesh, ini, lab, leaphand
 from tests import repositories
 from tests.recordings.headers import DEFAULT_POLICY
 from tests.recordings.readers.test_lab import PRESSES, write
@@ -327,10 +327,9 @@ def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, t
         "lab": 7150,
         "ini": 23300,
         "eflesh": 4805,
-        "eflash7": 268,
         "leaphand": 301,
     }
-    readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7, "leaphand": leaphand}
+    readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "leaphand": leaphand}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)

@@ -71,11 +71,9 @@ def scene(*experiments: str, **changes: object) -> Scene:
         ("adapt", ("lobo", "triplet")),
         ("pokes", ADAPTED),
         ("sensors", ADAPTED),
-        ("baselines", ("lobo",)),
         ("labels", ("lobo",)),
         ("audit", ("lobo",)),
         ("choice", ADAPTED),
-        ("contacts", ("lobo",)),
     ],
 )
 def test_missing_required_experiment_is_an_error(experiment, others):
@@ -152,18 +150,18 @@ def test_error_lists_all_missing_experiments():
         scene("lobo", "choice")
 
 
-ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
+ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "audit", "choice")
 
 
 def test_scene_with_all_experiments_runs_all_their_stages():
     checked = scene(*ALL)
     assert set(stages(checked.experiments, *LEARNING)) == {
-        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
-        "few_labels", "audit",
+        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "few_labels",
+        "audit",
     }  # fmt: skip
     assert checked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
     assert checked.curves == {
-        "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
+        "pokes": "sweep_pokes", "sensors": "sweep_sensors", "labels": "few_labels"
     }  # fmt: skip
     # These experiments have folds.
     assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}

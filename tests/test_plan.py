@@ -45,7 +45,6 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("adapt", ADAPTED),
         ("sweep_pokes", (*ADAPTED, "pokes")),
         ("sweep_sensors", (*ADAPTED, "sensors")),
-        ("train_classical", ("lobo", "baselines")),
         ("few_labels", ("lobo", "labels")),
         ("audit", ("lobo", "audit")),
     ],
@@ -80,11 +79,11 @@ def test_experiment_that_chooses_settings_has_no_stage_of_its_own():
 def test_planned_scene_raises_if_the_plan_lacks_an_experiment_of_the_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
-    Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
-    tiny = settings(scene_with("lobo", "baselines"))
-    assert planned_scene(tiny).experiments == ("lobo", "baselines")
+    Path(PLAN).write_text("scenes: {tiny: [lobo, audit]}\n")
+    tiny = settings(scene_with("lobo", "audit"))
+    assert planned_scene(tiny).experiments == ("lobo", "audit")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
-    with pytest.raises(ParamsError, match="baselines only in one of them. Try: reskin scenes use tiny"):
+    with pytest.raises(ParamsError, match="audit only in one of them. Try: reskin scenes use tiny"):
         planned_scene(tiny)
 
 
@@ -189,7 +188,7 @@ def test_each_protocol_is_simulated_and_ingested_by_stages_of_its_own(tmp_path):
     root = simulated_checkout(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages
-    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+    protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
     # The log of an SD card has no probe log.
     assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}

@@ -76,7 +76,7 @@ def test_settings_of_all_stages_with_a_section_are_tested():
 
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
 def test_params_in_dvc_yaml_cover_the_settings_that_a_stage_reads(stage):
-    scenes = ("ci", "lab", "eflash7", "hand", "decide", "universal")
+    scenes = ("ci", "lab", "hand")
     scene = next((one for one in scenes if scene_runs(one, stage)), None)
     of_scene = NEW_SCENE if scene is None else read_settings(scene, ROOT).of_scene
     scene_mapping, shared_mapping = RecordingMapping(of_scene), RecordingMapping(read_shared_files(ROOT))
@@ -143,34 +143,34 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
             (root / file).write_bytes(content)
 
 
-FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
-WHOLE = {"contacts", "neglected_effects"}  # These experiments depend on the whole section `simulate` and all terms.
-WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime", "bound"}  # They read the boards and few protocols.
+WHOLE = {"neglected_effects"}  # This experiment depends on the whole section `simulate` and all terms.
+WITH_BOARDS = {"flexible", "logs", "sleeve", "ambient", "runtime"}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
-    (PARAMS, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
-    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime", "bound"}),
-    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient", "bound"}),
+    (PARAMS, "methods.tiny.ridge.alpha=2.0", {"few_labels"}),
+    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime"}),
+    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient"}),
     (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),
-    (SCENE, "split.pool_passes_n=2", {"split", "flexible", "contacts"}),
+    (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
     (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *WHOLE}),
     (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", *WHOLE}),
     (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper", *WHOLE}),
     (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS | WHOLE),
-    (SCENE, "train_single.steps_n=10", {"train_single", "contacts"}),
-    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient", "contacts"}),
-    (SCENE, "adapt.steps_n=4", {*ADAPTING, "contacts"}),
-    (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes", "contacts"}),
-    (SCENE, "shear.repeats_n=1", {"shear", "contacts"}),
-    (SCENE, "runtime.repeats_n=2", {"runtime", "contacts"}),
+    (SCENE, "train_single.steps_n=10", {"train_single"}),
+    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient"}),
+    (SCENE, "adapt.steps_n=4", {*ADAPTING}),
+    (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes"}),
+    (SCENE, "shear.repeats_n=1", {"shear"}),
+    (SCENE, "runtime.repeats_n=2", {"runtime"}),
 ]
 
 

@@ -14,7 +14,7 @@ FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
     ("name", "kind"),
     [
         ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
-        ("glass", "load"), ("grip", "load"), ("press", "press"), ("log", "walk"),
+        ("glass", "load"), ("grip", "load"), ("log", "walk"),
     ],
 )  # fmt: skip
 def test_wrong_kind_of_protocol_is_an_error(name, kind):

@@ -14,7 +14,7 @@ tables states the kind of each result:
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,8 +23,14 @@ from pydantic import Field, model_validator
 
 from pipeline.experiments.compare import Compare, make_setup
 from pipeline.experiments.known_boards import align_boards
-from pipeline.experiments.mounting import Skin, simulated_skins, skin_of_board
-from pipeline.experiments.random_presses import CHECKERBOARD, BoardPresses, board_presses, draw_presses, place_scores
+from pipeline.experiments.random_presses import (
+    CHECKERBOARD,
+    BoardPresses,
+    board_presses,
+    draw_presses,
+    place_scores,
+    raise_forces,
+)
 from pipeline.experiments.results import read_captures, write_results
 from pipeline.formatting import show, tabulate
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
@@ -32,6 +38,7 @@ from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import statistic
 from pipeline.training.jobs import SceneData
+from pipeline.training.universal import draw_prior_skins, law_error
 from reskin.config import Strict
 from reskin.data.contact import CONTACT_SDS, magnitudes_uT
 from reskin.data.grid import CENTRE_MM
@@ -45,9 +52,10 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import leaphand
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from reskin.universal.batches import NOISE_uT
+from reskin.universal.batches import NOMINAL_NAME, NOISE_uT, SkinPrior
 from reskin.universal.force import NORMAL_90
-from reskin.universal.law import CHIPS_MM, to_board, to_chips
+from reskin.universal.law import CHIPS_MM, Setup, to_board, to_chips
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.model import load_universal
 from reskin.universal.population import PLACES_N
 
@@ -116,6 +124,22 @@ class MovingHand(Strict):
         if len(set(names)) < len(names):
             raise ValueError(f"groups must have different names, and none may be called {NO_FIELD}")
         return self
+
+
+class Skin(NamedTuple):
+    """A skin, with data in the form that the universal model expects.
+
+    - name: name of the skin.
+    - rest_uT: no-load field, in the chips' axes.
+    - db_uT: field changes of presses, in the chips' axes.
+    - place_mm, force_N: places of the presses, in the coordinates of labels, and their forces.
+    """
+
+    name: str
+    rest_uT: Float[np.ndarray, " ch"]
+    db_uT: Float[np.ndarray, "m ch"]
+    place_mm: Float[np.ndarray, "m 2"]
+    force_N: Float[np.ndarray, " m"]
 
 
 @dataclass(frozen=True)
@@ -221,6 +245,30 @@ def read_boards(settings: Settings, section: Compare, captures: Sequence[Reading
     data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     known = align_boards(data, section, captures)
     return [board_presses(known, board) for board in known.presses]
+
+
+def skin_of_board(board: BoardPresses) -> Skin:
+    """Return the presses of a recorded board as inputs of the universal model."""
+    presses = raise_forces(board.presses)
+    rest_uT, db_uT = to_chips(board.rest_uT[None])[0], to_chips(presses.db_uT)
+    return Skin(board.board, rest_uT, db_uT, presses.place_mm + CENTRE_MM, presses.force_N)
+
+
+def simulated_skins(setup: Setup, skins_n: int, seed: int, name: str) -> list[Skin]:
+    """Draw skins from the prior of the shipped model, with errors of the law as in the training of the model.
+
+    name: name of the random stream.
+    """
+    prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)
+    drawn = draw_prior_skins(prior, skins_n, seed, name, law_error())
+    parts = zip(drawn.rest_uT, drawn.db_uT, drawn.place_mm, drawn.force_N, strict=True)
+    return [
+        Skin(
+            f"skin {i}", to_chips(rest_uT[None].astype(float))[0], to_chips(db_uT.astype(float)),
+            place_mm.astype(float) + CENTRE_MM, force_N.astype(float),
+        )
+        for i, (rest_uT, db_uT, place_mm, force_N) in enumerate(parts)
+    ]  # fmt: skip
 
 
 def describe_pad(capture: str, pad_name: str, pad: Pad) -> Row:

@@ -17,7 +17,6 @@ from pipeline.formatting import (
     show_with_unit,
     three_digits,
     two_digits,
-    universal_rows,
 )
 from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT
 from pipeline.report.figures import IN_CONTEXT, constant_force, unseen_rows
@@ -49,7 +48,6 @@ ANSWER, SECOND, COMPARED = "answer", "second", "compared"
 RIG, SHIPPED = IN_CONTEXT  # methods of experiment new_board
 ADAPTED = "Multi-sensor with triplet loss, adapted"
 NETWORK = "Network of the paper, trained on the other boards"
-OURS = "Universal model (ours), trained on simulated skins"
 CHOSEN_ON = "lab"  # the scene on whose boards details of the universal model were chosen (docs/learning.md)
 USABLE = {YES: " (usable)", PARTLY: " (partly usable)", NO: " (not usable)"}
 WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the first of these that the scene ran is shown
@@ -158,16 +156,11 @@ def _efforts(numbers: Results) -> Iterator[Effort]:
     known, table2 = models(numbers), numbers.get("table2", {})
     adapting = f"{numbers.get('adapt', {}).get('pokes_n', ADAPTED_POKES_N)} presses without labels"
     rows = [row for row in ("single", "multi", "triplet", "adapted") if row in table2]
-    ours = universal_rows(numbers) if rows else []
-    # A scene without row `single` does not reproduce the whole of table 2, so it is about the universal model.
-    network_role, our_role = (SECOND, ANSWER) if ours and "single" not in table2 else (ANSWER, SECOND)
     for row in rows:
         title = ADAPTED if row == "adapted" else known[row].title
         paper = {metric: mean for metric, (mean, _) in known[row].paper.items()}
         needs = adapting if row == "adapted" else NOTHING
-        yield Effort(title, needs, table2[row], paper, role=network_role if row == rows[-1] else "")
-    for _, scores in ours:
-        yield Effort(OURS, f"{scores['pokes_n']} presses without labels", scores, {}, role=our_role)
+        yield Effort(title, needs, table2[row], paper, role=ANSWER if row == rows[-1] else "")
 
 
 def _efforts_on_new_boards(numbers: Results) -> Iterator[Effort]:

@@ -1,7 +1,6 @@
 """Tables and figures of error against the run times measured on this machine (`reports/<scene>/runtime`)."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import pandas as pd
@@ -10,10 +9,6 @@ from pipeline.experiments.runtime import CANDIDATES, ERROR_MAX, REFERENCE
 from pipeline.formatting import scored, tabulate, to_markdown
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
 
-TRADE_OFFS = {
-    "training": ("train_s", "median time of a training run / s"),
-    "inference": ("inference_us", "median time per reading / µs"),
-}
 STUDIES = ("quadratures", "integrators")
 COMPUTED = (
     "Column computed is the time that a stage takes to compute all its results if its training runs run one after "
@@ -21,7 +16,6 @@ COMPUTED = (
     "last run of the stage. The last run may have taken less time than computed, because it reuses training runs that "
     "were completed before."
 )
-MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
 # About the size of rounding errors. Smaller errors are drawn at this value, because a logarithmic axis cannot show 0.
 ERROR_SHOWN_MIN = 1e-16
 
@@ -30,15 +24,8 @@ Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against run times; return the texts of the figures and tables by file name.
-
-    Methods that were not timed on this machine are left out of the figures.
-    """
+    """Draw and tabulate errors against run times; return the texts of the figures and tables by file name."""
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
-    for name, (key, cost) in TRADE_OFFS.items():
-        if any(key in row for row in runtime.get("learning", [])):
-            title = f"Error on new skins against {name} time ({source})"
-            texts[f"{name}.svg"] = trade_off(runtime["learning"], key, title=title, cost=cost)
     if "quadratures.md" in texts:
         texts["quadratures.svg"] = quadratures(runtime["quadratures"], runtime["choice"], source)
     if "integrators.md" in texts:
@@ -47,29 +34,12 @@ def cost_pages(runtime: Row, source: str) -> dict[str, str]:
 
 
 def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the costs of stages, and the errors and costs of methods, adaptation and timed studies.
-
-    Return the tables by name.
-    """
-    methods = [
-        {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
-        | {"per reading, µs": _time(row, "inference_us"), "source": source}
-        | scored(row)
-        for row in runtime.get("learning", [])
-    ]
+    """Tabulate the costs of stages, and the errors and costs of adaptation and timed studies, by name."""
     adaptations = [
         {"pokes": str(row["pokes_n"]), "adaptation, s": _time(row, "seconds"), "source": source} | scored(row)
         for row in sorted(runtime.get("adaptation", []), key=lambda row: row["pokes_n"])
     ]
-    references = [
-        {"method": row["method"], "time until ready, s": _time(row, "train_s")}
-        | {"per reading, µs": _time(row, "inference_us"), "source": source}
-        | scored(row)
-        for row in runtime.get("rivals_costs", [])
-        if "train_s" in row
-    ]
-    lines = {"learning": methods, "adaptation": adaptations, "rivals_costs": references}
-    tables = {name: tabulate(lines[name]) for name in lines if name in runtime}
+    tables = {"adaptation": tabulate(adaptations)} if "adaptation" in runtime else {}
     timed = [name for name in STUDIES if any("median_s" in row for row in runtime.get(name, []))]
     tables |= {name: study_table(runtime[name], source) for name in timed}
     return tables | ({"stages": stage_costs(runtime["stages"])} if "stages" in runtime else {})
@@ -112,69 +82,6 @@ def study_table(rows: Rows, source: str) -> pd.DataFrame:
 
 def _time(row: Row, name: str) -> str:
     return f"{row[name]:.3g}" if name in row else "–"
-
-
-@dataclass(frozen=True)
-class Point:
-    """A method or setting in a figure of error against cost; `trade_off` labels only points on the Pareto front."""
-
-    name: str
-    label: str
-    position: tuple[float, float]  # (cost, error)
-    look: Mapping[str, Any]
-
-
-def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
-    """Draw errors of methods against cost `key` on logarithmic axes; a step line joins points on the Pareto front."""
-    points = trade_off_points(rows, key)
-    members = [point for point in points if point.label]
-    with drawing(4.7, 6.4) as figure:
-        axes = _trade_off_axes(figure, points, title=title, xlabel=cost)
-        for point in points:
-            mark = axes.plot(*point.position, **point.look, linestyle="none")[0]
-            mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
-            # No point is to the lower left of a point on the Pareto front.
-            style = {"xytext": (-5, -5), "textcoords": "offset points", "ha": "right", "va": "top", "fontsize": 8}
-            axes.annotate(point.label, point.position, **style)
-        steps = zip(*(point.position for point in members), strict=True)
-        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbered methods)")
-        figure.legend(loc="outside lower left", frameon=False, fontsize=8, ncols=2)
-        return svg(figure)
-
-
-def trade_off_points(rows: Rows, key: str) -> list[Point]:
-    """List the timed methods by cost; those on the Pareto front come first and are numbered."""
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    inputs = list(dict.fromkeys(row["inputs"] for row in rows))
-    timed = sorted((row for row in rows if key in row), key=lambda row: (row[key], row["mse_xy_mm2"]["mean"]))
-    positions = [(row[key], row["mse_xy_mm2"]["mean"]) for row in timed]
-    pareto = front(positions)
-    points = []
-    for row, position in zip(timed, positions, strict=True):
-        look = look_of(methods.index(row["method"]))
-        if row["inputs"] != inputs[0]:
-            look["markerfacecolor"] = "white"
-        label = str(pareto.index(position) + 1) if position in pareto else ""
-        points.append(Point(f"{row['method']} ({row['inputs']})", label, position, look))
-    return sorted(points, key=lambda point: not point.label)
-
-
-def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel: str) -> Any:
-    """Make logarithmic axes of error against cost that leave room for the labels of points."""
-    axes = figure.subplots()
-    axes.set(xscale="log", yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
-    axes.grid(alpha=0.25)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    costs, errors = zip(*(point.position for point in points), strict=True)
-    axes.set_ylim(min(errors) / MARGIN, max(errors) * MARGIN)
-    axes.set_xlim(min(costs) / MARGIN, max(costs) * MARGIN)
-    return axes
-
-
-def look_of(i: int) -> dict[str, Any]:
-    """Return the colour and marker of method i, which are distinct for the first 49 methods."""
-    marker = MARKERS[(i + i // len(COLOURS)) % len(MARKERS)]
-    return {"color": COLOURS[i % len(COLOURS)], "marker": marker, "markersize": 6}
 
 
 def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:

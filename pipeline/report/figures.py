@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.formatting import COLUMNS, TITLES, n_of, table_2_rows, two_digits, universal_rows
+from pipeline.formatting import COLUMNS, TITLES, n_of, table_2_rows, two_digits
 from pipeline.paper import ADAPTED_POKES_N, TABLE_2, Number
 from pipeline.plot import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
 from pipeline.plot_layout import WIDTH_IN
@@ -87,8 +87,7 @@ def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
 
 def table2_figure(numbers: Mapping[str, Any], source: str, metrics: Sequence[str] = HEADLINES[HEADLINE]) -> str:
     """Draw metrics of each row of table 2 on held-out boards, ours beside the paper's, with one panel per metric."""
-    table_rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
-    rows = table_rows + universal_rows(numbers)  # the paper's rows first, in its order
+    rows = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
     y = np.arange(len(rows))[::-1].astype(float)
     # Non-breaking spaces keep "n = 6" on one line.
     names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 32) for model, row in rows]

@@ -56,7 +56,6 @@ BEFORE_TOUCH = ("noload", "scan")  # methods that predict the position from what
 HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
 SEEN_PCT = 25.0  # assumed: if a hovering tip is located with at least this accuracy, the chips sense the tip
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
-TOUCHES_METRICS = ("single_touches_pct", "mean_left_over_pct")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
 TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # keys in `runtime` that differ between repeats
 ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # keys that identify a row in `runtime`
@@ -383,7 +382,6 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
             if policy in drift
         },
         "shear": _means(numbers["shear"], SHEAR_METRICS) if "shear" in numbers else {},
-        "touches": _means(numbers.get("touches", {}).get("superposition", {}), TOUCHES_METRICS),
         "moving_hand": {
             f"{row['group']}, external_uT={row['external_uT']:g}": {"live_false_pct": row["live_false_pct"]}
             for row in numbers.get("moving_hand", {}).get("contacts", ())

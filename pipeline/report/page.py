@@ -35,7 +35,7 @@ SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
 SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
 # Tables that are unfolded when the page loads; all other tables are folded.
-OPEN = {"table1", "table2", "claims", "final_model", "touches", "touches_detection"}
+OPEN = {"table1", "table2", "claims", "final_model"}
 WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
 BESIDE_N = 4  # a section compares at most this many results with the paper; the checklist contains all results
 EFFORTS = "Scores on new skins, by model and by the data that the model needs from the new skin"

@@ -26,23 +26,12 @@ LOOK = {
     "exist, or estimates a wrong force.",
     "ambient.svg": "Where a line falls, the estimates become worse because of a magnetic field that appeared after the "
     "no-load reading.",
-    "contacts.svg": "A model of single contacts estimates only one place for two contacts. Look how far apart two "
-    "contacts must be before they are detected as two.",
-    "dynamics.svg": "If the errors are larger for shorter presses (on the left), the cause is the motion of the tip "
-    "during a reading.",
     "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
     "stated tolerance.",
-    "population_scaling.svg": "Look at the right end of the lines: if they still fall there, more simulated training "
-    "skins would reduce the errors further.",
     "compare_growth.svg": "If the recorded and the simulated points lie on each other, the field grows with the force "
     "in the simulation as it does on the board.",
-    "recorded_limits.svg": "A press above the line of a threshold is detected. The lightest press that would be "
-    "detected is where an extrapolated line crosses the threshold.",
     "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
     "places is still high.",
-    "worlds.svg": "If the lines in a column are steep, the factor of this column changes the scores much.",
-    "training.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
-    "inference.svg": "A method that is above and to the right of a numbered method has larger errors and takes longer.",
     "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "
     "time.",
     "integrators.svg": "The best points are at the lower left: they have small errors and take little time. Failures "

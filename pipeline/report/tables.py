@@ -29,7 +29,6 @@ from pipeline.formatting import (
     tabulate,
     three_digits,
     to_markdown,
-    universal_rows,
 )
 from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR, TABLE_2, Number
 from pipeline.report.checklist import checklist, claims_table
@@ -105,10 +104,6 @@ REGISTERED_MEANING = (
     "predicted positions of this board. This mean error is computed from the labels of the board, so registered "
     "scores are only a diagnosis. The labelled and unlabelled indentations that a method receives are at the same "
     "places of the new board as the tested indentations, but at other depths."
-)
-TRAINING_ROWS = (
-    "Column training rows contains the number of training rows in the first fold. For classical methods, this number "
-    "is limited, and the training rows are drawn at random. The settings of classical methods were not tuned."
 )
 CONTROLLED = (
     "The row with 0 pokes has the scores of the network before fine-tuning. To see what fine-tuning changes without "
@@ -214,7 +209,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["hover"] = _hover(numbers, source)
     tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
-        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table, "baselines": baselines_table,
+        "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
         "audit": audit_table, "compare": compare_table, "chosen": chosen_table, "verification": verification_table,
         "stability": stability_table, "left_out": neglected_effects_table, "trainings": _trainings,
         "variants": _variants,
@@ -290,16 +285,6 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
         for row in sorted(rows, key=lambda row: (row["skins_n"], list(TITLES).index(row["method"])))
     ]
     return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
-
-
-def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List classical methods and networks on the same folds, starting with the most accurate."""
-    lines = [
-        {"method": row["method"], "inputs": row["inputs"], "training rows": str(row["rows_n"]), "source": source}
-        | scored(row)
-        for row in sorted(rows, key=lambda row: -row["accuracy_pct"]["mean"])
-    ]
-    return tabulate(lines, meaning=TRAINING_ROWS)
 
 
 def new_board_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -561,7 +546,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 def table_2_summary(numbers: Numbers) -> pd.DataFrame:
     """Tabulate the main scores on held-out boards, with the paper's means in parentheses."""
     lines = []
-    for model, row in [*universal_rows(numbers), *table_2_rows(numbers).values()]:
+    for model, row in table_2_rows(numbers).values():
         line = {HELD_OUT: model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")}
         for metric, title in COLUMNS.items():
             paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""

@@ -83,21 +83,7 @@ class RbfRidge(_Method):
     rows_max_n: Annotated[int, Field(ge=1)]
 
 
-class Boosting(_Method):
-    """Settings of gradient-boosted trees, with one model for each target.
-
-    Early stopping is disabled. It would split the readings at random, so that some readings of an indentation would be
-    used for training and others of the same indentation for validation.
-    """
-
-    title: ClassVar[str] = "gradient boosting"
-    method: Literal["boosting"]
-    rounds_n: Annotated[int, Field(ge=1)]
-    rate: Annotated[float, Field(gt=0)]
-    leaves_n: Annotated[int, Field(ge=2)]
-
-
-Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Field(discriminator="method")]
+Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge, Field(discriminator="method")]
 
 
 @dataclass(frozen=True)
@@ -165,7 +151,7 @@ def fit(
         if isinstance(settings, RbfRidge) and len(rows) > settings.rows_max_n:
             kept, row_weights = _thin(len(rows), settings.rows_max_n, row_weights, rng)
             rows = rows[kept]
-        regressor = make_regressor(settings, rng)
+        regressor = make_regressor(settings)
         with one_thread():
             regressor.fit(encoded[rows], encoded_target[rows][:, targets], row_weights)
         parts.append(_Part(targets, regressor, len(rows)))
@@ -248,7 +234,7 @@ def one_thread() -> Any:
     return _THREADS.limit(limits=1)
 
 
-def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
+def make_regressor(settings: Classical) -> Any:
     """Create a regressor with these settings.
 
     The regressor has the methods fit(inputs, target, weight) and predict(inputs).
@@ -271,18 +257,6 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
             from sklearn.kernel_ridge import KernelRidge
 
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
-        case Boosting():
-            from sklearn.ensemble import HistGradientBoostingRegressor
-            from sklearn.multioutput import MultiOutputRegressor
-
-            trees = HistGradientBoostingRegressor(
-                max_iter=settings.rounds_n,
-                learning_rate=settings.rate,
-                max_leaf_nodes=settings.leaves_n,
-                early_stopping=False,
-                random_state=int(rng.integers(2**32)),
-            )
-            return MultiOutputRegressor(trees)
 
 
 class _BlockwiseCubicRidge:

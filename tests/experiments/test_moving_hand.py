@@ -22,12 +22,14 @@ from reskin.errors import ParamsError
 from reskin.physics import external
 from reskin.recordings.header import HEADER_FILE, render
 from reskin.recordings.readers import leaphand
+from reskin.recordings.readers.lab import READINGS
 from reskin.seeds import rng_for
 from reskin.universal.law import CHIPS_MM, to_board
 from reskin.universal.model import load_universal
-from tests.experiments.test_recorded_limits import write_capture
+from reskin.universal.population import grid
 from tests.recordings.headers import make_header
 from tests.recordings.readers.test_leaphand import numbers as leaphand_rows
+from tests.universal.skins import poked_uT
 
 ROOT = Path(__file__).resolve().parents[2]
 SECTION = read_settings("hand", ROOT).section(MovingHand, "moving_hand")
@@ -148,6 +150,35 @@ def test_scene_without_recordings_of_presses_is_refused():
 
 
 # --- The whole stage ---
+
+
+COLUMNS = ["indent", "phase", "x_mm", "y_mm"]
+COLUMNS += [f"{name}{chip}" for chip in range(5) for name in ("T", "Bx", "By", "Bz")] + ["Fx", "Fy", "Fz"]
+
+
+def write_capture(folder: Path, frame: Frame, board: str, force_N: float) -> None:
+    """Write a synthetic recording in the layout `lab`, with one press at each place of the grid.
+
+    It has noise, but no drift.
+    """
+    rng, place_mm = rng_for(0, board, force_N), grid()
+    number = {"board1": np.array([0.5, -0.5, 0.3]), "board2": np.array([-0.5, 0.2, -0.3])}[board]
+    force_N = force_N * rng.uniform(0.8, 1.2, len(place_mm))
+    change_uT = poked_uT(place_mm, force_N, number).reshape(-1, 5, 3)
+    # Fields are rotated from the axes of the board to those of the chips.
+    change_uT = np.einsum("kji,nkj->nki", frame.turn, change_uT)
+    lines = [",".join(COLUMNS)]
+    for i, (label_mm, force) in enumerate(zip(frame.label(place_mm), force_N, strict=True)):
+        for phase in ["noload"] * 3 + ["contact"] * 2:
+            pressed = float(phase == "contact")
+            b_uT = pressed * change_uT[i] + 100 * np.arange(15).reshape(5, 3) + 4 * rng.standard_normal((5, 3))
+            fields = [f"21.5,{','.join(f'{value:.3f}' for value in chip_uT)}" for chip_uT in b_uT]
+            forces = f"{0.1 * pressed * label_mm[0]:.3f},{0.02 * pressed * i:.3f},{-pressed * force:.3f}"
+            lines.append(f"{i},{phase},{label_mm[0]:g},{label_mm[1]:g},{','.join(fields)},{forces}")
+    folder.mkdir(parents=True)
+    (folder / READINGS).write_text("\n".join(lines) + "\n")
+    header = make_header(capture=folder.name, board=board, skin=f"skin of {board}".replace(" ", "-"))
+    (folder / HEADER_FILE).write_text(render(header))
 
 
 def write_pad(folder: Path, pad: int) -> None:

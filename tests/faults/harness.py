@@ -19,10 +19,10 @@ from tests.repositories import git
 from tests.stages.checkout import ROOT, variables
 
 SCENE = "faults"
-EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
+EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "sensitivity", "audit")
 PROTOCOLS = ("grid", "glass")  # protocols that the experiments above need
 SECTIONS = (
-    "source", "seed", "selection", "train_single", "train_multi", "train_triplet", "adapt", "train_classical", "audit",
+    "source", "seed", "selection", "train_single", "train_multi", "train_triplet", "adapt", "audit",
 )  # fmt: skip
 SPLIT = ("random_test_fraction", "random_repeats_n", "transfer_skins_n", "pool_passes_n")
 LIMIT_S = 600.0  # a command that takes longer counts as hanging

@@ -22,7 +22,6 @@ SETTINGS = {
     "cubic_ridge": {"method": "cubic_ridge", "alpha": 1.0},
     "knn": {"method": "knn", "neighbours_n": 4},
     "rbf_ridge": {"method": "rbf_ridge", "alpha": 0.1, "gamma": 0.1, "rows_max_n": 30},
-    "boosting": {"method": "boosting", "rounds_n": 5, "rate": 0.2, "leaves_n": 7},
 }
 ROWS_N, CH_N = 90, 5
 TRAIN, NEW_SKIN_ROWS, TEST = np.arange(0, 60, 2), np.arange(60, 66), np.arange(70, 90)

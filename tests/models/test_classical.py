@@ -19,7 +19,6 @@ SETTINGS = {
     "cubic_ridge": {"method": "cubic_ridge", "alpha": 1.0},
     "knn": {"method": "knn", "neighbours_n": 4},
     "rbf_ridge": {"method": "rbf_ridge", "alpha": 0.1, "gamma": 0.1, "rows_max_n": 100},
-    "boosting": {"method": "boosting", "rounds_n": 10, "rate": 0.2, "leaves_n": 7},
 }
 every_method = pytest.mark.parametrize("method", SETTINGS)
 
@@ -150,14 +149,6 @@ def test_cubic_ridge_recovers_a_cubic_function():
     np.testing.assert_allclose(found, cubic(query_uT), atol=1e-4)
     plane = fit_to("ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
     assert np.abs(plane - cubic(query_uT)).max() > 1
-
-
-def test_equal_seeds_give_equal_boosted_trees():
-    db_uT, target = rows()
-    query_uT, _ = rows(1)
-    assert (
-        fit_to("boosting", db_uT, target).predict(query_uT) == fit_to("boosting", db_uT, target).predict(query_uT)
-    ).all()
 
 
 @every_method
@@ -304,7 +295,7 @@ def test_nan_readings_are_refused():
     db_uT, target = rows()
     db_uT[3, 1] = np.nan
     with pytest.raises(TrainingError, match="inputs of 1 rows are not finite"):
-        fit_to("boosting", db_uT, target)
+        fit_to("ridge", db_uT, target)
 
 
 def test_each_method_has_a_title_and_requires_its_settings():
@@ -313,4 +304,4 @@ def test_each_method_has_a_title_and_requires_its_settings():
     with pytest.raises(ValidationError, match="extra"):
         settings_of("ridge", gamma=1.0)
     titles = [settings_of(method).title for method in SETTINGS]
-    assert titles == ["ridge", "cubic ridge", "k nearest neighbours", "RBF kernel ridge", "gradient boosting"]
+    assert titles == ["ridge", "cubic ridge", "k nearest neighbours", "RBF kernel ridge"]

@@ -116,9 +116,8 @@ def all_experiments(source: str = "simulated") -> dict:
             "monotonic": {"holds": True, "spearman": 0.99},
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
-        "contacts": {"pairs_n": 3}, "touches": {"superposition": {}}, "compare": {"by_board": {}},
+        "compare": {"by_board": {}},
         "ambient": {"fields_uT": [1.0]},
-        "dynamics": {"presses_n": 3, "rate_hz": 400.0},
         "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
     }  # fmt: skip
 

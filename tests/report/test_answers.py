@@ -113,18 +113,6 @@ def test_answer_uses_experiment_random_presses_if_it_was_run():
     assert "so the scores are optimistic" in answers(numbers | {"random_presses": {"draws_n": 10, "rows": rows}}).tested
 
 
-@pytest.mark.parametrize(("dropped", "leads"), [("single", "94.8 %"), ("", "78.0 %")])
-def test_answer_describes_the_universal_model_if_table_2_is_incomplete(dropped, leads):
-    numbers = scene(over(78.0, 73.8, 81.7), over(0.6, 0.4, 0.8))
-    numbers["table2"]["single"] = row(over(40.0, 30.0, 50.0), over(0.2, 0.1, 0.3))
-    numbers["table2"] = {name: scores for name, scores in numbers["table2"].items() if name != dropped}
-    told = {"way": "universal", "labels_n": 0, "pokes_n": 65} | row(over(94.8, 91.9, 96.7), over(0.8, 0.7, 0.9))
-    found = answers(numbers | {"population": {"told": [told]}})
-    assert found.place.short.startswith(leads)
-    assert ("adapted: 78.0 %" in found.place.second) == (dropped == "single")
-    assert ("Universal model" in found.place.second) == (dropped == "")
-
-
 def test_answer_states_the_numbers_of_boards_and_skins_if_the_protocol_is_missing():
     numbers = scene(over(86.0, 78.0, 91.5), over(0.8, 0.7, 0.9))
     numbers["described"] = {"grid": {"over_skins": {"rest_changes_in_1_uT": {"mean": 5.0, "n": 18}}}}

@@ -1,16 +1,10 @@
 """Tests of the tables about training with many skins, and of the blocks in README and docs that contain them."""
 
-from itertools import pairwise
-
-from hypothesis import given
-from hypothesis import strategies as st
-
 from pipeline.formatting import CONTROL, to_markdown
 from pipeline.paper import TABLE_2
 from pipeline.report.readme import blocks_of
 from pipeline.report.tables import (
     audit_table,
-    baselines_table,
     chosen_table,
     labels_table,
     make_tables,
@@ -121,15 +115,6 @@ def test_rows_of_sweeps_are_sorted_by_count():
     assert table["method"].tolist() == ["multi-sensor", "adapted"] * 2
 
 
-@given(st.lists(st.floats(0, 100), min_size=1, max_size=9))
-def test_reference_methods_are_sorted_by_accuracy(accuracies):
-    rows = [{"method": f"m{i}", "inputs": "raw", "rows_n": 9, **row(value)} for i, value in enumerate(accuracies)]
-    methods = baselines_table(rows, "recorded")["method"].tolist()
-    assert sorted(methods) == sorted(f"m{i}" for i in range(len(rows)))
-    shown = [accuracies[int(name[1:])] for name in methods]
-    assert all(a >= b for a, b in pairwise(shown))
-
-
 def test_table_of_labels_has_scores_as_labelled_and_registered():
     one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
     (line,) = labels_table([one], "recorded").to_dict("records")
@@ -179,7 +164,6 @@ def all_numbers() -> dict:
         "capture": {"captures_n": 18, "left_out": {}},
         "sweep_pokes": [{"pokes_n": 0, **row(81.0)}],
         "sweep_sensors": [{"method": "multi", "skins_n": 3, **row(60.0)}],
-        "baselines": [one | {"rows_n": 9} | row(30.0)],
         "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
         "audit": [check],
         "chosen": {
@@ -204,7 +188,6 @@ def test_table_of_each_experiment_names_its_source():
         "paired_boards",
         "sweep_pokes",
         "sweep_sensors",
-        "baselines",
         "labels",
         "audit",
         "chosen",

@@ -15,17 +15,15 @@ from tests.report.synthetic import all_experiments, cost, scores, stat
 from tests.stages.checkout import ROOT
 
 SWEPT = [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390)]
-METHODS = [{"method": name, "inputs": "raw", "name": name, **scores()} for name in ("ridge", "knn")]
 STUDY = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "work_n": 9, "error": 0.1, "failure": None}
 
 
 def run(seconds: float) -> dict:
-    """Return the numbers of a run with run times of every kind. One method was not timed."""
+    """Return the numbers of a run with run times of every kind."""
     trainings = {
         "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
-        "train_classical": [{"name": "ridge.b0", "train_s": seconds, "one_reading_s": seconds / 1e3}],
     }
-    numbers = all_experiments() | {"sweep_pokes": SWEPT, "baselines": METHODS}
+    numbers = all_experiments() | {"sweep_pokes": SWEPT}
     numbers["provenance"] |= {"git": f"code {seconds}", "device": f"machine {seconds}", "seconds": seconds}
     numbers["runtime"] = {
         "trainings_n": 1, "stages": {"report": cost(seconds)}, "choice": {"setting": "1 mm x 5"},

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from pipeline.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
 from pipeline.paper import TABLE_2
-from pipeline.report.figures import HEADLINE, headline_figures
 from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
 from pipeline.report.readme import fill
 from pipeline.report.tables import (
@@ -33,7 +32,7 @@ from pipeline.training.universal import METHODS, WAYS
 from reskin.errors import ParamsError, SchemaError
 from reskin.io import read_json
 from tests.report import synthetic
-from tests.report.synthetic import all_experiments, over_boards, stat, texts_of
+from tests.report.synthetic import all_experiments, stat
 from tests.stages.checkout import ROOT
 
 
@@ -127,7 +126,7 @@ def test_lost_bytes_and_rows_are_counted_for_each_protocol():
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
         "variation": wear,  # This experiment uses the captures of `drift`, which are counted once.
         "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
-        "contacts": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
+        "ambient": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
     }
     found = lost_by_protocol(losses)
     assert set(found) == {"wear", "drag"}
@@ -241,23 +240,6 @@ def test_summary_has_our_scores_beside_the_papers_and_a_row_for_the_control():
                 assert table.loc[title, f"{column} (paper)"].endswith(f"({TABLE_2[name][metric][0]:.3g})")
     assert "(" not in table.loc[CONTROL, "accuracy, % (paper)"]
     assert "R² of F" in table
-
-
-def test_first_row_of_the_summary_is_the_universal_model_without_labels():
-    numbers = all_experiments()
-    rows = [
-        {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
-        | {metric: numbers["table2"]["multi"][metric] for metric in ("mse_xy_mm2", "mse_f_N2")}
-        for way, pokes_n, labels_n, accuracy in (
-            ("universal", 16, 0, (70.0, 72.0)), ("universal", 65, 0, (90.0, 92.0)), ("universal", 65, 5, (95.0, 97.0)),
-            ("map", 65, 0, (50.0, 52.0)),
-        )
-    ]  # fmt: skip
-    numbers |= {"population": {"told": rows}}
-    first = summary_table(numbers).iloc[0]
-    assert "65 unlabelled pokes" in first[HELD_OUT]
-    assert first["accuracy, % (paper)"] == "91.0 [90.0, 92.0]"
-    assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
 
 
 def test_summary_of_recordings_has_scores_with_labels():

@@ -39,21 +39,14 @@ from tests.compiled import compile_kernels
 from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 
 LEARNING = (
-    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
-    "few_labels", "audit",
+    "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "few_labels", "audit",
 )  # fmt: skip
-RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
+RANDOM = ("drift", "manual", "ambient")  # experiments with random draws
 # Scene ci runs all experiments except these, which need recordings or many skins.
 EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
-    "reference_methods",
     "random_presses",
-    "mounting",
-    "recorded_limits",
-    "touches",
     "moving_hand",
-    "population",
-    "worlds",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
 # The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
@@ -163,7 +156,6 @@ def test_experiments_on_many_skins_have_scores_for_each_board(story, numbers):
     assert set(boards_n.values()) == {3}
     assert all(len(row["by_board"]) == row["accuracy_pct"]["n"] for row in numbers["paired"])
     assert all(row["accuracy_pct"]["n"] == 3 for row in [*numbers["sweep_sensors"], *numbers["sweep_pokes"]])
-    assert {row["method"] for row in numbers["baselines"]} >= {"network", "network, adapted", "ridge"}
     assert {row["labels_n"] for row in numbers["labels"]} == {0, 10}
     assert all(check["holds"] or check["known"] for check in numbers["audit"])
     rows_n = {
@@ -174,7 +166,6 @@ def test_experiments_on_many_skins_have_scores_for_each_board(story, numbers):
     assert rows_n == {2 * 130 * 5}  # two skins x 130 presses of the second pass x 5 readings
     for name in ("sweep_pokes", "sweep_sensors"):
         assert "<svg" in (story / f"reports/ci/figures/{name}.svg").read_text()
-    assert "<svg" in (story / "reports/ci/runtime/training.svg").read_text()
 
 
 def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
@@ -191,7 +182,7 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
     assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"bound", "drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"drift", "variation", "manual"}
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.stages.train import ClassicalMethods
 from pipeline.training import few_labels as few
 from pipeline.training.few_labels import FewLabels as Settings
 from reskin.config import parse
@@ -275,15 +274,3 @@ def test_adaptation_uses_only_the_order_along_lines():
 def test_invalid_few_labels_settings_are_an_error(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         study(**changes)
-
-
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"rows_max_n": 0}, "train_classical: rows_max_n must be greater than or equal to 1; got 0"),
-        ({"methods": {"a b": SETTINGS["methods"]["ridge"]}}, "methods.a b.* must"),
-    ],
-)
-def test_invalid_classical_settings_are_an_error(changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
-        parse(ClassicalMethods, {"rows_max_n": 5, "methods": SETTINGS["methods"]} | changes, "train_classical")
