@@ -276,7 +276,7 @@ def test_note_says_that_a_run_is_shorter_than_the_papers_protocol():
     assert line(numbers, "figure-5b")["note"] == NOT_RUN
 
 
-@pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
+@pytest.mark.parametrize("name", ["temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
 def test_numbers_that_are_settings_of_the_simulated_rig_are_not_judged(name):
     assert line(all_experiments("simulated"), name)["note"] == SETTING
     assert line(all_experiments("recorded"), name)["met"] in ("yes", "–")

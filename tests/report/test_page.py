@@ -313,7 +313,7 @@ def test_results_of_experiments_come_before_checks_and_captures():
 def test_missing_experiment_has_no_section_on_the_page():
     keys = [section.key for section in arrange(["table2", "captures"], [])]
     assert keys == ["headline", "captures"]
-    assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
+    assert [section.key for section in arrange(["shear", "paired", "drift"], ["quadratures.svg"])] == [
         "shear", "drift", "skins", "costs",
     ]  # fmt: skip
 
