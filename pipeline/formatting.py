@@ -15,7 +15,6 @@ from pipeline.statistics import UNDECIDED, Stat, as_json
 Statistic = Stat | Mapping[str, Any]  # a statistic, or its entry in numbers.json
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
-FORCE_METRICS = ("mse_f_N2", "r2_f")  # metrics that do not depend on offsets of positions
 PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
 FEW_POINTS = 5.0  # assumed; the paper says of a drop of 3.4 points that it "slightly affects performance"
 MEANING = (

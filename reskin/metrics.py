@@ -90,19 +90,6 @@ def coverage_pct(
     return 100 * float(((low <= true) & (true <= high)).mean())
 
 
-def interval_score(
-    true: Float[np.ndarray, "..."], low: Float[np.ndarray, "..."], high: Float[np.ndarray, "..."]
-) -> float:
-    """Return the mean interval score of 90 % intervals; a smaller score is better.
-
-    The score of an interval is its width. If the true value is outside the interval, 20 times its distance from the
-    interval is added. The expected score is smallest if the limits of the interval are the true 5 % and 95 % quantiles
-    (Gneiting & Raftery, JASA 2007).
-    """
-    outside = np.maximum(low - true, 0) + np.maximum(true - high, 0)
-    return float((high - low + 2 / 0.1 * outside).mean())
-
-
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift all predicted places by the same offset, so that the mean error of x and the mean error of y become zero.
 

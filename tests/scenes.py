@@ -31,7 +31,6 @@ SHARED: dict[str, object] = {
     "recipes": {"paper": SHARED_RECIPE, "triplet": SHARED_RECIPE | {"triplet_weight": 0.1}},
     "adaptations": {"paper": {"unlabelled_weight": 0.1} | SCHEDULE},
     "labellings": {"few": {"own_weight": 1.0} | SCHEDULE},
-    "methods": {"all": {"ridge": {"method": "ridge", "inputs": "raw", "alpha": 1.0}}},
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 

@@ -39,7 +39,7 @@ def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
     for key, value in settings.items() if isinstance(settings, dict) else ():
         if not names_depth:
             yield key
-        levels_n = 2 if key == "methods" else 1 if key in NAMED else 0
+        levels_n = 1 if key in NAMED else 0
         yield from keys(value, max(levels_n, names_depth - 1))
 
 

@@ -156,7 +156,6 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
-    (PARAMS, "methods.tiny.ridge.alpha=2.0", {"few_labels"}),
     (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "ambient", "runtime"}),
     (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "ambient"}),
     (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),

@@ -13,7 +13,6 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
-from pipeline.executors import InProcessExecutor
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import COLUMNS, scores, show, tabulate
 from pipeline.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
@@ -21,14 +20,14 @@ from pipeline.plot import COLOURS, ERROR_COLOURS, drawing, svg
 from pipeline.scores import make_table, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
-from pipeline.stage import say
 from pipeline.statistics import statistic, tally
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score
-from reskin.models.classical import ClassicalJob, Neighbours, run_classical_jobs
-from reskin.models.job import TrainingData, TrainingJob
+from reskin.models.inputs import VIEW
+from reskin.models.job import TrainingJob
+from reskin.models.neighbours import fit_neighbours
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
@@ -151,15 +150,12 @@ def predict_by_neighbours(
 
     The inputs are either dB (key `knn-raw` of the result) or the shape of dB (key `knn-shape`).
     """
-    none = np.zeros(0, np.int64)
-    tasks = [
-        ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
-             train, test, none, len(train), data.settings.seed)
-        for inputs in ("raw", "shape")
-    ]  # fmt: skip
-    rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
-    done = run_classical_jobs(tasks, rows, InProcessExecutor(), lambda line: say(f"{data.scene} sleeve: {line}"))
-    return {task.name: [result.predicted] for task, result in zip(tasks, done, strict=True)}
+    predictions = {}
+    for name in ("raw", "shape"):
+        trained_on, tested = (VIEW[name](data.rows.db_uT[rows]) for rows in (train, test))
+        fitted = fit_neighbours(trained_on, data.rows.target[train], section.neighbours_n)
+        predictions[f"knn-{name}"] = [fitted.predict(tested)]
+    return predictions
 
 
 def rate_hz(captures: Sequence[Readings]) -> float:

@@ -47,7 +47,6 @@ NONE_HELD_OUT = "no board held out"
 ANSWER, SECOND, COMPARED = "answer", "second", "compared"
 RIG, SHIPPED = IN_CONTEXT  # methods of experiment new_board
 ADAPTED = "Multi-sensor with triplet loss, adapted"
-NETWORK = "Network of the paper, trained on the other boards"
 CHOSEN_ON = "lab"  # the scene on whose boards details of the universal model were chosen (docs/learning.md)
 USABLE = {YES: " (usable)", PARTLY: " (partly usable)", NO: " (not usable)"}
 WITHIN_SKIN = ("single_temporal", "single_pass", "single_indentation")  # the first of these that the scene ran is shown

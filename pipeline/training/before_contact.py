@@ -22,12 +22,11 @@ from reskin import io
 from reskin.data.rows import Selection, contacts
 from reskin.data.splits import SAME_SKIN, Fold
 from reskin.metrics import score
-from reskin.models.classical import Neighbours, fit
+from reskin.models.neighbours import fit_neighbours
 from reskin.models.trained import Network
 from reskin.schema import Readings
-from reskin.seeds import rng_for
 
-NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
+NEIGHBOURS_N = 2
 PLACE = ("accuracy_pct", "mse_xy_mm2")
 MAGNITUDES = ("hover_uT", "touch_uT")  # names of the median |dB| of hovering rows, and of contacts at about 1 N
 TOUCH_N = (0.8, 1.2)  # range of forces of the contacts at about 1 N
@@ -141,8 +140,7 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     if not in_test_passes.any():
         return []
     db_uT, place_mm = hover.db_uT[in_test_passes], hover.place_mm[in_test_passes]
-    rng = rng_for(data.settings.seed, "before-touch", "hover")
-    neighbours = fit(NEIGHBOURS, rows.db_uT[fold.train], rows.target[fold.train], rng, weight=None)
+    neighbours = fit_neighbours(rows.db_uT[fold.train], rows.target[fold.train], NEIGHBOURS_N)
     predictions = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
     force_N = rows.target[fold.test, 2]
     touch_uT = np.linalg.norm(rows.db_uT[fold.test][(force_N > TOUCH_N[0]) & (force_N < TOUCH_N[1])], axis=1)
@@ -161,7 +159,6 @@ def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> dict[str, float]:
     """Train nearest neighbours on inputs without the contact's signal, and score the places predicted for test rows."""
-    rng = rng_for(data.settings.seed, "before-touch")  # `fit` needs it; nearest neighbours do not use it
-    fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
+    fitted = fit_neighbours(inputs[train], data.rows.target[train], NEIGHBOURS_N)
     scores = score(data.rows.target[test], fitted.predict(inputs[test]))
     return {name: scores[name] for name in PLACE}

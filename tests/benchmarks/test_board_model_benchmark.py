@@ -22,12 +22,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from jaxtyping import Float, Int64
+from pipeline.training.universal import draw_prior_skins, law_error
 from scipy.spatial.transform import Rotation
+from sklearn.kernel_ridge import KernelRidge
+from sklearn.preprocessing import StandardScaler
 
 from pipeline.training.shipping import make_model, read_inputs
-from pipeline.training.universal import draw_prior_skins, law_error
-from reskin.config import parse
-from reskin.models.classical import RbfRidge, fit
 from reskin.models.inputs import VIEW
 from reskin.recordings.readers import READERS
 from reskin.schema import Readings
@@ -39,12 +39,10 @@ from reskin.universal.network import FULL_SET_N
 from reskin.universal.presses import cosines, magnitudes_uT
 from reskin.universal.presses import pool as pool_captures
 from tests.benchmarks import FULL, size
-from tests.recordings.headers import DEFAULT_POLICY, PARAMS, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 ROOT = Path(__file__).resolve().parents[2]
 LABELS_N, SEEDS_N, SKINS_N = size((0, 10, 40), (0, 10)), size(5, 1), size(12, 1)
-# The settings of this method were not tuned on eFlesh pads.
-CLASSICAL = parse(RbfRidge, PARAMS["methods"]["few-labels"]["rbf-shape"], "params.yaml")
 FORCE_MIN_N = 0.3  # the smallest force that the layout's model estimates; readings with a smaller force are not used
 PITCH_MM = 8.0  # assumed distance between the nine places of `eflash7`, which the recordings do not state
 
@@ -76,10 +74,16 @@ def by_model(
 
 
 def by_ridge(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:
-    """Fit RBF kernel ridge to the first labels of a pool."""
-    target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n].astype(np.float32)
-    train, test = (VIEW[CLASSICAL.inputs](presses.db_uT.astype(np.float32)) for presses in (pool, tested))
-    return fit(CLASSICAL, train[:labels_n], target, rng_for(0, "ridge"), weight=None).predict(test)
+    """Fit RBF kernel ridge to the first labels of a pool. Its settings were not tuned on eFlesh pads."""
+    target = np.column_stack([pool.place_mm, pool.force_N])[:labels_n]
+    known = np.isfinite(target).all(axis=0)
+    train, test = (VIEW["shape"](presses.db_uT.astype(np.float32)) for presses in (pool, tested))
+    inputs, outputs = StandardScaler().fit(train[:labels_n]), StandardScaler().fit(target[:, known])
+    ridge = KernelRidge(kernel="rbf", alpha=0.1, gamma=0.1)
+    ridge.fit(inputs.transform(train[:labels_n]), outputs.transform(target[:, known]))
+    predicted = np.full((len(test), 3), np.nan)
+    predicted[:, known] = outputs.inverse_transform(ridge.predict(inputs.transform(test)))
+    return predicted
 
 
 def by_mean(pool: Presses, tested: Presses, labels_n: int) -> Float[np.ndarray, "m 3"]:

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pipeline.training.universal_variants import Frame
 
 from pipeline.experiments import moving_hand as hand
 from pipeline.experiments.compare import chip_rotations
 from pipeline.experiments.moving_hand import FIRST_HALF, MAGNET, NO_FIELD, OTHER, TURNED, MovingHand, Pad
 from pipeline.settings import read_settings
 from pipeline.stages.ingest import ingest
-from pipeline.training.universal_variants import Frame
 from reskin import io
 from reskin.config import parse
 from reskin.data.contact import CONTACT_SDS, magnitudes_uT

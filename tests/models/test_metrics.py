@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from sklearn.metrics import r2_score
 
-from reskin.metrics import METRICS, coverage_pct, interval_score, median_error_mm, register, score, score_groups
+from reskin.metrics import METRICS, median_error_mm, register, score, score_groups
 
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
@@ -87,16 +87,6 @@ def test_registration_subtracts_one_offset_per_board():
     scores = score_groups(TRUE, TRUE + offset, BOARD, SKIN)
     assert scores["all"]["accuracy_pct"] == 0.0
     assert scores["registered"]["accuracy_pct"] == 100.0
-
-
-def test_interval_score_is_smallest_for_intervals_between_the_error_quantiles():
-    errors = np.random.default_rng(2).standard_normal(200_000)
-    ends = np.ones(len(errors))
-    scores = {width: interval_score(errors, -width * ends, width * ends) for width in (1.2, 1.645, 2.2)}
-    assert min(scores, key=scores.__getitem__) == 1.645
-    assert interval_score(np.array([3.0]), np.array([-1.0]), np.array([1.0])) == pytest.approx(2 + 20 * 2)
-    # The tolerance is four standard errors of a proportion of 0.9 in 200,000 values.
-    assert coverage_pct(errors, -1.645 * ends, 1.645 * ends) == pytest.approx(90, abs=0.27)
 
 
 def test_median_place_error_is_the_median_of_distances():

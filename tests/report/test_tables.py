@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pipeline.training.universal import METHODS, WAYS
 
 from pipeline.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
 from pipeline.paper import TABLE_2
@@ -28,7 +29,6 @@ from pipeline.report.tables import (
     verification_table,
 )
 from pipeline.scores import rows_of_cards
-from pipeline.training.universal import METHODS, WAYS
 from reskin.errors import ParamsError, SchemaError
 from reskin.io import read_json
 from tests.report import synthetic
