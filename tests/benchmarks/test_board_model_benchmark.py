@@ -24,8 +24,7 @@ import pytest
 from jaxtyping import Float, Int64
 from scipy.spatial.transform import Rotation
 
-from pipeline.training.shipping import make_model, read_inputs
-from pipeline.training.universal import draw_prior_skins, law_error
+from pipeline.training.shipping import draw_prior_skins, law_error, make_model, read_inputs
 from reskin.config import parse
 from reskin.models.classical import RbfRidge, fit
 from reskin.models.inputs import VIEW
