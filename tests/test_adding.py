@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 from pipeline import PLAN, SCENES, plan
 from pipeline.cli import app
-from pipeline.experiments.compare import Compare
 from pipeline.manage import add
 from pipeline.manage import new as creating
 from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_scene
 from pipeline.settings import read_settings
+from pipeline.training.recorded import Compare
 from pipeline.training.shipping import read_layout_of
 from reskin import config
 from reskin.board.wire import encode
@@ -110,7 +110,7 @@ def test_recording_that_differs_from_the_simulated_skin_is_added_with_a_warning(
             raise found
         return found
 
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", find_departure)
+    monkeypatch.setattr("reskin.universal.frames.find_departure", find_departure)
     arguments = recorded_scene()
     arguments["experiments"] = [*arguments["experiments"], "compare"]
     arguments["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
@@ -127,7 +127,7 @@ def test_recording_is_not_compared_with_the_skin_if_the_scene_has_no_section_com
     root, lab_file, monkeypatch, capsys
 ):
     monkeypatch.setattr(
-        "pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("find_departure must not be called")
+        "reskin.universal.frames.find_departure", lambda *_: pytest.fail("find_departure must not be called")
     )
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
@@ -489,7 +489,7 @@ def test_reskin_new_creates_a_scene_with_the_experiments_that_its_boards_allow(r
 
 def test_table_without_a_column_of_passes_is_added_with_a_warning(root, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(root)
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: None)
+    monkeypatch.setattr("reskin.universal.frames.find_departure", lambda *_: None)
     output_of(["new", "mine", "--boards", "b1,b2", "--presses", "20", "--passes", "2"])
     rng = rng_for(0, "passes")
     places_mm = np.concatenate([rng.permutation([[i, i % 5] for i in range(20)]) for _ in range(2)])

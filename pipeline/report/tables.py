@@ -253,7 +253,7 @@ def compare_table(numbers: Numbers, source: str) -> pd.DataFrame:
     """List how each recorded board is oriented, and how well each simulation agrees with it."""
     lines = []
     for board, of_board in numbers["by_board"].items():
-        line = {"board": board, "source": source, "orientation": of_board["frames"]["sentence"]}
+        line, orientation = {"board": board, "source": source}, {"orientation": of_board["frames"]["sentence"]}
         simulations = {"fitted": of_board} if "cosine_mean" in of_board else {}
         simulations |= {name: of_board[name] for name in ("refitted", "nominal") if name in of_board}
         for name, agreed in simulations.items():
@@ -262,8 +262,8 @@ def compare_table(numbers: Numbers, source: str) -> pd.DataFrame:
                 "simulation": SIMULATIONS[name], "cosine": f"{agreed['cosine_mean']:.3f}",
                 "explained": f"{agreed['explained_median']:.3f}",
                 "growth (recorded)": f"{grown['simulated']:.2f} ({grown['recorded']:.2f})" if grown else "–",
-            })  # fmt: skip
-        lines += [line] * (not simulations)
+            } | orientation)  # fmt: skip
+        lines += [line | orientation] * (not simulations)
     return tabulate(lines, meaning=COMPARE_MEANING)
 
 

@@ -48,6 +48,7 @@ class Measured(Strict):
 
     scene: str
     source: Literal["recorded"]
+    model_sha256: str  # digest of the model file whose results these are
     places: tuple[MeasuredAccuracy, ...]  # sorted by presses_n, and then by labels_n
     detection: MeasuredDetection
 
@@ -134,13 +135,16 @@ def _join(values: Sequence[float], digits: str) -> str:
 
 
 def _measured_of(model: Universal) -> Measured | None:
-    """Return the results of a model if it is the shipped universal model; return None for any other model."""
-    return _shipped()[1] if model.card == _shipped()[0] else None
+    """Return the results of a model if it is the shipped universal model, and if these results belong to its file."""
+    card, measured = _shipped()
+    return measured if model.card == card else None
 
 
 @cache
-def _shipped() -> tuple[dict[str, Any], Measured]:
-    return io.read_json(FILE.with_suffix(".json")), read_measured(MEASURED_FILE)
+def _shipped() -> tuple[dict[str, Any], Measured | None]:
+    """Return the card of the shipped model, and its results; None if they are results of another model file."""
+    measured = read_measured(MEASURED_FILE)
+    return io.read_json(FILE.with_suffix(".json")), measured if measured.model_sha256 == io.sha256(FILE) else None
 
 
 def read_measured(file: Path) -> Measured:

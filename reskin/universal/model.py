@@ -1148,7 +1148,7 @@ def _read_parts(
     of_residual = {name: parts.pop(key) for name in RESIDUAL if (key := f"residual.{name}") in parts}
     residual = None
     if of_residual:
-        noise = float(of_residual.pop("noise"))
+        noise = float(of_residual.pop("noise").item())
         residual = Residual(**{name: values.astype(float) for name, values in of_residual.items()}, noise=noise)
     layout = as_layout(card["layout"], f"{card_file}: layout")
     tables = Tables(names=tuple(card["spreads"]), **map_arrays, area=layout.places)

@@ -34,11 +34,9 @@ class RecordedPresses:
     ----------
     board : name of the board
     groups : names of the groups
-    group_i, capture_i : indices of the group and of the capture of each press
+    group_i : index of the group of each press
     place_mm, force_N : place and force of each press
     db_uT, noload_uT : field change of each press, and the no-load reading before it
-    noise_uT : standard deviation of readings from the mean of their press, along x, y and z; NaN if presses have only
-        one reading
     excluded_n : number of presses that were excluded, because their place is unknown, or because their force is unknown
         or is not above 0 N
     forces_known : False if no press has a known force. In this case, `force_N` is NaN.
@@ -47,12 +45,10 @@ class RecordedPresses:
     board: str
     groups: tuple[str, ...]
     group_i: Int[np.ndarray, " n"]
-    capture_i: Int[np.ndarray, " n"]
     place_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    noise_uT: Float[np.ndarray, "3"]
     excluded_n: int
     forces_known: bool = True
 
@@ -67,10 +63,9 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
     all presses with a known place are kept. Raises SchemaError if no press is left.
     """
     parts = [_means(readings) for readings in captures]
-    capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
-    place_mm, force_N, db_uT, noload_uT, var_uT2 = (
-        np.concatenate([part[i] for part in parts]).astype(float) for i in range(1, 6)
+    place_mm, force_N, db_uT, noload_uT = (
+        np.concatenate([part[i] for part in parts]).astype(float) for i in range(1, 5)
     )
     placed = np.isfinite(place_mm).all(axis=1)
     forces_known = with_force or bool(np.isfinite(force_N).any())
@@ -83,9 +78,8 @@ def pool(captures: Sequence[Readings], *, with_force: bool = True) -> RecordedPr
         )
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
-        capture_i=capture_i[known],
         place_mm=place_mm[known], force_N=force_N[known], db_uT=db_uT[known], noload_uT=noload_uT[known],
-        noise_uT=_noise_uT(var_uT2), excluded_n=int((~known).sum()), forces_known=forces_known,
+        excluded_n=int((~known).sum()), forces_known=forces_known,
     )  # fmt: skip
 
 
@@ -105,19 +99,15 @@ def pool_skins(captures: Sequence[Readings], *, with_force: bool = True) -> dict
 def thin(presses: RecordedPresses, most_n: int) -> RecordedPresses:
     """Select at most `most_n` presses, evenly distributed over the recording."""
     kept = np.unique(np.linspace(0, len(presses) - 1, most_n).round().astype(int))
-    names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
+    names = ("group_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(presses, **{name: getattr(presses, name)[kept] for name in names})
-
-
-def _noise_uT(var_uT2: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, "3"]:
-    return np.full(3, np.nan) if np.isnan(var_uT2).all() else np.sqrt(np.nanmean(var_uT2, axis=(0, 1)))
 
 
 def _means(readings: Readings) -> tuple[np.ndarray, ...]:
     """Return means over the readings of each press.
 
-    The result contains, for each press, the name of its group, its place, its force, its field change, its no-load
-    reading, and the variance of its readings.
+    The result contains, for each press, the name of its group, its place, its force, its field change and its
+    no-load reading.
     """
     _, first, press_i, counts = np.unique(
         readings.indentation, return_index=True, return_inverse=True, return_counts=True
@@ -131,11 +121,9 @@ def _means(readings: Readings) -> tuple[np.ndarray, ...]:
 
     b_uT, noload_uT = readings.b_uT.astype(float), readings.noload_uT[first].astype(float)
     mean_uT = mean(b_uT)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a single reading has no variance
-        var_uT2 = mean((b_uT - mean_uT[press_i.ravel()]) ** 2) * (counts / (counts - 1))[:, None]
     group = _name_groups(readings.capture, readings.depth_mm[first])
     place_mm = np.stack([readings.x_mm[first], readings.y_mm[first]], axis=1)
-    fields = [values.reshape(chips) for values in (mean_uT - noload_uT, noload_uT, var_uT2)]
+    fields = [values.reshape(chips) for values in (mean_uT - noload_uT, noload_uT)]
     return group, place_mm, mean(readings.Fz_N.astype(float)), *fields
 
 

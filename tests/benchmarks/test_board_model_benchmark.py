@@ -22,12 +22,11 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from jaxtyping import Float, Int64
-from pipeline.training.universal import draw_prior_skins, law_error
 from scipy.spatial.transform import Rotation
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.preprocessing import StandardScaler
 
-from pipeline.training.shipping import make_model, read_inputs
+from pipeline.training.shipping import draw_prior_skins, law_error, make_model, read_inputs
 from reskin.models.inputs import VIEW
 from reskin.recordings.readers import READERS
 from reskin.schema import Readings

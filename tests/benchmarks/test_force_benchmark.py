@@ -9,9 +9,9 @@ recorded press is used.
 from statistics import median
 
 import numpy as np
-
 from pipeline.experiments.random_presses import r2
-from pipeline.training.universal import draw_prior_skins, law_error
+
+from pipeline.training.shipping import draw_prior_skins, law_error
 from reskin.seeds import rng_for
 from reskin.universal import model as universal
 from reskin.universal.batches import NOMINAL_NAME, SkinPrior

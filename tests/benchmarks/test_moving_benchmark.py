@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-
 from pipeline.experiments.random_presses import place_scores, raise_forces
 from pipeline.training.universal import draw_prior_skins, law_error, split_presses
+
 from reskin.data.grid import CENTRE_MM
 from reskin.physics import external
 from reskin.seeds import rng_for

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.training.shipping import NO_POWERS, calibrate
-from pipeline.training.universal import AS_TRAINED, draw_prior_skins, law_error, split_presses
+from pipeline.training.shipping import AS_TRAINED, NO_POWERS, calibrate, draw_prior_skins, law_error, split_presses
 from reskin.config import parse
 from reskin.data.grid import SKIN_MM
 from reskin.physics.skin import SkinDesign

@@ -56,7 +56,10 @@ def make_board(seed: int = 1) -> Board:
         reskin.draw_skin(seed=seed), np.column_stack([place_mm, depth_mm]), board=reskin.draw_board(seed=seed)
     )
     noload_uT = before_uT.mean(axis=0, dtype=float)
-    presses, press_i = Presses(place_mm, force_N, noload_uT + pressed_uT - before_uT), np.repeat(np.arange(len(place_mm)), 2)
+    presses, press_i = (
+        Presses(place_mm, force_N, noload_uT + pressed_uT - before_uT),
+        np.repeat(np.arange(len(place_mm)), 2),
+    )
     return Board(f"b{seed}", f"b{seed}_s0", noload_uT, presses, presses[press_i], press_i, press_i, MIDDLE_MM)
 
 

@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reskin import io
 from reskin.board import find
 from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.live import used_model
 from reskin.live.emulator import encode_pieces
 from reskin.live.page_recording import LabelledPress, PageRecording
 from reskin.live.server import receive
@@ -22,7 +24,7 @@ from reskin.models.trained import read_network
 from reskin.recordings import probe
 from reskin.recordings.header import HEADER_FILE, PROBE_FILE, parse
 from reskin.recordings.labels import Label
-from reskin.universal.model import load_universal
+from reskin.universal.model import FILE, load_universal
 from tests.live.boards import POKE_S, QUIET_S, ScriptReader, make_script, write_model
 from tests.live.test_estimators import QUIET_N, guided_pokes, make_poke_script, random_pokes  # noqa: F401 - fixtures
 from tests.live.test_record import places_of, read
@@ -329,6 +331,15 @@ def test_page_describes_the_universal_model_and_its_expected_accuracy(random_pok
     texts = describe(UniversalEstimator(other), other, "other.safetensors")
     assert texts["expected"] == "not measured for this model"
     assert texts["least_force"].startswith("not measured; trained with simulated forces from ")
+
+
+def test_measured_accuracy_belongs_to_the_shipped_model(monkeypatch):
+    measured, shipped = read_measured(MEASURED_FILE), load_universal()
+    assert measured.model_sha256 == io.sha256(FILE)
+    others = measured.model_copy(update={"model_sha256": "0" * 64})
+    monkeypatch.setattr(used_model, "read_measured", lambda _: others)
+    monkeypatch.setattr(used_model, "_shipped", used_model._shipped.__wrapped__)  # without its cache
+    assert describe(UniversalEstimator(shipped), shipped, "")["expected"] == "not measured for this model"
 
 
 def test_page_describes_networks_by_the_scores_in_their_model_cards(tmp_path):

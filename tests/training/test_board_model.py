@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pipeline.training.universal import draw_prior_skins, law_error
 from scipy.constants import milli
 
 import reskin
 from pipeline.training import shipping
-from pipeline.training.shipping import calibrate
+from pipeline.training.shipping import calibrate, draw_prior_skins, law_error
 from reskin import io, predicting
 from reskin.config import parse
 from reskin.errors import ParamsError, SchemaError

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from pipeline.training.universal import draw_prior_skins, law_error, split_presses
 from scipy import stats
 
-from pipeline.training.shipping import read_inputs
+from pipeline.training.shipping import draw_prior_skins, law_error, read_inputs, split_presses
 from reskin.data.grid import CENTRE_MM
 from reskin.seeds import rng_for
 from reskin.universal.force import (

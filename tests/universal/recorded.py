@@ -1,0 +1,35 @@
+"""Simulated presses on a board like those of scene lab, and the axes of these boards."""
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.training.recorded import Compare
+from reskin.config import parse, read_yaml
+from reskin.physics.skin import SkinDesign
+from reskin.seeds import rng_for
+from reskin.simulation.defaults import nominal
+from reskin.universal import law
+from reskin.universal.presses import RecordedPresses
+
+LAB = Path(__file__).resolve().parents[2] / "pipeline/scenes/lab.yaml"
+# The nominal skin is pressed with the same tip as the boards, because tables for another tip would take seconds to
+# compute.
+DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "nominal.yaml: skin")
+AXES = parse(Compare, read_yaml(LAB)["compare"], "lab.yaml: compare").axes(DESIGN)
+SETUP = AXES.setup
+TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
+
+
+def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
+    """Return simulated presses at 25 places with two forces each, along the axes of scene lab."""
+    rng = rng_for(0, "compare")
+    grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
+    place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
+    db_uT = np.einsum("kij,nki->nkj", AXES.rotations, law.simulate_uT(parameters, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", AXES.rotations, law.at_rest_uT(parameters, SETUP))
+    return RecordedPresses(
+        board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), place_mm=AXES.label(place_mm),
+        force_N=force_N, db_uT=db_uT + noise_uT * rng.standard_normal(db_uT.shape),
+        noload_uT=np.tile(rest_uT, (50, 1, 1)), excluded_n=0,
+    )  # fmt: skip

@@ -1,0 +1,16 @@
+"""Tests of the conversion of labels and readings to the axes of a board."""
+
+import numpy as np
+
+from reskin.universal.axes import BoardAxes
+from tests.universal.skins import SETUP
+
+AXES = BoardAxes(SETUP, (90.0,) * 5, (8.0, 7.0), labels_mirrored=True)
+
+
+def test_places_and_fields_are_converted_to_the_axes_of_the_board():
+    label_mm = np.array([[8.0, 7.0], [9.0, 10.0]])
+    np.testing.assert_allclose(AXES.place(label_mm), [[0, 0], [1, -3]])
+    np.testing.assert_allclose(AXES.label(AXES.place(label_mm)), label_mm)
+    rotated = AXES.field(np.tile([1.0, 2.0, 3.0], 5)[None])
+    np.testing.assert_allclose(rotated, np.tile([-2.0, 1.0, 3.0], 5)[None])
