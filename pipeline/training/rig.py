@@ -5,7 +5,7 @@ the laws are described by a Gaussian process (residual), and networks are traine
 presses of the other boards.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ class RigModel:
 
     prior: SkinPrior
     tables: Tables
-    networks: list[Weights]
+    networks: Sequence[Weights]
 
 
 def make_models(
