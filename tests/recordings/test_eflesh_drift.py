@@ -40,8 +40,7 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     assert [row["contacts_n"] for row in numbers["each"]] == [961, 2 * 961, 3 * 961, 4 * 961]
     assert all("mse_f_N2" not in row for row in numbers["each"])
     assert "late" not in numbers
-    assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
-    of_trainings = [one["of_trainings"] for one in numbers["findings"]]
-    # These are the verdicts over the three networks that were trained for each policy.
-    assert of_trainings == ["supported", "supported"]
+    assert numbers["claims"]["higher"]["mse_xy_mm2"]["mean"] > 0
+    assert numbers["claims"]["faster"]["mse_xy_mm2"]["mean"] > 0
+    assert "overestimates" not in numbers["claims"]
     assert numbers["contact_every_s"] > 1  # The time is in seconds per contact. A real rig takes more than one second.
