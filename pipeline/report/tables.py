@@ -97,8 +97,7 @@ CONSTANT = "constant force: the mean over the tested indentations"
 COLLAPSED_MEANING = (
     "A network has collapsed if its output is nearly constant, so that it explains almost nothing of some target on "
     "its own training rows. A collapsed network is trained again with other random draws, at most twice. A network "
-    "that collapses every time is kept and included in all means. The networks of stages train_* and adapt that were "
-    "kept in this way are also named in table audit. Very short training runs are not checked for collapse."
+    "that collapses every time is kept and included in all means. Very short runs are not checked for collapse."
 )
 REGISTERED_MEANING = (
     "Registered: before these scores are computed, the mean position error of each board is subtracted from the "
