@@ -115,7 +115,7 @@ def run(settings: Settings, section: Drift, captures: Sequence[Readings]) -> Res
         parts = np.split(result.predicted, np.cumsum([len(test.row) for test in tests])[:-1])
         for window_i, (test, predicted) in enumerate(zip(tests, parts, strict=True)):
             true_N, predicted_N = rows.target[test.row, FORCE].astype(float), predicted[:, FORCE].astype(float)
-            network = {"method": test.policy, "board": test.readings.board, "skin": test.readings.skin}
+            network: dict[str, Any] = {"method": test.policy, "board": test.readings.board, "skin": test.readings.skin}
             network |= {"recipe": job.recipe_name, "seed": job.seed_i, "contacts_n": test.contacts_n}
             scores.append(
                 {"experiment": "drift", **network, "window_i": window_i, "noload_off_uT": test.noload_off_uT}
@@ -166,7 +166,8 @@ def cut(captures: Sequence[Readings], section: Drift, selection: Selection) -> l
         remedy = "Record a longer capture, or reduce drift.every_n or drift.test_n in the scene."
         raise ParamsError("experiment drift", "the shortest capture", rule, shortest_n, remedy)
     spans = [(0, section.train_n), *((start, start + section.test_n) for start in starts)]
-    series, rows_n = [], 0
+    series: list[list[Window]] = []
+    rows_n = 0
     for capture in captures:
         unit_i = unit(capture, section)
         for policy in section.policies:
@@ -236,26 +237,29 @@ def measure(
     measured |= {"left_out_units_n": sum(max(0, n - section.every_n * len(series[0])) for n in units_n)}
     policy, late_i = late
     ends = [(train, tests[late_i]) for train, *tests in series if train.policy == policy]
-    late_numbers = {"policy": policy, "contacts_n": round(np.mean([window.contacts_n for _, window in ends]))}
-    left_pct = [force_left_pct(early.readings, window.readings) for early, window in ends]
-    if None not in left_pct:
-        late_numbers["force_left_pct"] = float(np.mean(left_pct))
+    late_numbers: dict[str, Any] = {
+        "policy": policy,
+        "contacts_n": round(np.mean([window.contacts_n for _, window in ends])),
+    }
+    left_pct = float(np.mean([force_left_pct(early.readings, window.readings) for early, window in ends]))
+    if not np.isnan(left_pct):
+        late_numbers["force_left_pct"] = left_pct
     return measured | pace(captures) | {"late": late_numbers}
 
 
-def force_left_pct(early: Readings, late: Readings) -> float | None:
+def force_left_pct(early: Readings, late: Readings) -> float:
     """Return the late force as a percentage of the early force, at equal places and depths.
 
-    The percentage is below 100 if the skin has softened. Returns None if no place was pressed to the same depth both
-    early and late with known forces.
+    The percentage is below 100 if the skin has softened. The result is NaN if no place was pressed to the same depth
+    both early and late with known forces.
     """
     sides = []
     for readings in (early, late):
         stop = {name: getattr(readings, name).round(DECIMALS) for name in ("x_mm", "y_mm", "depth_mm")}
         known = pd.DataFrame(stop | {"force_N": readings.Fz_N.astype(float)}).dropna()
         sides.append(known.groupby(list(stop))["force_N"].mean())
-    early_N, late_N = (total_N for _, total_N in pd.concat(sides, axis=1, join="inner", keys=[0, 1]).sum().items())
-    return float(100 * late_N / early_N) if early_N else None
+    early_N, late_N = pd.concat(sides, axis=1, join="inner").sum()
+    return float(100 * late_N / early_N) if early_N else float("nan")
 
 
 # --- Numbers ---
@@ -264,7 +268,7 @@ def force_left_pct(early: Readings, late: Readings) -> float | None:
 def numbers(found: Results) -> dict[str, Any]:
     """Compute the numbers of the report from the networks of the headline recipe."""
     scores = found.scores[found.scores["recipe"] == HEADLINE]
-    windows = {policy: window_means(rows) for policy, rows in scores.groupby("method", sort=False)}
+    windows = {str(policy): window_means(rows) for policy, rows in scores.groupby("method", sort=False)}
     measured = {name: value for name, value in found.measured.items() if name != "late"}
     if found.forces["indentation"].nunique() < 2:
         return measured | windows | {"claims": claims(scores)}
@@ -298,7 +302,7 @@ def late_bias(forces: pd.DataFrame) -> dict[str, Any]:
         bias = {"bias_N": error_N.mean(), "bias_pct": 100 * error_N.mean() / true_N.mean()}
         biases.append(bias | {"bias_se_N": error_N.sem(), "slope": true_N.cov(predicted_N) / true_N.var()})
     of_networks = forces.groupby(NETWORK, sort=False)[["true_N", "predicted_N"]].mean()
-    return pd.DataFrame(biases).mean().to_dict() | {
+    return {str(name): float(mean) for name, mean in pd.DataFrame(biases).mean().items()} | {
         "indentations_n": forces["indentation"].nunique(),
         "network_bias_N": (of_networks["predicted_N"] - of_networks["true_N"]).tolist(),
         "network_board": of_networks.index.get_level_values("board").tolist(),
@@ -318,16 +322,20 @@ def claims(scores: pd.DataFrame) -> dict[str, Any]:
     means = by_network[errors].mean()
     policies, windows_n = set(scores["method"]), scores["window_i"].nunique()
     frequent = [policy for policy in ("regular", "each") if policy in policies]
+
+    def compare(values: Any, policy: str, other: str) -> Mapping[str, Stat]:
+        return claim(values.loc[policy] - values.loc[other], errors)
+
     found: dict[str, Any] = {}
     if "initial" in policies and frequent:
-        found["higher"] = claim(means.loc["initial"] - means.loc[frequent[0]], errors)
+        found["higher"] = compare(means, "initial", frequent[0])
         if windows_n > 1:
             growth = by_network[["contacts_n", *errors]].apply(
                 lambda network: pd.Series(np.polyfit(network["contacts_n"], network[errors], 1)[0], errors)
             )
-            found["faster"] = claim(growth.loc["initial"] - growth.loc[frequent[0]], errors)
+            found["faster"] = compare(growth, "initial", frequent[0])
     if len(frequent) == 2:
-        found["each_is_worse"] = claim(means.loc["each"] - means.loc["regular"], errors)
+        found["each_is_worse"] = compare(means, "each", "regular")
     if "each" in policies:
         last = scores[(scores["method"] == "each") & (scores["window_i"] == windows_n - 1)]
         lasting = claim(last, ["accuracy_pct", *errors], differences=False)
@@ -335,7 +343,7 @@ def claims(scores: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
-def claim(networks: pd.DataFrame, metrics: Sequence[str], *, differences: bool = True) -> dict[str, Stat]:
+def claim(networks: pd.DataFrame, metrics: Sequence[str], *, differences: bool = True) -> Mapping[str, Stat]:
     """Summarise values of networks over boards, with the standard deviation over seeds."""
     rows = networks.reset_index()[[*NETWORK, *metrics]].groupby(NETWORK, as_index=False).mean()
     return add_seed_sd(summarise(board_means(rows), boards=True, differences=differences), rows, "board", "skin")

@@ -268,7 +268,7 @@ def test_remaining_force_compares_readings_at_equal_places_and_depths(left, orde
 
 @pytest.mark.parametrize("depth_mm", [2, np.nan])
 def test_remaining_force_is_unknown_if_no_place_is_visited_twice(depth_mm):
-    assert force_left_pct(readings_at([[0, 0, depth_mm]], [1]), readings_at([[0, 0, 1]], [1])) is None
+    assert np.isnan(force_left_pct(readings_at([[0, 0, depth_mm]], [1]), readings_at([[0, 0, 1]], [1])))
 
 
 # --- Run ---
