@@ -15,16 +15,17 @@ import pandas as pd
 from jaxtyping import Bool, Float32, Int64
 from pydantic import Field, model_validator
 
+from pipeline import statistics
 from pipeline.description import first_rows, pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import COLUMNS, show_difference
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
+from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
-from pipeline.statistics import Stat, add_seed_sd, board_means, summarise, tally
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs
 from reskin.data.baseline import alike_within_uT, free, rank
 from reskin.data.rows import Selection, contacts, gather
-from reskin.data.splits import Fold
+from reskin.data.splits import NO_POOL, Fold
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score
 from reskin.models.recipe import HEADLINE
@@ -72,25 +73,25 @@ class Drift(SectionWithTraining):
 class Results(NamedTuple):
     """Results of the experiment.
 
-    scores: one row per network and test window.
-    forces: the forces of the late window (figure 5b) as the networks of the headline recipe predict them. There is one
-        row per network and indentation, with the mean over the readings of the indentation.
-    measured: quantities that do not depend on the networks.
+    scores: one row per network and test window, in the table of scores.
+    measured: numbers that are not computed from the scores.
+    points: the points of figure 5b.
     trainings: the numbers of trained and of collapsed networks.
     """
 
     scores: pd.DataFrame
-    forces: pd.DataFrame
     measured: dict[str, Any]
+    points: dict[str, list[float]]
     trainings: dict[str, int]
 
 
-def drift(settings: Settings, section: Drift, indentations: Path, results: Path) -> None:
+def drift(settings: Settings, section: Drift, indentations: Path, scores: Path, results: Path) -> None:
     """Train and test networks for every no-load policy, on every capture of the scene, and write the results."""
     preload_training()
     found = run(settings, section, read_captures(indentations, tuple(settings.captures_in(indentations))))
+    write_scores(scores, found.scores)
     losses = read_losses(indentations, found.measured["dropped"])
-    write_results(results, numbers(found), {"late": points(found.forces)}, losses, found.trainings)
+    write_results(results, found.measured, {"late": found.points}, losses, found.trainings)
 
 
 def run(settings: Settings, section: Drift, captures: Sequence[Readings]) -> Results:
@@ -100,11 +101,12 @@ def run(settings: Settings, section: Drift, captures: Sequence[Readings]) -> Res
     rows = gather([window.readings for windows in series for window in windows], selection)
     tests_of = {f"{train.readings.skin}-{train.policy}": tests for train, *tests in series}
     folds = [
-        Fold("drift", name, train.row, np.concatenate([test.row for test in tests]), np.zeros(0, np.int64))
+        Fold("drift", name, train.row, np.concatenate([test.row for test in tests]), NO_POOL)
         for (name, tests), (train, *_) in zip(tests_of.items(), series, strict=True)
     ]
-    jobs = make_jobs(SceneData(settings.scene, settings, rows, folds), section.training, folds)
-    trained = train_jobs(SceneData(settings.scene, settings, rows, folds), jobs, "drift")
+    data = SceneData(settings.scene, settings, rows, folds)
+    jobs = make_jobs(data, section.training, folds)
+    trained = train_jobs(data, jobs, "drift")
     dropped = {reason: n // len(section.policies) for reason, n in rows.dropped.items()}  # the same for all policies
     late = late_window(series, section)
     measured = measure(captures, series, section, late) | {"dropped": dropped}
@@ -117,17 +119,19 @@ def run(settings: Settings, section: Drift, captures: Sequence[Readings]) -> Res
             true_N, predicted_N = rows.target[test.row, FORCE].astype(float), predicted[:, FORCE].astype(float)
             network: dict[str, Any] = {"method": test.policy, "board": test.readings.board, "skin": test.readings.skin}
             network |= {"recipe": job.recipe_name, "seed": job.seed_i, "contacts_n": test.contacts_n}
-            scores.append(
-                {"experiment": "drift", **network, "window_i": window_i, "noload_off_uT": test.noload_off_uT}
-                | score(rows.target[test.row], predicted)
-                | {"bias_f_N": pd.Series(predicted_N - true_N).mean()}  # NaN if no force is known
-            )
+            row = {"experiment": "drift", **network, "window_i": window_i, "rows_n": len(test.row)}
+            row |= {"noload_off_uT": test.noload_off_uT, **score(rows.target[test.row], predicted)}
+            scores.append(row | {"bias_f_N": pd.Series(predicted_N - true_N).mean()})  # NaN if no force is known
             if (test.policy, window_i, job.recipe_name) == (*late, HEADLINE):
                 readings = {"indentation": rows.indentation[test.row], "true_N": true_N, "predicted_N": predicted_N}
                 forces.append(pd.DataFrame(network | readings))
     by_indentation = pd.concat(forces).dropna().groupby([*NETWORK, "indentation"], sort=False, as_index=False)
     force_means = by_indentation[["true_N", "predicted_N"]].mean()
-    return Results(pd.DataFrame(scores), force_means, measured, tally(map(collapse_record, trained)))
+    if force_means["indentation"].nunique() > 1:
+        measured["late"] |= late_bias(force_means)
+    else:
+        del measured["late"]
+    return Results(make_table(scores), measured, points(force_means), statistics.tally(map(collapse_record, trained)))
 
 
 # --- Windows ---
@@ -239,6 +243,7 @@ def measure(
     ends = [(train, tests[late_i]) for train, *tests in series if train.policy == policy]
     late_numbers: dict[str, Any] = {
         "policy": policy,
+        "window_i": late_i,
         "contacts_n": round(np.mean([window.contacts_n for _, window in ends])),
     }
     left_pct = float(np.mean([force_left_pct(early.readings, window.readings) for early, window in ends]))
@@ -265,17 +270,11 @@ def force_left_pct(early: Readings, late: Readings) -> float:
 # --- Numbers ---
 
 
-def numbers(found: Results) -> dict[str, Any]:
-    """Compute the numbers of the report from the networks of the headline recipe."""
-    scores = found.scores[found.scores["recipe"] == HEADLINE]
+def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise the scores of the headline recipe by policy and window, and for the paper's statements."""
+    scores = select(scores, recipe=HEADLINE)
     windows = {str(policy): window_means(rows) for policy, rows in scores.groupby("method", sort=False)}
-    measured = {name: value for name, value in found.measured.items() if name != "late"}
-    if found.forces["indentation"].nunique() < 2:
-        return measured | windows | {"claims": claims(scores)}
-    late = found.measured["late"] | late_bias(found.forces)
-    bias_f_N = found.forces["predicted_N"] - found.forces["true_N"]
-    overestimates = claim(found.forces.assign(bias_f_N=bias_f_N), ["bias_f_N"])
-    return measured | windows | {"late": late, "claims": claims(scores) | {"overestimates": overestimates}}
+    return {**measured, **windows, "claims": claims(scores, measured.get("late"))}
 
 
 def window_means(scores: pd.DataFrame) -> list[dict[str, Any]]:
@@ -309,13 +308,14 @@ def late_bias(forces: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def claims(scores: pd.DataFrame) -> dict[str, Any]:
+def claims(scores: pd.DataFrame, late: Mapping[str, Any] | None) -> dict[str, Any]:
     """Compute the statistics over boards by which the paper's statements about drift are judged.
 
     higher, faster: errors with only one no-load reading at the start minus errors with more frequent no-load readings,
         as a mean over windows and as a growth per 10,000 contacts.
     each_is_worse: errors with a no-load reading before each contact minus errors with regular no-load readings.
     lasting: scores in the last window with a no-load reading before each contact.
+    overestimates: error of the force in the late window of figure 5b.
     """
     errors = [name for name in ERRORS if name in scores.dropna(axis=1)]
     by_network = scores.assign(contacts_n=scores["contacts_n"] / 10_000).groupby(["method", *NETWORK])
@@ -323,7 +323,7 @@ def claims(scores: pd.DataFrame) -> dict[str, Any]:
     policies, windows_n = set(scores["method"]), scores["window_i"].nunique()
     frequent = [policy for policy in ("regular", "each") if policy in policies]
 
-    def compare(values: Any, policy: str, other: str) -> Mapping[str, Stat]:
+    def compare(values: Any, policy: str, other: str) -> statistics.Summary:
         return claim(values.loc[policy] - values.loc[other], errors)
 
     found: dict[str, Any] = {}
@@ -340,13 +340,16 @@ def claims(scores: pd.DataFrame) -> dict[str, Any]:
         last = scores[(scores["method"] == "each") & (scores["window_i"] == windows_n - 1)]
         lasting = claim(last, ["accuracy_pct", *errors], differences=False)
         found["lasting"] = {"contacts_n": round(last["contacts_n"].mean())} | lasting
+    if late is not None:
+        found["overestimates"] = claim(select(scores, method=late["policy"], window_i=late["window_i"]), ["bias_f_N"])
     return found
 
 
-def claim(networks: pd.DataFrame, metrics: Sequence[str], *, differences: bool = True) -> Mapping[str, Stat]:
+def claim(networks: pd.DataFrame, metrics: Sequence[str], *, differences: bool = True) -> statistics.Summary:
     """Summarise values of networks over boards, with the standard deviation over seeds."""
     rows = networks.reset_index()[[*NETWORK, *metrics]].groupby(NETWORK, as_index=False).mean()
-    return add_seed_sd(summarise(board_means(rows), boards=True, differences=differences), rows, "board", "skin")
+    summary = statistics.summarise(statistics.board_means(rows), boards=True, differences=differences)
+    return statistics.add_seed_sd(summary, rows, "board", "skin")
 
 
 def points(forces: pd.DataFrame) -> dict[str, list[float]]:

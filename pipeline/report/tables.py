@@ -36,6 +36,7 @@ from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.experiments import experiment_tables
 from pipeline.report.figures import unseen_rows
 from pipeline.report.protocol import protocol_table, protocols
+from pipeline.statistics import Stat
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
 
@@ -327,9 +328,9 @@ def drift_table(numbers: Numbers, source: str) -> pd.DataFrame:
         line = {"contacts": f"{window['contacts_n']:,}", "source": source}
         for policy, title in policies.items():
             row = numbers[policy][i]
-            sds = {metric: {"sd": sd} for metric, sd in row["spread"].items()}
             for metric in ("accuracy_pct", error):
-                line[f"{COLUMNS[metric]} ({title})"] = show({"mean": row[metric], **sds.get(metric, {})})
+                stat = Stat(row[metric], numbers["skins_n"] * numbers["seeds_n"], row["spread"].get(metric))
+                line[f"{COLUMNS[metric]} ({title})"] = show(stat)
         lines.append(line)
     return tabulate(lines, spread="± is the standard deviation over networks, which differ in their seed or skin.")
 

@@ -13,10 +13,11 @@ from ruamel.yaml import YAML
 from scipy.stats import linregress, sem
 
 from pipeline.experiments import drift as experiment
-from pipeline.experiments.drift import Drift, claims, cut, drift, figures, force_left_pct, numbers, run
+from pipeline.experiments.drift import Drift, claims, cut, drift, figures, force_left_pct, run, summarise
 from pipeline.report.tables import drift_table
+from pipeline.scores import make_table, read_scores
 from pipeline.settings import Settings, read_shared_files
-from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, verdict
+from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, as_json, verdict
 from reskin import io
 from reskin.data.grid import points_mm
 from reskin.data.rows import Selection
@@ -156,18 +157,18 @@ def test_scores_equal_those_of_a_loop_over_networks_and_windows(results):
             bias_N = float(np.mean(predicted[part, 2].astype(float) - true[:, 2]))
             expected.append(
                 {"method": policy, "skin": skin, "board": f"b{skin[1]}", "recipe": "paper", "seed": job.seed_i,
-                 "contacts_n": start, "window_i": window_i, "bias_f_N": bias_N, "experiment": "drift",
+                 "contacts_n": start, "window_i": window_i, "rows_n": 60, "bias_f_N": bias_N, "experiment": "drift",
                  "noload_off_uT": DRIFT_uT * np.sqrt(np.mean(age_n**2.0))} | score(true, predicted[part])
             )  # fmt: skip
     # The relative tolerance is the rounding of fields of 1000 uT to single precision.
-    pd.testing.assert_frame_equal(found.scores, pd.DataFrame(expected), check_like=True, rtol=1e-3)
+    pd.testing.assert_frame_equal(found.scores, make_table(expected), check_like=True, rtol=1e-3)
     assert len(found.scores) == 2 * 3 * 2 * 3
 
 
 def test_windows_have_means_and_standard_deviations_over_skins_and_seeds(results):
     found = results[0]
     for policy in ("initial", "regular", "each"):
-        for window_i, window in enumerate(numbers(found)[policy]):
+        for window_i, window in enumerate(summarise(found.scores, found.measured)[policy]):
             rows = found.scores[(found.scores["method"] == policy) & (found.scores["window_i"] == window_i)]
             assert window["contacts_n"] == 100 * (window_i + 1)
             for name in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "bias_f_N"):
@@ -177,7 +178,7 @@ def test_windows_have_means_and_standard_deviations_over_skins_and_seeds(results
 
 def test_late_bias_and_its_standard_error_over_indentations_equal_scipy(results):
     found, data, jobs = results
-    late = numbers(found)["late"]
+    late = summarise(found.scores, found.measured)["late"]
     forces: dict[int, list] = {0: [], 1: []}
     for job in (job for job in jobs if job.fold.endswith("regular")):
         pair = np.stack([data.rows.target[job.test, 2], answer(data, job).predicted[:, 2]])[:, -60:].astype(float)
@@ -201,11 +202,11 @@ def test_recording_without_forces_has_scores_of_places_only(scene, monkeypatch):
     monkeypatch.setattr(experiment, "train_jobs", lambda data, jobs, stage: [answer(data, job) for job in jobs])
     unknown = np.full(780, np.nan, np.float32)
     found = run(scene, SECTION, [replace(capture(), Fz_N=unknown, depth_mm=unknown)])
-    content = numbers(found)
+    content = summarise(found.scores, found.measured)
     assert set(content["each"][0]["spread"]) == {"accuracy_pct", "mse_xy_mm2"}
     assert "late" not in content
     assert set(content["claims"]["higher"]) == {"mse_xy_mm2"}
-    assert list(figures(content, {"late": experiment.points(found.forces)}, "recorded")) == ["drift.svg"]
+    assert list(figures(content, {"late": found.points}, "recorded")) == ["drift.svg"]
 
 
 # --- Claims ---
@@ -224,12 +225,12 @@ PAPERS = {"initial": (1.0, 1.0), "regular": (0.2, 0.02), "each": (0.3, 0.02)}
 
 
 def test_claims_are_supported_by_errors_like_those_of_the_paper():
-    found = claims(errors(**PAPERS))
+    found = claims(errors(**PAPERS), None)
     for name in ("higher", "faster", "each_is_worse"):
         assert verdict(found[name]["mse_xy_mm2"]) == SUPPORTED
-    assert found["faster"]["mse_xy_mm2"]["mean"] == pytest.approx(0.98 * 1.015)  # mean over boards
+    assert found["faster"]["mse_xy_mm2"].mean == pytest.approx(0.98 * 1.015)  # mean over boards
     assert found["lasting"]["contacts_n"] == 20_000
-    assert found["lasting"]["accuracy_pct"]["mean"] == pytest.approx(96.5)
+    assert found["lasting"]["accuracy_pct"].mean == pytest.approx(96.5)
 
 
 @pytest.mark.parametrize(
@@ -237,14 +238,14 @@ def test_claims_are_supported_by_errors_like_those_of_the_paper():
     [("higher", {"initial": (0.1, 0.0)}), ("faster", {"initial": (1.0, 0.0)}), ("each_is_worse", {"each": (0.1, 0.0)})],
 )
 def test_claim_is_contradicted_by_the_opposite_errors(name, changed):
-    assert verdict(claims(errors(**(PAPERS | changed)))[name]["mse_xy_mm2"]) == CONTRADICTED
+    assert verdict(claims(errors(**(PAPERS | changed)), None)[name]["mse_xy_mm2"]) == CONTRADICTED
 
 
 def test_claims_are_not_judged_on_one_board_and_need_their_policies():
     one_board = errors(**PAPERS)
-    assert verdict(claims(one_board[one_board["board"] == "b0"])["higher"]["mse_xy_mm2"]) == FEW_BOARDS
-    assert set(claims(errors(initial=(1, 1)))) == set()
-    assert set(claims(errors(initial=(1, 1), each=(1, 0)))) == {"higher", "faster", "lasting"}
+    assert verdict(claims(one_board[one_board["board"] == "b0"], None)["higher"]["mse_xy_mm2"]) == FEW_BOARDS
+    assert set(claims(errors(initial=(1, 1)), None)) == set()
+    assert set(claims(errors(initial=(1, 1), each=(1, 0)), None)) == {"higher", "faster", "lasting"}
 
 
 # --- Measured on the captures ---
@@ -276,9 +277,9 @@ def test_remaining_force_is_unknown_if_no_place_is_visited_twice(depth_mm):
 
 def test_errors_are_largest_with_the_no_load_reading_from_the_start_if_the_skin_drifts(scene, tmp_path):
     io.write_readings(tmp_path / "wear/s0-wear.parquet", [capture()], {})
-    drift(scene, SECTION, tmp_path / "wear", tmp_path / "results.json")
+    drift(scene, SECTION, tmp_path / "wear", tmp_path / "drift.parquet", tmp_path / "results.json")
     results = io.read_json(tmp_path / "results.json")
-    content = results["numbers"]
+    content = as_json(summarise(read_scores([tmp_path / "drift.parquet"]), results["numbers"]))
     assert (content["skins_n"], content["seeds_n"], content["left_out_units_n"]) == (1, 2, 0)
     last = {policy: content[policy][-1]["mse_xy_mm2"] for policy in ("initial", "regular", "each")}
     assert last["initial"] > 2 * max(last["regular"], last["each"])
