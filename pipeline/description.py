@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 
 from pipeline.statistics import summarise
 from reskin.board.faults import find_lsb
@@ -64,6 +64,29 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
             for name, stat in summary.items()}  # fmt: skip
 
 
+def pace(captures: Sequence[Readings]) -> dict[str, float]:
+    """Return the median time from one indentation to the next, and the duration of the longest capture, in seconds.
+
+    Captures without times are ignored. Returns an empty dict if no other capture has more than one indentation.
+    """
+    timed = [capture for capture in captures if np.isfinite(capture.t_s).all()]
+    steps_s = [np.diff(capture.t_s[first_rows(capture)]) for capture in timed]
+    if not sum(map(len, steps_s)):
+        return {}
+    lasts_s = max(float(capture.t_s[-1] - capture.t_s[0]) for capture in timed)
+    return {"contact_every_s": float(np.median(np.concatenate(steps_s))), "lasts_s": lasts_s}
+
+
+def first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:
+    """Return the number of the first reading of each indentation."""
+    return np.unique(rank(readings.indentation), return_index=True)[1]
+
+
+def rms(values: Float[np.ndarray, "..."]) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values.astype(float) ** 2)))
+
+
 def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
     b_uT = np.abs(np.median(noload_uT.astype(np.float64), axis=0)).reshape(-1, AXES_PER_CHIP_N)
     return {
@@ -80,8 +103,7 @@ def _wander(readings: Readings) -> dict[str, float]:
     have after-effects, the difference has its full size already at lag 1, and it repeats when the rig presses the same
     places again in the same order.
     """
-    _, first_i = np.unique(rank(readings.indentation), return_index=True)
-    rest_uT = readings.noload_uT[first_i].astype(np.float64)
+    rest_uT = readings.noload_uT[first_rows(readings)].astype(np.float64)
     lags = [lag_n for lag_n in LAGS_N if len(rest_uT) >= 2 * lag_n + ENOUGH_N]
     return {
         f"rest_changes_in_{lag_n}_uT": float(np.sqrt(((rest_uT[lag_n:] - rest_uT[:-lag_n]) ** 2).mean()))

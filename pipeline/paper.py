@@ -43,12 +43,11 @@ FIGURE_6B = (
 
 SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
-# Figures 4 and 5 are also printed without numbers, so only statements of the text about them are quoted.
+# Figure 4 is also printed without numbers, so only a statement of the text about it is quoted.
 FIGURE_4 = (
     '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
     'samples"'
 )
-FIGURE_5 = "Figure 5 of the paper is printed without numbers. The table of findings tests what its text says about it."
 SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_xy_mm2": (0.085, 0.006),
     "mse_fxy_N2": (0.0011, 0.0002),

@@ -87,8 +87,8 @@ def test_missing_required_experiment_is_an_error(experiment, others):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"train_n": 2}, "train_n must be at most every_n"),
-        ({"test_n": 2}, "test_n must be at most every_n"),
+        ({"train_n": 2}, "train_n and test_n must be at most every_n"),
+        ({"test_n": 2}, "train_n and test_n must be at most every_n"),
         ({"regular_n": 5}, "regular_n is required if policies contains regular, and not allowed otherwise"),
         ({"policies": ["regular"]}, "regular_n is required if policies contains regular, and not allowed otherwise"),
         ({"policies": ["each", "each"]}, "policies contains a policy more than once"),

@@ -12,7 +12,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
-from pipeline.experiments.drift import describe_pace, pace, rms
+from pipeline.description import pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.formatting import tabulate
 from pipeline.paper import FIGURE_4
@@ -208,7 +208,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         for what, rms_uT, pct in rows:
             values = {"difference, µT": f"{rms_uT:.3g}", "difference, % of the change": f"{pct:.3g}"}
             lines.append(place_cells | {"what": what} | values | {"source": source})
-    meaning = f"{MEANING} {describe_pace(numbers, source)}"
+    meaning = MEANING
     if "shown_s" in numbers and "warmer_K" in numbers:
         meaning += (
             f" The contacts that are compared over time take {numbers['shown_s']:,.0f} s. In this time, the "

@@ -90,7 +90,6 @@ class Row(Strict):
     - `sizeable`: a paired difference is an improvement of at least half of the paper's difference.
     - `each`: every paired difference in a list is an improvement.
     - `slight`, `plateau`: a paired difference is small.
-    - `finding`: the experiment itself gives the verdict.
     - `input`: like `near` in recorded scenes; not judged in simulated scenes, where the number is a setting.
     - `target`: like `near`; in simulated scenes, a note says that the number was a calibration target.
     - `setting`: not judged, because the number is a setting in every scene.
@@ -105,8 +104,8 @@ class Row(Strict):
     ours: str | None = None
     experiment: str | None = None  # the experiment that computes `ours`, if this number is missing in small scenes
     rule: Literal[
-        "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
-        "setting", "target", "view",
+        "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "input", "setting",
+         "target", "view",
     ] = "near"  # fmt: skip
     signs: tuple[str, str] | None = None  # meaning of a negative and of a positive number, in words
     family: bool = False  # whether the claim belongs to the family whose p-values are adjusted by Holm's method
@@ -147,7 +146,7 @@ def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     if metrics is None:
         yield row
     for metric in metrics or ():
-        paths = {side: f"{row[side]}.{metric}" for side in ("paper", "ours")}
+        paths = {side: f"{row[side]}.{metric}" for side in ("paper", "ours") if side in row}
         yield row | paths | {"id": f"{row['id']}-{metric}", "what": f"{row['what']}: {METRICS[metric]}"}
 
 
@@ -249,9 +248,6 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
         return Judgement(notes=(SETTING,))
     if row.rule == "view":
         return Judgement()
-    if row.rule == "finding":
-        met = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
-        return Judgement(ours["verdict"], "true for the networks trained here", met)
     if row.rule == "each":
         return _judge_each(ours)
     if row.rule in DIFFERENCES:

@@ -9,6 +9,7 @@ import pandas as pd
 from pydantic import model_validator
 
 from pipeline import scenes
+from pipeline.experiments.drift import policies_in
 from pipeline.experiments.neglected_effects import neglected_effects_table
 from pipeline.formatting import (
     COLUMNS,
@@ -35,6 +36,7 @@ from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.experiments import experiment_tables
 from pipeline.report.figures import unseen_rows
 from pipeline.report.protocol import protocol_table, protocols
+from pipeline.statistics import Stat
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
 
@@ -96,8 +98,7 @@ CONSTANT = "constant force: the mean over the tested indentations"
 COLLAPSED_MEANING = (
     "A network has collapsed if its output is nearly constant, so that it explains almost nothing of some target on "
     "its own training rows. A collapsed network is trained again with other random draws, at most twice. A network "
-    "that collapses every time is kept and included in all means. The networks of stages train_* and adapt that were "
-    "kept in this way are also named in table audit. Very short training runs are not checked for collapse."
+    "that collapses every time is kept and included in all means. Very short runs are not checked for collapse."
 )
 REGISTERED_MEANING = (
     "Registered: before these scores are computed, the mean position error of each board is subtracted from the "
@@ -175,10 +176,6 @@ CASES = {
     "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
-POLICIES = {
-    "initial": "once, at the start", "regular": "every {regular_n} contacts", "each": "before every contact",
-    "free": "whenever nothing touches",
-}  # fmt: skip
 SIMULATIONS = {
     "nominal": "nominal skin", "fitted": "law fitted to this board", "refitted": "law of another board, refitted",
 }  # fmt: skip
@@ -210,7 +207,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
-        "audit": audit_table, "compare": compare_table, "chosen": chosen_table, "verification": verification_table,
+        "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table,
+        "verification": verification_table,
         "stability": stability_table, "left_out": neglected_effects_table, "trainings": _trainings,
         "variants": _variants,
     }  # fmt: skip
@@ -318,6 +316,23 @@ def new_board_contact_table(rows: Rows, source: str) -> pd.DataFrame:
         if row["method"] == "contact"
     ]
     return pd.DataFrame(lines)
+
+
+def drift_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List accuracy and one error by the number of earlier contacts, for each no-load policy."""
+    policies = policies_in(numbers)
+    first = next(iter(policies))
+    error = "mse_f_N2" if "mse_f_N2" in numbers[first][0] else "mse_xy_mm2"
+    lines = []
+    for i, window in enumerate(numbers[first]):
+        line = {"contacts": f"{window['contacts_n']:,}", "source": source}
+        for policy, title in policies.items():
+            row = numbers[policy][i]
+            for metric in ("accuracy_pct", error):
+                stat = Stat(row[metric], numbers["skins_n"] * numbers["seeds_n"], row["spread"].get(metric))
+                line[f"{COLUMNS[metric]} ({title})"] = show(stat)
+        lines.append(line)
+    return tabulate(lines, spread="± is the standard deviation over networks, which differ in their seed or skin.")
 
 
 def audit_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -685,11 +700,12 @@ def measured(numbers: Numbers) -> dict[str, str]:
         area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
         cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated
     if drift := numbers.get("drift"):
-        policy = next(name for name in ("each", "regular", "initial", "free") if name in drift)
+        policies = policies_in(drift)
+        policy = "each" if "each" in policies else next(iter(policies))
         last = drift[policy][-1]
         cells["Durable (> 50k contacts)"] = (
             f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts (no-load readings: "
-            f"{POLICIES[policy].format(regular_n=drift.get('regular_n'))})"
+            f"{policies[policy]})"
         )
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
     if best:

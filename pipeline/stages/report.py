@@ -44,6 +44,7 @@ from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
+from pipeline.statistics import as_json
 from pipeline.tracking import Curves, Results, TrackingUnavailable, metrics_of, publishing, read_times, scores_link
 from pipeline.tracking import publish as write_runs
 from pipeline.training.choice import choose, fingerprint, to_record
@@ -249,11 +250,11 @@ def read_curves(scene: Scene, scores: Path, results: Path) -> Curves:
 
     The keys of the result are the names of the stages that computed the curves.
     """
-    table = read_scores(scores / f"{stage}.parquet" for stage in scene.curves.values())
+    table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
     curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(table).items()}
-    for experiment in scene.analyses:
-        numbers = io.read_json(results / f"{experiment}.json")["numbers"]
+    analyses = {experiment: io.read_json(results / f"{experiment}.json") for experiment in scene.analyses}
+    for experiment, numbers in as_json(experiment_numbers(analyses, table)).items():
         named_values = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
         curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named_values]
     return curves

@@ -1,8 +1,4 @@
-"""Baseline policies (paper section 4).
-
-A baseline is a no-load reading (a reading without contact) that is subtracted from a reading, because the change of the
-field shows the contact. A baseline policy is a rule that chooses the no-load reading for each reading.
-"""
+"""Baselines: no-load readings (readings without contact), which are subtracted from readings."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -36,31 +32,6 @@ def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
     indentation or the pass of each row of a capture, in order of time.
     """
     return np.cumsum(np.concatenate([[0], label[1:] != label[:-1]])).astype(np.int64)[: len(label)]
-
-
-def initial(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Return the first no-load reading as the baseline of all rows.
-
-    The paper calls this "a single no-load measurement" (section 4).
-    """
-    return np.broadcast_to(noload_uT[:1], noload_uT.shape).copy()
-
-
-def regular(
-    noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"], *, regular_n: int
-) -> Float32[np.ndarray, "f ch"]:
-    """Return baselines that are replaced by a new no-load reading only every `regular_n` indentations.
-
-    The paper describes this as no-load readings "at regular intervals" (section 4).
-    """
-    rank_i = rank(indentation)
-    _, first_i = np.unique(rank_i, return_index=True)  # the first row of each indentation
-    return noload_uT[first_i[rank_i - rank_i % regular_n]]
-
-
-def each(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Return the baseline of each row: the no-load reading that was taken immediately before the contact of the row."""
-    return noload_uT
 
 
 def free(

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.data.baseline import alike_within_uT, each, follow_free, free, initial, rank, regular, subtract
+from reskin.data.baseline import alike_within_uT, follow_free, free, rank, subtract
 from reskin.seeds import rng_for
 
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
@@ -19,43 +19,6 @@ def test_field_changes_are_not_affected_by_a_constant_external_field(ambient_uT)
     # The tolerance in uT is rounding: single precision rounds fields of a few thousand uT by about 1e-4 uT.
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
-
-
-runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # The number of readings of each indentation.
-
-
-def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return no-load fields and indentation numbers.
-
-    Each no-load field equals the number of its indentation. Some numbers are missing.
-    """
-    indentation = np.repeat(7 + 3 * np.arange(len(runs_n), dtype=np.int32), runs_n)
-    return np.repeat(indentation[:, None], 3, axis=1).astype(np.float32), indentation
-
-
-@given(runs_n, st.integers(1, 5))
-def test_no_load_readings_chosen_by_each_policy_equal_those_of_a_loop(runs_n, regular_n):
-    noload_uT, indentation = capture(runs_n)
-    seen, first, last = [], None, None
-    for i, number in enumerate(indentation.tolist()):
-        if number not in seen:
-            if len(seen) % regular_n == 0:
-                last = noload_uT[i, 0]
-            seen.append(number)
-        first = noload_uT[0, 0] if first is None else first
-        assert initial(noload_uT, indentation)[i].tolist() == [first] * 3
-        assert regular(noload_uT, indentation, regular_n=regular_n)[i].tolist() == [last] * 3
-        assert each(noload_uT, indentation)[i].tolist() == [number] * 3
-
-
-@given(runs_n, st.integers(1, 5))
-def test_all_policies_use_the_same_no_load_reading_at_the_first_indentation(runs_n, regular_n):
-    noload_uT, indentation = capture(runs_n)
-    first = slice(0, runs_n[0])
-    for policy in (initial(noload_uT, indentation), regular(noload_uT, indentation, regular_n=regular_n)):
-        assert (policy[first] == each(noload_uT, indentation)[first]).all()
-    assert (regular(noload_uT, indentation, regular_n=1) == each(noload_uT, indentation)).all()
-    assert (regular(noload_uT, indentation, regular_n=len(runs_n)) == initial(noload_uT, indentation)).all()
 
 
 def test_rank_numbers_indentations_in_their_order_in_time():
@@ -84,7 +47,7 @@ def test_no_load_field_estimated_between_touches_follows_the_drift(rows_n):
     off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
     # The estimate is usually less than one touch old, and occasionally one or two touches.
     assert np.sqrt((off_uT**2).mean()) < 0.7
-    assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
+    assert np.sqrt(((noload_uT[0] - noload_uT) ** 2).mean()) > 5
 
 
 def test_no_load_reading_is_not_replaced_during_a_long_slide():

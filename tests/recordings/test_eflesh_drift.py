@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.experiments.drift import Drift, drift
+from pipeline.experiments.drift import Drift, drift, summarise
+from pipeline.scores import read_scores
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.recordings.readers import eflesh
@@ -32,16 +33,16 @@ def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, 
     of_scene = Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,))
     drift(
         of_scene, of_scene.section(Drift, "drift"),
-        indentations=tmp_path / "indentations", results=tmp_path / "results.json",
+        tmp_path / "indentations", tmp_path / "drift.parquet", tmp_path / "results.json",
     )  # fmt: skip
-    numbers = io.read_json(tmp_path / "results.json")["numbers"]
+    measured = io.read_json(tmp_path / "results.json")["numbers"]
+    numbers = summarise(read_scores([tmp_path / "drift.parquet"]), measured)
     assert [row["accuracy_pct"] for row in numbers["each"]] == pytest.approx(FRESH_PCT, abs=TOLERANCE_PCT)
     assert [row["accuracy_pct"] for row in numbers["initial"]] == pytest.approx(INITIAL_PCT, abs=TOLERANCE_PCT)
     assert [row["contacts_n"] for row in numbers["each"]] == [961, 2 * 961, 3 * 961, 4 * 961]
     assert all("mse_f_N2" not in row for row in numbers["each"])
     assert "late" not in numbers
-    assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
-    of_trainings = [one["of_trainings"] for one in numbers["findings"]]
-    # These are the verdicts over the three networks that were trained for each policy.
-    assert of_trainings == ["supported", "supported"]
+    assert numbers["claims"]["higher"]["mse_xy_mm2"].mean > 0
+    assert numbers["claims"]["faster"]["mse_xy_mm2"].mean > 0
+    assert "overestimates" not in numbers["claims"]
     assert numbers["contact_every_s"] > 1  # The time is in seconds per contact. A real rig takes more than one second.

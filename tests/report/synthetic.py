@@ -56,16 +56,7 @@ NETWORKS = {
 
 def all_experiments(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
-    windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
-    names = ("higher_and_faster", "offset", "each_is_worse", "overestimates")
-    finding = {
-        "finding": "errors grow",
-        "holds": True,
-        "verdict": "supported",
-        "of_trainings": "supported",
-        "measured": "+3 points",
-    }
-    last = {"contacts_n": 49000, "accuracy_pct": {"mean": 90.0, "n": 1}}
+    windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1, "spread": {}}]
     contrasts = ("pokes_first", "pokes_gain", "pokes_plateau", "sensors_gain_fewer")
     contrasts += tuple(f"sensors_more_{method}" for method in ("multi", "triplet", "adapted"))
     counts = {"from_pokes_n": 780, "to_pokes_n": 780}
@@ -95,8 +86,11 @@ def all_experiments(source: str = "simulated") -> dict:
         "variants": {"lobo": {"paper": scores()}},
         "described": {"grid": {"source": source, "counts": {"captures_n": 2, "readings_n": 1000}, "over_skins": {}}},
         "drift": {
-            "initial": windows, "regular": windows, "each": windows, "last_window": {"each": last},
-            "findings": [finding | {"id": name} for name in names],
+            "regular_n": 390, "initial": windows, "regular": windows, "each": windows,
+            "claims": {
+                **dict.fromkeys(("higher", "faster", "each_is_worse"), scores(("mse_xy_mm2", "mse_f_N2"))),
+                "lasting": {"contacts_n": 49000} | scores(("accuracy_pct",)), "overestimates": {"bias_f_N": stat()},
+            },
             "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},
         },
         "variation": {"contacts_n": 10000},

@@ -75,7 +75,7 @@ def test_scores_include_the_means_of_table_2_and_of_the_control():
 
 def test_scores_include_the_last_window_of_experiment_drift():
     windows = [{"contacts_n": n, "accuracy_pct": 100.0 - n, "mse_xy_mm2": 1.0} for n in (10, 20)]
-    numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows, "findings": [{"finding": "x"}]}}
+    numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows}}
     # These scores are without forces.
     assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}
 

@@ -184,15 +184,15 @@ def test_no_level_of_headings_is_skipped(read):
 
 
 def test_results_link_to_the_table_or_figure_that_shows_them():
-    rows = {"result": ["a", "b", "c", "d"], "ours": ["see table drift_findings", "see figure gone", "90 %"]}
+    rows = {"result": ["a", "b", "c", "d"], "ours": ["see table sweep_pokes", "see figure gone", "90 %"]}
     rows["ours"].append("see figure sweep_sensors")
-    shown = ["drift_findings", "gone.svg", "drift.svg, drift", "sweep_sensors.svg"]
+    shown = ["sweep_pokes", "gone.svg", "drift.svg, drift", "sweep_sensors.svg"]
     rows |= {"criterion": ["–"] * 4, "verdict": ["–"] * 4, "shown in": shown}
-    ids = {"drift_findings": "drift-findings", "drift.svg": "figure-5a", "sweep_sensors.svg": "figure-6b"}
+    ids = {"sweep_pokes": "sweep-pokes", "drift.svg": "figure-5a", "sweep_sensors.svg": "figure-6b"}
     table = lay_out("checklist", "C", pd.DataFrame(rows), ids)
     ours = [row[table.columns.index("ours")] for row in table.rows]
     assert ours == [
-        '<a href="#drift-findings">see the paper&#39;s findings about drift</a>',
+        '<a href="#sweep-pokes">see scores by number of unlabelled pokes</a>',
         "see figure gone",
         '<a href="#figure-5a">90\u00a0%</a>',
         '<a href="#figure-6b">see figure 6b</a>',

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
-from pipeline.experiments.audit import audit_collapse
 from pipeline.scores import (
     AS_LABELLED,
     KEYS,
@@ -447,15 +446,3 @@ def test_trainings_that_were_repeated_are_counted_with_all_their_attempts(done):
         "collapsed_n": sum(map(sum, attempts)),
         "kept_collapsed_n": sum(collapses[-1] for collapses in attempts),
     }
-
-
-def test_collapsed_network_is_listed_in_the_audit():
-    def trained(seed_i: int, **collapses: object) -> dict:
-        return card("lobo", "b0", {}, seed_i=seed_i, collapsed=False, collapsed_before_n=0) | collapses
-
-    check = audit_collapse(
-        "train_multi", [trained(0, collapsed_before_n=2), trained(1, collapsed=True, collapsed_before_n=2)]
-    )
-    assert check.found == ("1 of 2 networks collapsed: lobo.paper.b0.seed1; 4 training runs were repeated")
-    assert (check.holds, check.known) == (False, True)
-    assert audit_collapse("train_multi", [trained(0)]).holds

@@ -14,7 +14,7 @@ from pipeline.training.final import FILE, final_numbers
 from reskin import io
 from reskin.data.rows import Selection, load_rows
 from reskin.data.splits import Split, draw_folds, render_folds
-from tests.experiments.audit.test_run import capture
+from tests.experiments.test_audit import capture
 from tests.report.synthetic import over_boards
 from tests.scenes import TRAINING, recorded_scene, settings
 
