@@ -37,6 +37,7 @@ TITLES = {
     "control": "control", "shipped": "in-context model, as shipped",
     "rig": "in-context model, made with the rig's other boards", "registration": "multi-sensor, 5 known presses",
     "gaussian_process": "Gaussian process on own labels", "kernel_ridge": "kernel ridge", "constant": "mean of labels",
+    "reference_chip": "shipped, reference chip subtracted", "joints": "shipped, field predicted from joints subtracted",
 }  # fmt: skip
 CONTROL = "Control: fine-tuned equally long, but without pokes of the new skin (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"

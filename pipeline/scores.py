@@ -20,9 +20,11 @@ from reskin.metrics import METRICS, TRUTH
 
 NAMES = (
     "experiment", "method", "recipe", "inputs", "architecture", "base", "fold", "board", "skin", "places", "split",
+    "field",
 )  # fmt: skip
 COUNTS = (
-    "seed", "draw", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
+    "seed", "draw", "external_uT", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n",
+    "rows_n",
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
 ALL_SKINS = ""  # value of column `skin` in joint rows, which are for all skins on which a network was tested

@@ -17,7 +17,13 @@ from reskin.errors import SchemaError
 from reskin.metrics import TRUTH
 
 CONFIDENCE = 0.95  # confidence level of intervals; the usual convention
-PERCENTAGES = ("accuracy_pct", "coverage_pct", "coverage_f_pct")  # metrics between 0 and 100
+PERCENTAGES = (
+    "accuracy_pct",
+    "coverage_pct",
+    "coverage_f_pct",
+    "false_pct",
+    "detected_pct",
+)  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
 DECIMALS = 12  # differences in %, mm2 or N2 are rounded to this many decimals, to remove rounding errors
 BOARDS_MIN = 4  # with fewer boards, no interval is computed; the value of each board is given instead

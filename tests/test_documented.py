@@ -23,7 +23,7 @@ from reskin.simulation.defaults import NOMINAL
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = [ROOT / "params.yaml", NOMINAL, *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
 # Sections whose keys are names of entries (such as recipes or boards), not parameters.
-NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
+NAMED = {"situations", "recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
 
 # Names of rows, boards, captures and stages, which are not documented individually.
 NAME = re.compile(r".* .*|[0-9]+|[bf][0-9](_s[0-9].*)?|board[0-9].*|(ingest|simulate).*|knn-.*|shape|released")

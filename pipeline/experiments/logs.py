@@ -5,7 +5,7 @@ both as it is and as if its board rotated in the earth's field.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
 from pipeline import paper
-from pipeline.experiments.ambient import Instrument, draw_instrument, readings_uT, reference_uT
 from pipeline.experiments.results import only, write_results
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -33,7 +32,7 @@ from reskin.logs import (
     truth_at,
 )
 from reskin.models.trained import networks_held_out
-from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T
+from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, Instrument, draw_instrument, readings_uT, reference_uT
 from reskin.recordings import probe
 from reskin.recordings.header import LOG_FILE, PROBE_FILE
 from reskin.recordings.ingest import read_header
@@ -84,10 +83,8 @@ class Log:
 def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
     """Score the networks on the log as if its board rotated in the earth's field, without and with a reference chip."""
     simulation, seed = simulation_settings(settings), settings.seed
-    chip = simulation.chip
-    # A log contains single readings, not means of several readings, so the noise of a single reading is used.
-    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
-    instrument = replace(draw_instrument(simulation, board, seed=seed), noise_uT=noise_uT)
+    design = simulation.main_boards.design
+    instrument = draw_instrument(design, simulation.spreads, simulation.chip, seed=seed, name=board)
     return {
         "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),
         "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),

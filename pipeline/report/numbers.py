@@ -382,10 +382,10 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
             if policy in drift
         },
         "shear": _means(numbers["shear"], SHEAR_METRICS) if "shear" in numbers else {},
-        "moving_hand": {
-            f"{row['group']}, external_uT={row['external_uT']:g}": {"live_false_pct": row["live_false_pct"]}
-            for row in numbers.get("moving_hand", {}).get("contacts", ())
-            if row["method"] == "none"
+        "interference": {
+            f"{row['field']}.external_{row['external_uT']:g}_uT": _means(row, ("false_pct", "detected_pct"))
+            for row in numbers.get("interference", {}).get("contacts", ())
+            if row["method"] == "shipped"
         },
     }
     return {name: part for name, part in parts.items() if part}

@@ -34,7 +34,7 @@ TABLES = (
 )  # tables of simulated scenes that docs/results.md shows
 COMPARED = ("compare",)
 NEW_BOARD = ("new_board", "new_board_contact")
-MOVING = ("moving_hand", "moving_hand_places", "moving_hand_simulated", "moving_hand_places_simulated")
+INTERFERENCE = ("interference_contacts", "interference_places")
 NONE_YET = "None yet."
 COSTS_MEANING = (
     "Column computed is the time that it takes to compute everything from scratch if the training runs run one after "
@@ -168,13 +168,13 @@ def blocks_of(
     simulated skins with recorded skins.
     """
     compared = [numbers for numbers in recorded if "compare" in numbers]
-    moving = [numbers for numbers in recorded if "moving_hand" in numbers]
+    on_hand = [numbers for numbers in recorded if "interference" in numbers]
     skins = {
         f"{numbers['provenance']['scene']} ({numbers['provenance']['source']})": next(
             iter(numbers["described"].values())
         )
         for numbers in (results[-1], *recorded)
-        if numbers not in moving  # a scene with experiment moving_hand uses the presses of another scene
+        if numbers not in on_hand  # scene hand uses the presses of another scene
     }
     return {
         "headline": _simulated(list(reversed(results))),
@@ -184,7 +184,7 @@ def blocks_of(
         "costs": to_markdown(costs_table([*results, *recorded])),
         "new_board": "\n\n".join(_tables(each, NEW_BOARD) for each in recorded if "new_board" in each) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
-        "moving_hand": "\n\n".join(_tables(numbers, MOVING) for numbers in moving) or NONE_YET,
+        "interference": "\n\n".join(_tables(numbers, INTERFERENCE) for numbers in on_hand) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
         "stages": _stages(stages),
     }

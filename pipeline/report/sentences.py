@@ -25,14 +25,12 @@ LOOK = {
     "readings are ordered correctly.",
     "logs.svg": "Where the two lines of the force differ, the model misses a contact, reports a contact that does not "
     "exist, or estimates a wrong force.",
-    "ambient.svg": "Where a line falls, the estimates become worse because of a magnetic field that appeared after the "
-    "no-load reading.",
+    "interference.svg": "Look for values of the option external_uT at which false contacts are rare and places are "
+    "still accurate.",
     "gripper.svg": "Marks inside the band belong to runs in which the gripper held the intended force within the "
     "stated tolerance.",
     "compare_growth.svg": "If the recorded and the simulated points lie on each other, the field grows with the force "
     "in the simulation as it does on the board.",
-    "moving_hand.svg": "Look for values of the option external_uT at which false contacts are rare and the accuracy of "
-    "places is still high.",
     "quadratures.svg": "Among the points below the line of the limit, the point farthest to the left takes the least "
     "time.",
     "integrators.svg": "The best points are at the lower left: they have small errors and take little time. Failures "

@@ -22,6 +22,7 @@ from pipeline.formatting import (
     n_of,
     reworded,
     scored,
+    scores,
     show,
     show_both,
     show_difference,
@@ -186,6 +187,20 @@ COMPARE_MEANING = (
 )
 LOCALISATION = "Localisation (within 1 mm, new skin)"  # row that we add to table 1
 OURS = "ours"
+CONTACT_TITLES = {
+    "rms_uT": "rms of changes, µT",
+    "false_pct": "false contacts, %",
+    "detected_pct": "detected presses, %",
+}
+PLACE_TITLES = {"accuracy_pct": "within 1 mm, %", "coverage_pct": "in 90 % interval, %"}
+CONTACTS_MEANING = (
+    "False contacts: readings without contact above the threshold of the live page. Detected presses: presses above "
+    "it if a change of the field is added; values are of boards or pads."
+)
+PLACES_MEANING = (
+    "The model is calibrated, without changes of the field, to 65 presses at half of the places; presses at the other "
+    "places are tested with changes. Labels are presses of the calibration; values are of the pressed boards."
+)
 SHIPPED = "The shipped model, which is made for skins that it has never seen: `reskin.load_universal()`."
 NOT_GIVEN = "–"
 
@@ -217,6 +232,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["new_board"] = new_board_table(numbers["new_board"], source)
         contact = new_board_contact_table(numbers["new_board"], source)
         tables |= {} if contact.empty else {"new_board_contact": contact}
+    if "interference" in numbers:
+        tables |= interference_tables(numbers["interference"])
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     if "final_model" in numbers:
@@ -283,6 +300,24 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
         for row in sorted(rows, key=lambda row: (row["skins_n"], list(TITLES).index(row["method"])))
     ]
     return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
+
+
+def interference_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
+    """List detected contacts and accuracy of places, for each changing field, method and value of `external_uT`."""
+
+    def line(row: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, str]:
+        keys = {"field": row["field"].replace("_", " "), "method": TITLES[row["method"]]}
+        return keys | {"external_uT": f"{row['external_uT']:g}"} | scores(row, titles)
+
+    contacts = [line(row, CONTACT_TITLES) for row in numbers["contacts"]]
+    places: dict[tuple[str, ...], dict[str, str]] = {}
+    for row in numbers["places"]:
+        titles = {name: f"{row['labels_n']} labels: {title}" for name, title in PLACE_TITLES.items()}
+        places.setdefault((row["field"], row["method"], row["external_uT"]), {}).update(line(row, titles))
+    return {
+        "interference_contacts": tabulate(contacts, meaning=CONTACTS_MEANING),
+        "interference_places": tabulate([*places.values()], meaning=PLACES_MEANING),
+    }
 
 
 def new_board_table(rows: Rows, source: str) -> pd.DataFrame:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.ambient import Instrument
 from pipeline.experiments.logs import (
     PERIOD_S,
     PITCHES_DEG,
@@ -22,7 +21,7 @@ from pipeline.experiments.logs import (
 )
 from reskin.errors import CaptureError
 from reskin.logs import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
-from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T
+from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T, Instrument
 from reskin.physics.board import Board
 from reskin.seeds import rng_for
 

@@ -1,7 +1,10 @@
 """Tests of the field of an iron ball against magpylib's sphere, boundary conditions and laws of magnetostatics.
 
-The ball is magnetised by the earth's field and by the skin, and its field disturbs the readings.
+The ball is magnetised by the earth's field and by the skin, and its field disturbs the readings. Other tests compare
+changes of readings in ambient fields with simulated chips, and with the estimate of a reference chip.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +13,20 @@ from hypothesis import strategies as st
 from magpylib.core import magnet_sphere_Bfield
 
 from reskin.physics import magnet
-from reskin.physics.ambient import EARTH_SIZE_T, EARTH_T, ball_field, ball_images, random_directions
+from reskin.physics.ambient import (
+    EARTH_SIZE_T,
+    EARTH_T,
+    ball_field,
+    ball_images,
+    draw_instrument,
+    random_directions,
+    readings_uT,
+    reference_uT,
+)
+from reskin.physics.board import Spreads
+from reskin.physics.chip import ChipDesign, read_field, steps_uT
 from reskin.seeds import rng_for
+from tests.simulation.scene import SECTIONS, synthesis
 
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
@@ -119,3 +134,47 @@ def test_random_directions_are_uniform_unit_vectors():
 def test_earth_field_has_the_given_magnitude_and_points_down():
     assert np.linalg.norm(EARTH_T) == pytest.approx(EARTH_SIZE_T)
     assert EARTH_T[2] < 0 < EARTH_T[0]
+
+
+# --- Readings in ambient fields ---
+
+SCENE = synthesis()
+DESIGN, CHIP = SCENE.main_boards.design, ChipDesign(gain_sel=6, noise_xy_uT=0, noise_z_uT=0, noise_temperature_degC=0)
+NO_SPREAD = Spreads(
+    **{name: 0.0 for name in SECTIONS["spreads"] if name != "skin_filler_length_mm"}, skin_filler_length_mm=3
+)
+fields_T = st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array)
+
+
+@given(fields_T)
+def test_uniform_field_changes_readings_as_it_changes_those_of_simulated_chips(b_T):
+    board = draw_instrument(DESIGN, SCENE.spreads, CHIP, seed=1, name="b0").board
+    at_chips_T = np.tile(b_T, (1, 5, 1))
+    at_rest_uT, with_field_uT = (
+        read_field(b_T, board, design=CHIP, rng=rng_for(0, "x"))[0] for b_T in (0 * at_chips_T, at_chips_T)
+    )
+    # Each reading is rounded by at most half a step, so a difference of two readings is off by at most one step.
+    change_uT = readings_uT(board, at_chips_T)
+    assert np.abs((with_field_uT - at_rest_uT) - change_uT).max() <= steps_uT(6).max() * 1.001
+
+
+@given(fields_T)
+def test_reference_chip_without_errors_measures_a_uniform_field_at_every_chip(b_T):
+    perfect = draw_instrument(DESIGN, NO_SPREAD, CHIP, seed=1, name="b0")
+    added_uT = readings_uT(perfect.board, np.tile(b_T, (1, 5, 1)))
+    np.testing.assert_allclose(reference_uT(perfect, b_T[None], rng_for(0, "silent")), added_uT, rtol=0, atol=1e-9)
+
+
+def test_reference_chip_leaves_a_residual_of_a_few_uT_if_chips_have_errors():
+    real = draw_instrument(DESIGN, SCENE.spreads, CHIP, seed=1, name="b0")
+    b_T = np.array([[0, 0, 5e-5]])
+    residual_uT = readings_uT(real.board, np.tile(b_T, (1, 5, 1))) - reference_uT(real, b_T, rng_for(0, "silent"))
+    # Gain errors of 2.5 % and tilts of 2 degrees in a field of 50 uT leave a few uT.
+    assert 0.1 < np.abs(residual_uT).max() < 10
+
+
+def test_estimate_of_the_reference_chip_has_the_noise_of_its_reading():
+    perfect = replace(draw_instrument(DESIGN, NO_SPREAD, CHIP, seed=1, name="b0"), noise_uT=np.array([3.0, 3.0, 5.0]))
+    read_uT = reference_uT(perfect, np.zeros((4000, 3)), rng_for(0, "noise")).reshape(4000, 5, 3)
+    # The tolerance of 6 % is five standard errors.
+    np.testing.assert_allclose(read_uT[:, 0].std(axis=0), [3.0, 3.0, 5.0], rtol=0.06)

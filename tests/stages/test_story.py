@@ -41,12 +41,11 @@ from tests.stages.checkout import ENVIRONMENT, copy_checkout, run, warm_stages
 LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "few_labels", "audit",
 )  # fmt: skip
-RANDOM = ("drift", "manual", "ambient")  # experiments with random draws
+RANDOM = ("drift", "manual", "interference")  # experiments with random draws
 # Scene ci runs all experiments except these, which need recordings or many skins.
 EXPERIMENTS_OF_CI = set(ANALYSES) - {
     "compare",
     "random_presses",
-    "moving_hand",
 }
 OUTPUT = "output.txt"  # file with the output of the first run
 # The time limit (in s) ends tests that hang. It is long, because a busy machine can be four times as slow as an idle
@@ -227,9 +226,9 @@ def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(s
     assert numbers["sleeve"]["accuracy_pct"]["n"] == 2
     for policy in ("initial", "regular", "each"):
         assert all("mse_f_N2" in row["spread"] for row in numbers["drift"][policy])
-    for name in ("manual", "flexible", "shear", "ambient", "gripper"):
+    for name in ("manual", "flexible", "shear", "gripper"):
         assert "(seeds)" in (story / f"reports/ci/tables/{name}.md").read_text()
-    for name in ("manual", "flexible", "shear", "ambient", "gripper", "logs", "sleeve", "drift"):
+    for name in ("manual", "flexible", "shear", "gripper", "logs", "sleeve", "drift"):
         table = (story / f"reports/ci/tables/{name}.md").read_text()
         assert "±" in table
         assert re.search("over (2 |the )?network seeds", table)
