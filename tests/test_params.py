@@ -130,16 +130,17 @@ def test_settings_of_a_removed_experiment_are_listed_as_unused(removed, unused):
 
 @pytest.mark.parametrize(
     "unit",
-    ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "neglected_effects"],
+    ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "accuracy_and_cost"],
 )
 def test_scene_runs_only_the_stages_of_its_experiments_and_protocols(unit):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(settings, "ci.yaml").runs(unit)
     removed = ("drift", "variation")
     settings["experiments"] = [
-        experiment for experiment in settings["experiments"] if experiment not in (*removed, "neglected_effects")
+        experiment for experiment in settings["experiments"] if experiment not in (*removed, "accuracy_and_cost")
     ]
-    settings = {name: section for name, section in settings.items() if name not in removed}
+    gone = {*removed, "accuracy_and_cost"}
+    settings = {name: section for name, section in settings.items() if name not in gone}
     settings["simulate"]["protocols"].pop("wear")
     remaining = parse_scene(settings, "ci.yaml")
     assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))

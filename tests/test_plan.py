@@ -31,7 +31,7 @@ def test_plan_of_the_checkout_is_up_to_date():
 def test_plan_lists_no_scenes_for_stages_that_no_scene_needs():
     generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
     assert generated["train_multi"] == ["lab"]
-    assert generated["train_single"] == generated["verification"] == generated["runtime"] == []
+    assert generated["train_single"] == generated["extremes"] == generated["accuracy_and_cost"] == []
     assert generated["simulate"] == generated["ingest_simulated"] == {}
 
 

@@ -146,30 +146,30 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
-ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
-TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve"}
+ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible", "accuracy_and_cost"}
+TRAINING = {"train_single", "train_multi", "train_triplet", "drift", "shear", "sleeve"}
+NUMERICAL = {"extremes", "accuracy_and_cost"}  # These experiments compare methods of the simulator.
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
-WHOLE = {"neglected_effects"}  # This experiment depends on the whole section `simulate` and all terms.
-WITH_BOARDS = {"flexible", "logs", "sleeve", "runtime"}  # They read the boards and few protocols.
+WITH_BOARDS = {"flexible", "logs", "sleeve", *NUMERICAL}  # They read the boards and few protocols.
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
-    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, *WHOLE, "interference", "runtime"}),
-    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, *WHOLE, "logs", "interference"}),
-    (SKIN, "terms.ageing.settling=0.2", SIMULATE | WHOLE),
+    (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, "interference", *NUMERICAL}),
+    (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, "logs", "interference", "extremes"}),
+    (SKIN, "terms.ageing.settling=0.2", SIMULATE),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible"}),
-    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *WHOLE}),
-    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity", *WHOLE}),
-    (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper", *WHOLE}),
-    (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS | WHOLE),
+    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag"}),
+    (SCENE, "simulate.protocols.glass.step_N=0.1", {"simulate@ci-glass", "sensitivity"}),
+    (SCENE, "simulate.protocols.grip.step_N=0.5", {"simulate@ci-grip", "gripper"}),
+    (SCENE, "simulate.boards.sleeve.design.gap_mm=0.5", SIMULATE | WITH_BOARDS),
     (SCENE, "train_single.steps_n=10", {"train_single"}),
-    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors"}),
+    (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "accuracy_and_cost"}),
     (SCENE, "adapt.steps_n=4", {*ADAPTING}),
     (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes"}),
     (SCENE, "shear.repeats_n=1", {"shear"}),
-    (SCENE, "runtime.repeats_n=2", {"runtime"}),
+    (SCENE, "accuracy_and_cost.repeats_n=2", {"accuracy_and_cost"}),
 ]
 
 

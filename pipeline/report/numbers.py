@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from pipeline.formatting import control_of
@@ -30,7 +29,6 @@ from pipeline.training.before_contact import MAGNITUDES, PLACE
 from reskin.metrics import METRICS
 
 Row = Mapping[str, Any]
-Seconds = Sequence[Row]  # times of training runs: name, train_s, one_reading_s
 
 CONTROL = "control"  # recipe of adaptation that fine-tunes for equally many steps, without the new skin's pokes
 # Pairs of rows of table 2. The scores of the second row are subtracted from those of the first row.
@@ -57,8 +55,6 @@ HOVER = ("hover", "hover_network")  # methods that predict the position of a tip
 SEEN_PCT = 25.0  # assumed: if a hovering tip is located with at least this accuracy, the chips sense the tip
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
-TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # keys in `runtime` that differ between repeats
-ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # keys that identify a row in `runtime`
 SHEAR_METRICS = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 
@@ -102,17 +98,6 @@ def sweep_curves(table: pd.DataFrame) -> dict[str, list[tuple[str, int, dict[str
         for experiment, (key, axis) in AXES.items()
         if key in numbers
     }
-
-
-def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of adapted networks with their training times on this machine, if these were measured."""
-    if "sweep_pokes" not in numbers:
-        return {}
-    rows = []
-    for row in numbers["sweep_pokes"]:
-        named = [t for t in seconds.get("sweep_pokes", []) if f".{row['pokes_n']}pokes." in t["name"]]
-        rows.append(row | ({"seconds": float(np.median([t["train_s"] for t in named]))} if named else {}))
-    return {"adaptation": rows}
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
@@ -304,63 +289,42 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
     return by_protocol
 
 
-def runtime_numbers(
-    trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
-) -> dict[str, Any]:
-    """Return the cost of each stage, and the results of the experiment named `runtime` with times on this machine.
-
-    `study` has the results of the experiment, and `seconds` has the times.
-    """
-    numbers: dict[str, Any] = {
-        "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
-    }  # fmt: skip
-    if study is None:
-        return numbers
-    key = itemgetter("study", "method", "setting")
-    times = {key(timed): timed for timed in seconds}
-    numbers["choice"] = study["choice"]
-    for name in ("quadratures", "integrators"):
-        numbers[name] = [row | times.get(key(row), {}) for row in study[name]]
-    return numbers
-
-
-def _stage_cost(cost: Row) -> dict[str, float]:
-    """Return the cost of computing a stage from scratch, and the cost of its last run.
+def stage_costs(costs: Mapping[str, Row]) -> dict[str, dict[str, float]]:
+    """Return, for each stage, the cost of computing it from scratch, and the cost of its last run.
 
     The last run may have reused training runs.
     """
-    trainings_s = cost["trainings_s"].values()
+    kept = ("seconds", "cpu_s", "reused_n", "peak_process_memory_MB")
     return {
-        "computed_s": cost["other_s"] + sum(trainings_s),
-        "trainings_n": len(trainings_s),
-        **{name: cost[name] for name in ("seconds", "cpu_s", "reused_n", "peak_process_memory_MB") if name in cost},
+        stage: {
+            "computed_s": cost["other_s"] + sum(cost["trainings_s"].values()),
+            "trainings_n": len(cost["trainings_s"]),
+            **{name: cost[name] for name in kept if name in cost},
+        }
+        for stage, cost in costs.items()
     }
+
+
+def timed_rows(numbers: Row) -> list[dict[str, Any]]:
+    """Return the rows of experiment accuracy_and_cost with their run times on this machine, if they were measured."""
+    key = itemgetter("study", "method", "setting")
+    seconds = {key(row): row["seconds"] for row in numbers["runtime"].get("accuracy_and_cost", ())}
+    rows = numbers.get("accuracy_and_cost", {"rows": []})["rows"]
+    return [row | ({"seconds": seconds[key(row)]} if key(row) in seconds else {}) for row in rows]
 
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split the numbers of a run into numbers.json, which is equal for repeats of the run, and provenance.json."""
-    run_provenance = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
-    costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
-    studies: dict[str, Any] = {}
-    for name, value in numbers["runtime"].items():
-        if isinstance(value, list):
-            costs[name] = [{key: row[key] for key in (*ROW_KEYS, *TIMES) if key in row} for row in value]
-            studies[name] = [{key: row[key] for key in row if key not in TIMES} for row in value]
-        elif name != "stages":
-            studies[name] = value
+    of_run = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
+    shared = {name: value for name, value in numbers.items() if name != "runtime"}
     settings = {name: numbers["provenance"][name] for name in SETTINGS}
-    return {**numbers, "provenance": settings, "runtime": studies}, {**run_provenance, "runtime": costs}
+    return shared | {"provenance": settings}, of_run | {"runtime": numbers["runtime"]}
 
 
 def join(numbers: Row, provenance: Row) -> dict[str, Any]:
     """Join numbers.json and provenance.json of a run: the inverse of `split`."""
-    run_provenance = {name: value for name, value in provenance.items() if name != "runtime"}
-    costs = provenance["runtime"]
-    runtime = {**numbers["runtime"], **costs}
-    for name, value in runtime.items():
-        if isinstance(value, list):
-            runtime[name] = [row | times for row, times in zip(numbers["runtime"][name], costs[name], strict=True)]
-    return {**numbers, "provenance": {**numbers["provenance"], **run_provenance}, "runtime": runtime}
+    of_run = {name: value for name, value in provenance.items() if name != "runtime"}
+    return {**numbers, "provenance": {**numbers["provenance"], **of_run}, "runtime": provenance["runtime"]}
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:

@@ -18,11 +18,11 @@ from pipeline.catalogue import is_stage, module_name
 from pipeline.formatting import notes
 from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
 from pipeline.report.checklist import CLAIM, ONE_SKIN
-from pipeline.report.costs import cost_tables
 from pipeline.report.experiments import add_sections
 from pipeline.report.figures import HEADLINE
 from pipeline.report.protocol import Protocol, protocols
 from pipeline.report.sentences import sentences
+from pipeline.report.tables import run_tables
 from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
@@ -215,7 +215,7 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     file name.
     """
     source = numbers["provenance"]["source"]
-    tables = cost_tables(numbers["runtime"], source)
+    tables = run_tables(numbers, source)
     ids = ids_of([*tables, *costs])
     drawings = {name: measure(name, text, ids[name]) for name, text in costs.items() if name.endswith(".svg")}
     drawings = describe(drawings, sentences(numbers))

@@ -10,7 +10,6 @@ from pydantic import model_validator
 
 from pipeline import scenes
 from pipeline.experiments.drift import policies_in
-from pipeline.experiments.neglected_effects import neglected_effects_table
 from pipeline.formatting import (
     COLUMNS,
     INTERVAL,
@@ -36,6 +35,7 @@ from pipeline.paper import ADAPTED_POKES_N, FIGURE_6A, FIGURE_6B, SINGLE_SENSOR,
 from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.experiments import experiment_tables
 from pipeline.report.figures import unseen_rows
+from pipeline.report.numbers import timed_rows
 from pipeline.report.protocol import protocol_table, protocols
 from pipeline.statistics import Stat
 from reskin.config import Strict, parse, read_yaml
@@ -169,12 +169,13 @@ DIFFERENCE = "within 1 mm, minus the shipped model (± over draws)"
 NEW_BOARD_SPREAD = "Scores are means over draws, then over boards; (a; b) are the values of the boards."
 NOLOAD_AGES = {"each": "before each press", "previous": "before the press before", "initial": "at the start"}
 CONTACT = {"false_pct": "false touches, %", "missed_pct": "missed touches, %"}
-CHECKS = {
-    "subject": "subject", "law": "law", "against": "compared with", "error": "error", "tolerance": "allowed",
-    "reason": "reason for the tolerance",
-}  # fmt: skip
+COMPUTED = (
+    "Column computed is the time that a stage takes to compute all its results if its training runs run one after "
+    "another. The last run may have taken less time, because training runs run in parallel and are reused."
+)
 CASES = {
-    "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
+    "area": "area", "what": "what", "reference": "compared with", "error": "error", "limit": "allowed",
+    "reason": "reason for the allowed error",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
 SIMULATIONS = {
@@ -222,9 +223,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
-        "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table,
-        "verification": verification_table,
-        "stability": stability_table, "left_out": neglected_effects_table, "trainings": _trainings,
+        "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table, "extremes": extremes_table,
+        "accuracy_and_cost": accuracy_and_cost_table, "trainings": _trainings,
         "variants": _variants,
     }  # fmt: skip
     tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
@@ -657,27 +657,52 @@ def _difference_of(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:
     return f"{known[row['of']].short} − {known[row['over']].short}"
 
 
-def verification_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the checks of the physics: what was compared, the error, and the allowed error with its reason."""
-    return _checks(rows, CHECKS, source)
-
-
-def stability_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List stiff, extreme and broken cases: expected and observed behaviour, the error and its limit."""
-    return _checks(rows, CASES, source)
-
-
-def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
-    def show_value(value: str | float | None, unit: str) -> str:
-        if value is None or isinstance(value, str):
-            return value or "–"
-        return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
-
-    return pd.DataFrame(
-        {title: show_value(row[name], row.get("unit", "1")) for name, title in titles.items()}
+def extremes_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List laws of physics and stiff, extreme and broken cases with the error, the allowed error and its reason."""
+    lines = [
+        {title: _with_unit(row[name], row["unit"]) for name, title in CASES.items()}
         | {"holds": "yes" if row["holds"] else "NO", "source": source}
-        for row in rows
-    )
+        for row in numbers["cases"]
+    ]
+    return tabulate(lines)
+
+
+def accuracy_and_cost_table(numbers: Numbers, source: str) -> pd.DataFrame:
+    """List the errors of methods and of neglected terms; the run times are shown if they were measured."""
+    timed = any("seconds" in row for row in numbers["rows"])
+    lines = [
+        {name: row[name] for name in ("study", "method", "setting")}
+        | {"error": "failed" if row["error"] is None else _with_unit(row["error"], row["unit"])}
+        | ({"run time, s": f"{row['seconds']:.2g}" if "seconds" in row else "–"} if timed else {})
+        | {"source": source}
+        for row in numbers["rows"]
+    ]
+    return tabulate(lines)
+
+
+def _with_unit(value: str | float, unit: str) -> str:
+    if isinstance(value, str):
+        return value
+    return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
+
+
+def run_tables(numbers: Numbers, source: str) -> dict[str, pd.DataFrame]:
+    """Make the tables that differ between repeats of a run: errors against run times, and the cost of each stage."""
+    rows = timed_rows(numbers)
+    tables = {"accuracy_and_cost": accuracy_and_cost_table({"rows": rows}, source)} if rows else {}
+    lines = [
+        {
+            "stage": stage,
+            "computed, s": f"{cost['computed_s']:.1f}",
+            "last run, s": f"{cost['seconds']:.1f}",
+            "last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # missing in older records of costs
+            "training runs": str(cost["trainings_n"]),
+            "reused training runs": str(cost["reused_n"]),
+            "peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}",
+        }
+        for stage, cost in numbers["runtime"]["stages"].items()
+    ]
+    return tables | {"stages": tabulate(lines, meaning=COMPUTED)}
 
 
 class Table1(Strict):

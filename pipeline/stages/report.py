@@ -9,6 +9,7 @@ import pandas as pd
 
 from pipeline import PLAN, SCENES
 from pipeline.executors import make_executor
+from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded, to_markdown
 from pipeline.provenance import (
     COSTS,
@@ -21,7 +22,6 @@ from pipeline.provenance import (
     total_cost_s,
     versions,
 )
-from pipeline.report.costs import cost_pages
 from pipeline.report.experiments import experiment_figures, experiment_numbers
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
 from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
@@ -31,15 +31,15 @@ from pipeline.report.numbers import (
     count_trainings,
     headline_scores,
     learning_numbers,
-    learning_times,
     lost_by_protocol,
-    runtime_numbers,
     split,
+    stage_costs,
     sweep_curves,
+    timed_rows,
 )
 from pipeline.report.page import about_scene, index, page, run_page
 from pipeline.report.summary import summarise
-from pipeline.report.tables import make_tables, table_2_summary, table_texts
+from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
 from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
@@ -93,7 +93,6 @@ def report(
         imports="pipeline.report.experiments"
     ) as executor:  # figures are drawn in parallel, because drawing takes most of the time
         figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
-        costs_future = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(table)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
@@ -102,10 +101,11 @@ def report(
         figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
         figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
         figures |= figures_future.result()
-        costs = costs_future.result()
     io.write_texts(reports / "figures", figures)
     # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
-    io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
+    timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, source)
+    of_run = table_texts(run_tables(numbers, source)) | timed
+    io.write_texts(reports / "runtime", of_run | {"index.html": run_page(numbers, timed)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     write_index(reports.parent)
     for line in (
@@ -161,8 +161,10 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
     analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
     studies = {EXPERIMENTS[name].key: result for name, result in inputs.studies.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
-    seconds = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
-    runtime = runtime_numbers(len(inputs.cards), costs, studies.pop("runtime", None), seconds.get("runtime", []))
+    runtime: dict[str, Any] = {"stages": stage_costs(costs)}
+    seconds = SECONDS / settings.scene / "accuracy_and_cost.json"
+    if "accuracy_and_cost" in scene.experiments and seconds.exists():
+        runtime["accuracy_and_cost"] = io.read_json(seconds)
     experiments = {EXPERIMENTS[name].key: found for name, found in experiment_numbers(inputs.analyses, table).items()}
     experiments |= studies
     numbers = {
@@ -185,7 +187,6 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
         numbers["capture_by_protocol"] = lost_by_protocol(losses)
     if "choice" in scene.experiments:
         numbers["chosen"] = choose(inputs.cards)
-    runtime |= learning_times(numbers, seconds)
     return numbers
 
 

@@ -135,8 +135,8 @@ SEAMS_M = seams_m(SKIN_SIDE_M)  # for the authors' skin, which is magnetised by 
 class QuadratureSettings(Strict):
     """Section `quadrature` of a board's settings: the rule by which a skin is divided into cells.
 
-    The closer the chips are to the skin, the smaller the cells must be. The experiment `runtime` measures the error and
-    the computing time for several rules.
+    The closer the chips are to the skin, the smaller the cells must be. The experiment `accuracy_and_cost` measures the
+    error and the computing time for several rules.
     """
 
     cell_mm: Annotated[float, Field(gt=0, le=20)]  # largest width of a cell along x and y

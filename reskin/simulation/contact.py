@@ -1,7 +1,7 @@
 """Simulate the response of a skin to a tip: the fields at the chips and the forces at every stop of a protocol.
 
 A stop is a place and depth at which the tip rests while readings are taken. Friction, ageing and some other effects are
-optional: they are simulated only if the protocol's settings list them under `terms`. The experiment `neglected_effects`
+optional: they are simulated only if the protocol's settings list them under `terms`. The experiment `accuracy_and_cost`
 reports the error that results if such an effect is not simulated.
 """
 

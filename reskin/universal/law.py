@@ -61,7 +61,7 @@ def inside(place_mm: Float[np.ndarray, "n 2"], area: Area = PAPER_AREA) -> Bool[
 
 
 # The field of a skin is an integral over its volume, which is computed with a quadrature rule. This is the same rule as
-# in scene `quick`: the cheapest rule whose error is below 2 % of the field change (measured by experiment `runtime`).
+# in scene `quick`: the cheapest rule whose error is below 2 % of the field change (experiment `accuracy_and_cost`).
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
 # A cheaper rule, with which the skins for training networks are simulated. Its error is smaller than the error of the
 # law, which is the difference between the law and real skins.

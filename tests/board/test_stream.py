@@ -8,14 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.experiments.stability.wire import Damage, decode_damaged, decode_portions, join_mid_frame, records
+from pipeline.experiments.extremes.serial import cut_start, decode_portions, lost_frames_n, records
 from reskin.board import stream
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
 from reskin.errors import CaptureError
 from reskin.recordings.decode import decode_dump
 from tests.board.signals import BINARY_WIRES, TEXT_WIRES, WIRES, CRLF_TEMPERATURE_degC, frames_strategy, make_frames
-from tests.laws import broken
 
 EVERY_WIRE = st.sampled_from(WIRES)
 FIELDS = ("b_uT", "temperature_degC", "device_s", "end_byte")
@@ -31,8 +30,7 @@ def check_account(account: dict[str, int], data: bytes) -> None:
 
 
 def check_damage(frames, wire, chunks, *, lost_n, false_n):
-    damage = Damage("", "", chunks, lost_n=lost_n, false_n=false_n, not_finite_n=None)
-    assert not broken([decode_damaged(damage, frames, wire)])
+    assert lost_frames_n(chunks, frames, wire, false_n=false_n, not_finite_n=None) <= lost_n
 
 
 def check_equal(frames: Frames, others: Frames) -> None:
@@ -109,7 +107,7 @@ def test_decoding_of_bytes_with_many_terminators_does_not_depend_on_the_chunks(d
     check_account(account, data)
 
 
-# Damaged streams: `decode_damaged` compares the lost frames, false frames and counted bytes with the limits -----
+# Damaged streams: `lost_frames_n` also checks false frames and counted bytes ----------------------------------
 
 
 @settings(max_examples=150)
@@ -146,15 +144,14 @@ def test_only_one_frame_is_lost_if_a_stream_starts_within_a_frame(frames, wire, 
     length_n = record_type(wire, chips_of(frames)).itemsize
     # The cut is not between CR and LF. Otherwise, the next frame would be lost too.
     joined_n = 1 + int(where * (length_n - 3))
-    assert decode_damaged(join_mid_frame(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
+    assert lost_frames_n(cut_start(frames, wire, (joined_n + 0.5) / length_n), frames, wire) <= 1
 
 
 def test_frames_whose_temperature_contains_the_terminator_are_decoded():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
-    assert not broken(
-        [decode_damaged(join_mid_frame(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)]
-    )
+    for n in range(1, 81):
+        assert lost_frames_n(cut_start(frames, "binary", n / 82), frames, "binary") <= 1
 
 
 def test_remains_of_two_damaged_frames_are_not_taken_for_a_frame():

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.experiments.stability.wire import decode_portions
+from pipeline.experiments.extremes.serial import decode_portions
 from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encode_pieces, inject
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames

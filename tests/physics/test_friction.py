@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
@@ -34,8 +33,10 @@ def slipped_m(path_m, found):
 
 @given(st.floats(1e-6, 1e-2), st.floats(1e-3, 5), st.floats(1e-3, 2), st.floats(0, 5e3), st.integers(1, 50))
 def test_force_of_a_straight_drag_is_the_smaller_of_spring_force_and_friction(end_m, normal_N, mu, stiffness, steps_n):
-    path_m = np.linspace(0, end_m, steps_n + 1)
-    assert straight_drag(path_m, mu * normal_N, stiffness_N_per_m=stiffness, coefficient=mu).holds
+    path_m = np.column_stack([np.linspace(0, end_m, steps_n + 1), np.zeros(steps_n + 1)])
+    found = drag_force(path_m, constant_force_N(path_m, normal_N), stiffness_N_per_m=stiffness, friction=mu)
+    truth_N = np.minimum(stiffness * path_m[:, 0], mu * normal_N)
+    np.testing.assert_allclose(found.force_N[:, 0], truth_N, atol=ROUNDING * mu * normal_N)
 
 
 @given(paths_m)

@@ -14,7 +14,6 @@ from pipeline.report.numbers import (
     contrasts_of_pokes,
     contrasts_of_sensors,
     learning_numbers,
-    learning_times,
 )
 from pipeline.scores import join, rows_of_cards, rows_of_networks
 from pipeline.statistics import as_json
@@ -180,12 +179,6 @@ def test_sweep_over_the_number_of_sensors_has_a_point_per_method_and_count():
     # The number n is that of boards. There is one board, with two draws of skins.
     assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
-
-
-def test_times_of_adaptation_are_given_for_each_number_of_pokes():
-    numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
-    seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
-    assert [row.get("seconds") for row in learning_times(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> list[dict]:

@@ -8,28 +8,21 @@ import json
 import pytest
 
 from pipeline.manage.compare import leaves
-from pipeline.report.numbers import TIMES, headline_scores, join, learning_times, split
+from pipeline.report.numbers import headline_scores, join, split, timed_rows
 from pipeline.scenes import ANALYSES
 from reskin.io import read_json
 from tests.report.synthetic import all_experiments, cost, scores, stat
 from tests.stages.checkout import ROOT
 
-SWEPT = [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390)]
-STUDY = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "work_n": 9, "error": 0.1, "failure": None}
+ROW = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "error": 0.1, "unit": "1"}
 
 
 def run(seconds: float) -> dict:
-    """Return the numbers of a run with run times of every kind."""
-    trainings = {
-        "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
-    }
-    numbers = all_experiments() | {"sweep_pokes": SWEPT}
+    """Return the numbers of a run with run times; one method was not timed."""
+    numbers = all_experiments() | {"accuracy_and_cost": {"rows": [ROW, ROW | {"method": "reference"}]}}
     numbers["provenance"] |= {"git": f"code {seconds}", "device": f"machine {seconds}", "seconds": seconds}
-    numbers["runtime"] = {
-        "trainings_n": 1, "stages": {"report": cost(seconds)}, "choice": {"setting": "1 mm x 5"},
-        "quadratures": [STUDY | {"median_s": seconds, "repeats_n": 3}, STUDY | {"method": "reference"}],
-        **learning_times(numbers, trainings),
-    }  # fmt: skip
+    timed = {name: ROW[name] for name in ("study", "method", "setting")} | {"seconds": seconds}
+    numbers["runtime"] = {"stages": {"report": cost(seconds)}, "accuracy_and_cost": [timed]}
     return numbers
 
 
@@ -37,15 +30,18 @@ def test_equal_runs_differ_only_in_their_provenance():
     (numbers, provenance), (other_numbers, other) = split(run(1.0)), split(run(2.0))
     assert numbers == other_numbers
     assert provenance != other
-    assert all(row.keys() & set(TIMES) for row in provenance["runtime"]["adaptation"])
 
 
 def test_numbers_do_not_contain_the_commit_the_machine_or_run_times():
     numbers = split(run(1.0))[0]
     assert set(numbers["provenance"]) == {"scene", "source", "seed"}
-    assert "stages" not in numbers["runtime"]
-    assert [name for name, _ in leaves(numbers["runtime"]) if name.rsplit(".", 1)[-1] in TIMES] == []
-    assert numbers["runtime"]["quadratures"][0] == STUDY
+    assert "runtime" not in numbers
+    assert numbers["accuracy_and_cost"]["rows"][0] == ROW
+
+
+def test_rows_are_joined_with_their_run_times():
+    assert timed_rows(run(2.0)) == [ROW | {"seconds": 2.0}, ROW | {"method": "reference"}]
+    assert timed_rows(all_experiments()) == []
 
 
 def test_results_that_are_split_and_joined_are_unchanged():

@@ -88,7 +88,7 @@ def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
 
 
 def render_run(numbers: dict) -> str:
-    return run_page(numbers, {"training.svg": SVG.format(300), "stages.md": "| a |"})
+    return run_page(numbers, {"accuracy_and_cost.svg": SVG.format(300)})
 
 
 @pytest.fixture(scope="module")
@@ -313,7 +313,7 @@ def test_results_of_experiments_come_before_checks_and_captures():
 def test_missing_experiment_has_no_section_on_the_page():
     keys = [section.key for section in arrange(["table2", "captures"], [])]
     assert keys == ["headline", "captures"]
-    assert [section.key for section in arrange(["shear", "paired", "drift"], ["quadratures.svg"])] == [
+    assert [section.key for section in arrange(["shear", "paired", "drift"], ["accuracy_and_cost.svg"])] == [
         "shear", "drift", "skins", "costs",
     ]  # fmt: skip
 
@@ -325,7 +325,7 @@ def test_page_about_the_run_has_provenance_and_run_times():
     assert set(provenance) <= set(text)
     assert {str(value) for value in provenance.values()} <= set(text)
     assert any("Cost of each stage" in word for word in text)
-    assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["training.svg"]
+    assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["accuracy_and_cost.svg"]
 
 
 def test_page_of_results_does_not_depend_on_the_run(read):

@@ -19,20 +19,21 @@ from pipeline.report.tables import (
     LOCALISATION,
     NOT_GIVEN,
     OURS,
+    accuracy_and_cost_table,
+    extremes_table,
     make_tables,
     measured,
     read_table1,
+    run_tables,
     skins_table,
-    stability_table,
     summary_table,
     table1,
-    verification_table,
 )
 from pipeline.scores import rows_of_cards
 from reskin.errors import ParamsError, SchemaError
 from reskin.io import read_json
 from tests.report import synthetic
-from tests.report.synthetic import all_experiments, stat
+from tests.report.synthetic import all_experiments, cost, stat
 from tests.stages.checkout import ROOT
 
 
@@ -359,36 +360,32 @@ def test_table_compares_simulated_skins_with_recorded_ones():
     assert ratios["resolution of a chip (one digital step), z, µT"] == "–"
 
 
-CHECK = {
-    "subject": "chip", "law": "conversion", "against": "data sheet", "error": 3.33e-05, "unit": "uT",
-    "tolerance": 5e-5, "reason": "four decimals", "holds": True,
-}  # fmt: skip
 CASE = {
-    "area": "wire", "case": "truncated", "should": "counted", "happened": "59 of 60 frames back", "error": 1.0,
-    "limit": 1.0, "holds": True,
+    "area": "chip", "case": "steps", "what": "field per count", "reference": "data sheet", "error": 3.33e-05,
+    "unit": "uT", "limit": 5e-5, "reason": "four decimals", "holds": True,
 }  # fmt: skip
 
 
-def test_table_of_verification_has_errors_and_tolerances():
-    table = verification_table([CHECK, CHECK | {"unit": "1", "error": 1.5e-15}], "simulated")
-    assert table["error"].tolist() == ["3.3e-05 uT", "1.5e-15"]
+def test_table_of_extremes_has_errors_limits_and_failed_cases():
+    cases = [CASE, CASE | {"unit": "1", "error": 1.5e-3, "holds": False}]
+    table = extremes_table({"cases": cases}, "simulated")
+    assert table["error"].tolist() == ["3.3e-05 uT", "0.0015"]
     assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
-    assert table["reason for the tolerance"].tolist() == ["four decimals"] * 2
-
-
-def test_table_of_stability_has_dashes_for_missing_numbers():
-    table = stability_table([CASE, CASE | {"error": None, "limit": None}], "simulated")
-    assert table["error"].tolist() == ["1", "–"]
-    assert table["allowed"].tolist() == ["1", "–"]
-
-
-@pytest.mark.parametrize(("layout", "row"), [(verification_table, CHECK), (stability_table, CASE)])
-def test_rows_of_failed_checks_are_highlighted(layout, row):
-    table = layout([row, row | {"holds": False}], "simulated")
     assert table["holds"].tolist() == ["yes", "NO"]
     assert table["source"].tolist() == ["simulated"] * 2
 
 
-@pytest.mark.parametrize("layout", [verification_table, stability_table])
-def test_table_without_rows_is_empty(layout):
-    assert layout([], "simulated").empty
+def test_table_of_accuracy_has_run_times_only_if_they_were_measured():
+    row = {"study": "field", "method": "midpoint", "setting": "1 mm x 2", "error": 0.012, "unit": "1"}
+    failed = row | {"error": None}
+    assert accuracy_and_cost_table({"rows": [row, failed]}, "simulated")["error"].tolist() == ["0.012", "failed"]
+    timed = accuracy_and_cost_table({"rows": [row | {"seconds": 0.25}, failed]}, "simulated")
+    assert timed["run time, s"].tolist() == ["0.25", "–"]
+
+
+def test_table_of_a_run_lists_the_cost_of_each_stage():
+    tables = run_tables({"runtime": {"stages": {"train_multi": cost(seconds=0.25)}}}, "simulated")
+    assert list(tables) == ["stages"]
+    (line,) = tables["stages"].to_dict("records")
+    assert line["computed, s"] == "3.0"
+    assert line["last run, CPU s"] == "–"

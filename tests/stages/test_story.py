@@ -29,7 +29,7 @@ from pipeline.formatting import to_markdown
 from pipeline.pyfunc import channel_names
 from pipeline.report.checklist import NOT_REACHED, NOT_RUN, read_rows, resolve
 from pipeline.report.figures import table2_figure
-from pipeline.report.numbers import join
+from pipeline.report.numbers import join, timed_rows
 from pipeline.report.tables import table_2_summary
 from pipeline.scenes import ANALYSES
 from reskin import io
@@ -181,7 +181,13 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
     assert NOT_RUN not in (tables / "checklist.md").read_text()
     page = (story / "reports/ci/index.html").read_text()
     figures = sorted((story / "reports/ci/figures").glob("*.svg"))
-    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {"drift", "variation", "manual"}
+    assert {file.stem for file in figures} >= EXPERIMENTS_OF_CI - {
+        "extremes",
+        "accuracy_and_cost",
+        "drift",
+        "variation",
+        "manual",
+    }
     for figure in figures:
         assert f'src="figures/{figure.name}"' in page
 
@@ -209,7 +215,7 @@ def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(st
     assert after.keys() == before.keys()
     changed = {name for name in after if after[name] != before[name]}
     assert {name for name in changed if not name.startswith("ci/runtime/")} == {"ci/provenance.json"}
-    assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
+    assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/accuracy_and_cost.svg"} <= changed
 
 
 def test_experiments_on_single_boards_report_the_standard_deviation_over_seeds(story, numbers):
@@ -268,16 +274,14 @@ def test_reskin_predict_estimates_contacts_from_a_log_of_an_sd_card(story):
     assert np.isfinite(estimates.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
 
 
-def test_studies_of_the_simulation_have_numbers_and_tables(story, numbers):
-    assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
-    costs = json.loads((story / "reports/ci/provenance.json").read_text())
-    runtime = join(numbers, costs)["runtime"]
-    rows = runtime["quadratures"] + runtime["integrators"]
-    assert all(("median_s" in row) == (row["failure"] is None and row["method"] != "reference") for row in rows)
+def test_methods_have_errors_in_the_numbers_and_times_in_the_provenance(story, numbers):
+    rows = timed_rows(join(numbers, json.loads((story / "reports/ci/provenance.json").read_text())))
+    methods = [row for row in rows if row["method"] != "reference" and row["study"] != "neglected term"]
+    assert all(("seconds" in row) == (row["error"] is not None) for row in methods)
+    assert {"training", "adaptation", "neglected term"} <= {row["study"] for row in rows}
+    assert all(case["holds"] for case in numbers["extremes"]["cases"])
     assert set(numbers["described"]) == {"grid"}
-    for name in ("left_out", "skins"):
-        assert "simulated" in (story / f"reports/ci/tables/{name}.md").read_text()
-    assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
+    assert "<svg" in (story / "reports/ci/runtime/accuracy_and_cost.svg").read_text()
 
 
 def test_each_capture_has_a_parquet_file_with_units(story):

@@ -1,0 +1,119 @@
+"""Every law and extreme case holds, and a fault planted in the library makes a case fail."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.experiments.extremes import CASES
+from pipeline.experiments.extremes.cases import Case, World
+from reskin.board import stream
+from reskin.config import parse, read_yaml
+from reskin.models import inputs, train
+from reskin.physics import aging, chip, deformation, layer, magnet, slide
+from reskin.simulation import contact
+from reskin.simulation.defaults import nominal
+from reskin.simulation.settings import SimulationSettings
+
+QUICK = Path(__file__).resolve().parents[2] / "pipeline/scenes/quick.yaml"
+SHARED = {name: nominal(name) for name in ("rig", "skin", "chip", "spreads", "terms")}
+WORLD = World(parse(SimulationSettings, SHARED | read_yaml(QUICK)["simulate"], "simulate"), 2021)
+BY_NAME = {case.name: case for case in CASES}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_case_holds(case):
+    row = case.row(WORLD)
+    assert row["holds"], row
+
+
+def test_names_of_cases_are_unique():
+    assert len(BY_NAME) == len(CASES)
+
+
+def test_case_holds_up_to_its_limit_and_not_for_nan():
+    def holds(error):
+        return Case("physics", "a", "b", "c", lambda _: error, 1.0, "d").row(WORLD)["holds"]
+
+    assert [holds(error) for error in (0.0, 1.0, 1.0 + 1e-12, np.nan, np.inf)] == [True, True, False, False, False]
+
+
+def wrong_corner(original):
+    return lambda from_m: -original(from_m)
+
+
+def without_rotation(original):
+    def move(table, rest, poke_m):
+        moved = original(table, rest, poke_m)
+        return replace(moved, after=(moved.after[0], moved.before[1]))
+
+    return move
+
+
+def stretched(original):
+    def displacement(r_m, z_m, of):
+        u = original(r_m, z_m, of)
+        return replace(u, z_m=1.02 * u.z_m, z_z=1.02 * u.z_z, z_r=1.02 * u.z_r)
+
+    return displacement
+
+
+def naive_quotient(_):
+    return lambda x: np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
+
+
+def rotated_chips(original):
+    def feed(self, data):
+        frames = original(self, data)
+        return replace(frames, b_uT=frames.b_uT * (1 if len(frames) > 10 else 2))
+
+    return feed
+
+
+def unchecked(_):
+    def check(self, errors, step):
+        self.errors.append(errors)
+        for i in range(errors.shape[1]):
+            self.sound_steps_n[i] = step
+            self.weights[i] = self.net.weights_of(i)
+        return True
+
+    return check
+
+
+FAULTS = {
+    "array": (magnet, "_corner", wrong_corner),
+    "maxwell": (magnet, "array_field", lambda original: lambda *args, **named: original(*args, **named) * (1, 1, 1.01)),
+    "dipoles": (magnet, "MU0_4PI", lambda _: 1.001e-7),
+    "long_2011": (layer, "bonded_compliance", lambda _: np.ones_like),
+    "rings_slipping_1": (layer, "slipping_compliance", lambda original: lambda kh: original(1.5 * kh)),
+    "linear_step_slipping": (layer, "displacement", stretched),
+    "depth_0.72": (deformation, "move_dipoles", without_rotation),
+    "thickness_20mm": (slide, "stiffening", lambda _: lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3),
+    "lifted_drag": (contact, "_in_series", lambda _: lambda layers, base: layers[:, None, None] * np.eye(2)),
+    "stiff_relaxation": (aging, "_mean_decay", naive_quotient),
+    "steps": (chip, "STEP_AT_GAIN_ONE_uT", lambda _: (0.161, 0.161, 0.294)),
+    "portions": (stream.FrameStream, "feed", rotated_chips),
+    "constant_channels": (inputs, "SCALE_FLOOR", lambda _: np.float32(0)),
+    "exploding": (train.Monitor, "check", unchecked),
+}
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("name", FAULTS)
+def test_planted_fault_is_reported(monkeypatch, name):
+    owner, attribute, fault = FAULTS[name]
+    caches = (layer.contact_of_depth, layer._force_curve)
+    monkeypatch.setattr(owner, attribute, fault(getattr(owner, attribute)))
+    for cached in caches:
+        cached.cache_clear()
+    assert not BY_NAME[name].row(WORLD)["holds"]
+    for cached in caches:
+        cached.cache_clear()
+
+
+def test_noise_that_differs_from_recorded_noise_is_reported():
+    simulation = WORLD.simulation
+    quiet = simulation.model_copy(update={"chip": simulation.chip.model_copy(update={"noise_xy_uT": 1.0})})
+    assert not BY_NAME["recorded_noise"].row(World(quiet, 2021))["holds"]
