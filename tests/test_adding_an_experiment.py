@@ -3,55 +3,27 @@
 They compare DVC's index and hashes before and after the edit. Only stage `code` is run.
 """
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline import FLOW, PLAN, SCENES, plan
-from reskin import code
+from pipeline.scores import read_scores
+from reskin import code, io
 from reskin.models.job import CODE_MODULES, JobKeys
 from tests.models.example_jobs import example_data, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Libraries that DVC uses cause warnings.
-STAGE = """\
-  repeat: # how much force differs from reading to reading
-    foreach: ${stages.repeat}
-    do:
-      cmd: >-
-        python -m pipeline repeat --scene ${item} --indentations data/indentations/${item}
-        --results data/results/${item}/repeat.json
-      deps: [data/code/repeat, "data/indentations/${item}"]
-      outs: ["data/results/${item}/repeat.json"]
-
-"""
-FILES = {
-    "repeat.yaml": "experiment: {recorded: true}\n",
-    "repeat.py": '''"""How much force differs from reading to reading."""
-
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
-
-import pandas as pd
-
-from pipeline.experiments.results import read_captures, write_results
-
-
-def repeat(indentations: Path, results: Path) -> None:
-    """Write the standard deviation of force by capture."""
-    write_results(results, {one.capture: float(one.Fz_N.std()) for one in read_captures(indentations)}, {})
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show a row for each capture."""
-    lines = [{"capture": name, "sd of force, N": f"{sd_N:.3g}", "source": source} for name, sd_N in numbers.items()]
-    return {"repeat": pd.DataFrame(lines)}
-''',
-}
+PAGE = (ROOT / "docs/add-an-experiment.md").read_text(encoding="utf-8")
+MODULE, EXPERIMENT, STAGE = re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE, re.DOTALL)
+FILES = {"repeat.py": MODULE, "repeat.yaml": EXPERIMENT}
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +82,23 @@ def _overlap(path: Path, other: Path) -> bool:
     return path.is_relative_to(other) or other.is_relative_to(path)
 
 
+def test_module_of_the_page_computes_numbers_and_a_figure_from_its_scores(tmp_path):
+    module: dict[str, Any] = {}
+    exec(compile(MODULE, "repeat.py", "exec"), module)
+    forces_N = {"b0": [[1.0, 3.0], [2.0, 2.0]], "b1": [[1.0, 5.0]]}
+    module["read_captures"] = lambda _: [
+        SimpleNamespace(board=board, skin=f"{board}_s{i}", Fz_N=np.array(of_skin))
+        for board, of_board in forces_N.items()
+        for i, of_skin in enumerate(of_board)
+    ]
+    module["repeat"](tmp_path, tmp_path / "scores.parquet", tmp_path / "repeat.json")
+    measured = io.read_json(tmp_path / "repeat.json")["numbers"]
+    numbers = module["summarise"](read_scores([tmp_path / "scores.parquet"]), measured)
+    assert (numbers["captures_n"], numbers["by_board"]) == (3, {"b0": 0.5, "b1": 2.0})
+    assert numbers["force_sd_N"].mean == 1.25
+    assert "b1" in module["figures"](numbers, {}, "simulated")["repeat.svg"]
+
+
 @contextmanager
 def edited_files(root: Path, files: dict[str, str]) -> Iterator[None]:
     """Write files within the block. At its end, restore the files and the plan."""
@@ -135,7 +124,7 @@ def insert_before(file: Path, line: str, text: str) -> str:
 def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
     files = {f"pipeline/experiments/{name}": text for name, text in FILES.items()} | {
-        FLOW: insert_before(root / FLOW, "  report: #", STAGE),
+        FLOW: insert_before(root / FLOW, "  report: #", f"{STAGE}\n"),
         scene: insert_before(root / scene, "single_random,", "repeat, "),
     }
     with edited_files(root, files):
@@ -143,7 +132,7 @@ def test_new_experiment_reruns_its_stage_and_the_report(root, before):
         after = state(root)
     assert stale_stages(before, after) == {
         "repeat@ci", "table2@ci", "report@ci",  # These stages read the numbers of all experiments.
-        "contacts@ci",  # This stage reads the whole file of the scene.
+        "new_board@ci",  # This stage reads the list of experiments.
     }  # fmt: skip
 
 

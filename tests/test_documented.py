@@ -64,7 +64,7 @@ def test_columns_of_readings_are_documented_with_units():
 
 def test_columns_of_predictions_and_scores_are_documented():
     columns = {f"{side}_{name}" for side in ("true", "predicted") for name in TARGETS}
-    assert sorted(columns.union(KEYS, METRICS, UNCERTAINTY) - code_words("data/README.md")) == []
+    assert sorted(columns.union(KEYS, METRICS) - code_words("data/README.md")) == []
 
 
 def number_names(settings: Any) -> Iterator[str]:

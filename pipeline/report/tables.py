@@ -49,10 +49,6 @@ SPLITS = {
     "single_pass": "random passes held out (each pass presses all places to all depths)",
     "single_temporal": "last passes held out (trained on the first passes, tested on the last passes)",
 }
-UNCERTAINTY = {
-    "coverage_pct": "coverage of 90 % intervals, %",
-    "half_width_mm": "half-width of 90 % intervals, mm (median)",
-}
 BEFORE_TOUCH = {
     "noload": "only the no-load reading before the indentation",
     "scan": "only the number of the indentation in its pass",
