@@ -183,7 +183,7 @@ def run(settings: Settings, section: Interference, raw: Path, indentations: Path
 
 def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, Any]:
     """Average over draws and over the skins of a board, then summarise the boards."""
-    in_order = {name: pd.CategoricalDtype(scores[name].unique()) for name in ("field", "method")}
+    in_order = {name: pd.CategoricalDtype(list(scores[name].unique())) for name in ("field", "method")}
     scores = scores.astype(in_order | {"labels_n": "Int64"})
     parts = {"contacts": (KEYS, CONTACT_METRICS), "places": ([*KEYS, "labels_n"], PLACE_METRICS)}
     return dict(measured) | {
