@@ -60,9 +60,7 @@ CARD = {
 }
 SHIPPED = {  # additional entries in the card of the shipped model
     "name": "universal, simulated alone",
-    "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
-    "evenly spread presses (see(presses, even=True)) and by labels. Table `random_presses` "
-    "has presses at random places",
+    "tested_on": "reports/lab: rows `shipped` of experiment new_board, calibrated by unlabelled presses and by labels",
     "not_for": "boards with other positions or rotations of the chips, skins with another magnetisation or thickness, "
     "two contacts at once, shear",
 }
