@@ -22,6 +22,14 @@ MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 WHOLE = "the scene"  # in messages about unused settings: the place of settings that are whole sections of the scene
+# Experiments and sections that no longer exist, by the experiment that replaces them.
+REPLACED = {
+    "new_board": ("labels", "few_labels", "calibrated", "random_presses", "reference_methods", "recorded_limits"),
+    "rig": ("universal",),
+    "interference": ("ambient", "moving_hand"),
+    "extremes": ("verification", "stability"),
+    "accuracy_and_cost": ("runtime", "neglected_effects"),
+}
 KEPT = {"pool_passes_n"}  # settings that have an effect even if the scene does not run the experiment that needs them
 
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
@@ -249,6 +257,11 @@ def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
 
     The sections are not parsed.
     """
+    named = content.get("experiments")
+    for new, olds in REPLACED.items():
+        if old := [name for name in olds if name in content or (isinstance(named, list) and name in named)]:
+            remedy = f"Use {new}; the scene that `reskin new` writes, or pipeline/scenes/ci.yaml, shows its settings."
+            raise ParamsError(f"{where}: {', '.join(old)} was replaced by {new}. {remedy}")
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))
