@@ -220,8 +220,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
         "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table,
-        "extremes": extremes_table,
-        "accuracy_and_cost": accuracy_and_cost_table, "trainings": _trainings,
+        "extremes": extremes_table, "accuracy_and_cost": accuracy_and_cost_table, "trainings": _trainings,
         "variants": _variants,
     }  # fmt: skip
     tables |= {name: make(numbers[name], source) for name, make in makers.items() if name in numbers}
