@@ -294,10 +294,10 @@ def study_relaxation(tried: Integrators, repeats_n: int) -> Iterator[Row]:
     """Compare integrators of q' = -q / tau + share e' with a 50-digit solution, at every stiffness ratio."""
     for ratio in tried.ratios:
         prony = stiff(ratio)
-        truth = hereditary(TIME_S, ELASTIC, prony)[1:]
+        truth = hereditary(TIME_S, ELASTIC, prony)
         settings = [(method, tolerance, "{:.0e}") for method, tolerance in product(SOLVERS, tried.tolerances)]
         settings += [(EULER, step_s, "{:.0e} s") for step_s in tried.euler_steps_s]
-        runs: list[tuple[str, str, Callable[[], Any]]] = [(EXACT, "", partial(exact, prony))]
+        runs: list[tuple[str, str, Callable[[], Any]]] = [(EXACT, "", partial(relax, TIME_S, ELASTIC, prony))]
         runs += [
             (method, shown.format(of), partial(integrate, prony, method, of, tried.calls_max_n))
             for method, of, shown in settings
@@ -306,10 +306,6 @@ def study_relaxation(tried: Integrators, repeats_n: int) -> Iterator[Row]:
             error = error_of(run, truth)
             seconds = None if error is None else median_s(run, repeats_n)
             yield Row(f"relaxation, stiffness {ratio:.0e}", method, setting, error, seconds=seconds)
-
-
-def exact(prony: Prony) -> Float[np.ndarray, " u"]:
-    return relax(TIME_S, ELASTIC, prony)[1:]
 
 
 def error_of(run: Callable[[], Float[np.ndarray, " u"]], truth: Float[np.ndarray, " u"]) -> float | None:
@@ -330,8 +326,8 @@ def stiff(ratio: float) -> Prony:
 
 
 def integrate(prony: Prony, method: str, setting: float, calls_max_n: int) -> Float[np.ndarray, " u"]:
-    """Integrate the states of the relaxation piece by piece; return the relaxed force at the end of each piece."""
-    state, found, calls_n = np.zeros_like(prony.tau_s), [], 0
+    """Integrate the states of the relaxation piece by piece; return the relaxed force at `TIME_S`."""
+    state, found, calls_n = np.zeros_like(prony.tau_s), [0.0], 0
     jacobian = np.diag(-1 / prony.tau_s)
     for length_s, change, elastic in zip(np.diff(TIME_S), np.diff(ELASTIC), ELASTIC[1:], strict=True):
         driven = prony.share * change / length_s
@@ -394,8 +390,8 @@ def study_training(
     recipe, adaptation = settings.section(Training, "train_multi").recipes[HEADLINE], adapt.recipes[HEADLINE]
     jobs: dict[tuple[str, int], list[TrainingJob]] = {}
     for steps_n in section.training_steps_n:
-        of_steps = Training(recipes={HEADLINE: recipe.model_copy(update={"steps_n": steps_n})}, seeds_n=1)
-        jobs["training", steps_n] = make_jobs(data, of_steps, [fold])
+        shorter = Training(recipes={HEADLINE: recipe.model_copy(update={"steps_n": steps_n})}, seeds_n=1)
+        jobs["training", steps_n] = make_jobs(data, shorter, [fold])
     for steps_n in section.adaptation_steps_n:
         named = HEADLINE, adaptation.model_copy(update={"steps_n": steps_n})
         adapting = adaptation_jobs(data, fold, named, networks, experiment="adapt", pokes_n=adapt.pokes_n)

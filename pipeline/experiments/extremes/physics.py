@@ -573,7 +573,7 @@ CASES: tuple[Case, ...] = (
          lambda _: sliding_compliance(np.geomspace(0.01, 30, 12)), 1e-12,
          "For long waves, almost equal numbers are subtracted."),
     *(_law(f"hertz_{base}", f"force of a thick {base} layer at depths up to 1e-5 of the tip radius",
-           "16/9 E sqrt(R) d^1.5 (Hertz 1882)", lambda w, base=base: hertz(w.press.tip_radius_m, base), 1e-4,
+           "16/9 E sqrt(R) d^1.5 (Hertz 1882)", partial(lambda base, w: hertz(w.press.tip_radius_m, base), base), 1e-4,
            "Hertz takes the sphere as a paraboloid (d / R = 1e-5); the force is interpolated by a spline.")
       for base in BASES),
     _law("sneddon", "force and depth of a sphere in a thick layer, contact radius up to 0.7 of the tip radius",
@@ -588,7 +588,7 @@ CASES: tuple[Case, ...] = (
          lambda w: long_2011(_fit_depths_m(w), _with_base(w, "bonded")), 0.05,
          "The reference is a fit to finite-element simulations of large deformations."),
     *(_law(f"rings_{base}_{size:g}", f"force of a {base} layer, tip radius {size:g} times the thickness",
-           f"{RINGS_N} rings of pressure", lambda _, b=base, s=size: _with_tip(b, s), 1e-3,
+           f"{RINGS_N} rings of pressure", partial(lambda base, size, _: _with_tip(base, size), base, size), 1e-3,
            "The pressure is uniform on each ring, and waves shorter than a ring is wide are omitted.",
            full=(base, size) != ("slipping", 1.0))
       for base, size in product(BASES, (0.1, 1.0, 10.0))),
@@ -605,19 +605,19 @@ CASES: tuple[Case, ...] = (
          "Waves that decay as exp(-pi r / h) disturb this rule near the contact."),
     *(_law(f"depth_{share:g}", f"dB of a press to {share:g} of the thickness",
            "dB in finer steps, without tables, rotations by SVD",
-           lambda w, share=share: in_fine_steps(w.board, w.skin, share, round(40 * share)), 0.02,
+           partial(lambda share, w: in_fine_steps(w.board, w.skin, share, round(40 * share)), share), 0.02,
            "A total error of 2 % is accepted for the field change of a press.", full=share < slide.DEEPEST)
       for share in (0.1, 0.3, 0.6, 0.66, slide.DEEPEST)),
     _law("symmetries", "dB if board, skin and press are turned, mirrored or shifted together",
          "dB turned, mirrored or unchanged; negated if the poles of a checkerboard are swapped",
          lambda w: symmetries(w.board.chips_m, _rigid_rig(w), w.design.polarity), 1e-9, ROUNDING),
     *(_law(f"gap_{gap_mm:g}mm", f"dB at chips {gap_mm:g} mm under a skin that slides by 0.1 mm",
-           "a magnetised box (magpylib)", lambda w, gap_mm=gap_mm: near(w, gap_mm), 0.03,
+           "a magnetised box (magpylib)", partial(near, gap_mm=gap_mm), 0.03,
            "Dipoles in cells of half the gap represent the skin.", full=gap_mm < 0.4)
       for gap_mm in (1.1, 0.4, 0.2)),
     *(_law(f"thickness_{size_mm:g}mm", f"a skin of {size_mm:g} mm thickness, all other lengths scaled too",
            "dB unchanged, force proportional to length squared",
-           lambda w, size_mm=size_mm: scaled(w.board, w.skin, size_mm * milli), 1e-6,
+           partial(lambda size_mm, w: scaled(w.board, w.skin, size_mm * milli), size_mm), 1e-6,
            "The contact radius is the result of a root search.")
       for size_mm in (0.2, 20.0)),
     _law("memory", "memory of a press", "bytes per further press", lambda w: memory_per_poke_n(w.board, w.skin), 1000.0,
