@@ -1,6 +1,6 @@
 """Tests of experiment sleeve, in which one large skin covers several boards.
 
-The tests cover held-out indentations, borders between boards, the frame rate, scores and the places in the map of errors.
+The tests cover held-out indentations, borders between boards, the frame rate, scores, and the map of errors.
 """
 
 import numpy as np
