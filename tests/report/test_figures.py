@@ -7,7 +7,6 @@ from html import unescape
 import numpy as np
 import pytest
 
-from pipeline.formatting import models
 from pipeline.paper import TABLE_2
 from pipeline.plot import drawing, svg
 from pipeline.report.figures import (
@@ -29,6 +28,7 @@ from pipeline.report.figures import (
     unseen_boards,
     unseen_rows,
 )
+from pipeline.report.table_2 import models
 from tests.report.synthetic import all_experiments, new_board, texts_of
 
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)

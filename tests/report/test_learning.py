@@ -1,7 +1,8 @@
 """Tests of the tables about training with many skins."""
 
-from pipeline.formatting import CONTROL, to_markdown
+from pipeline.formatting import to_markdown
 from pipeline.paper import TABLE_2
+from pipeline.report.table_2 import CONTROL
 from pipeline.report.tables import (
     audit_table,
     chosen_table,

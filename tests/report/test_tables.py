@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.formatting import CONTROL, PAPER_METRICS, TITLES, models, rounded, show, show_digits, to_markdown
+from pipeline.formatting import PAPER_METRICS, TITLES, rounded, show, show_digits, to_markdown
 from pipeline.paper import TABLE_2
 from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
 from pipeline.report.readme import fill
+from pipeline.report.table_2 import CONTROL, models
 from pipeline.report.tables import (
     HELD_OUT,
     LOCALISATION,
