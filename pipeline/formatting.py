@@ -1,19 +1,17 @@
-"""Scores as text (means, deviations, intervals, paired differences), rows of table 2, and tables as Markdown."""
+"""Scores as text (means, deviations, intervals, paired differences), and tables as Markdown."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from pipeline.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
+from pipeline.paper import Number
 from pipeline.statistics import UNDECIDED, Stat, as_json
 
 Statistic = Stat | Mapping[str, Any]  # a statistic, or its entry in numbers.json
-Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
 FEW_POINTS = 5.0  # assumed; the paper says of a drop of 3.4 points that it "slightly affects performance"
@@ -38,9 +36,10 @@ TITLES = {
     "rig": "in-context model, made with the rig's other boards", "registration": "multi-sensor, 5 known presses",
     "gaussian_process": "Gaussian process on own labels", "kernel_ridge": "kernel ridge", "constant": "mean of labels",
     "reference_chip": "shipped, reference chip subtracted", "joints": "shipped, field predicted from joints subtracted",
+    "before": "before adaptation", "after": "after adaptation", "grid": "adapted with as many robot pokes",
+    "network": "the paper's network", "knn-raw": "k nearest neighbours (dB)",
+    "knn-shape": "k nearest neighbours (direction and length of dB)",
 }  # fmt: skip
-CONTROL = "Control: fine-tuned equally long, but without pokes of the new skin (ours)"
-ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
 INCONCLUSIVE = "inconclusive"
 DECIMALS_MAX = 6  # numbers that need more decimals are written with an exponent
 
@@ -189,14 +188,28 @@ def scored(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def beside(
-    row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Statistic | None], str], *, paper: str = "paper"
+    row: Mapping[str, Any],
+    printed: Mapping[str, str],
+    show: Callable[[Statistic | None], str],
+    *,
+    columns: Mapping[str, str] = COLUMNS,
+    paper: str = "paper",
 ) -> dict[str, str]:
     """Write each metric of a row beside the paper's value (`printed`), and then n; return cells by column title."""
     cells: dict[str, str] = {}
-    for metric, title in COLUMNS.items():
+    for metric, title in columns.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}
-        cells |= {f"{title} ({paper})": printed.get(metric, "–")} if metric in PAPER_METRICS else {}
+        if metric in PAPER_METRICS or metric in printed:
+            cells |= {f"{title} ({paper})": printed.get(metric, "–")}
     return cells | {"n": n_of(row)}
+
+
+def printed(paper: Mapping[str, Number] | Mapping[str, float]) -> dict[str, str]:
+    """Write the paper's scores, which are means or pairs of mean and standard deviation, as text by metric."""
+    return {
+        metric: "{:g} ± {:g}".format(*value) if isinstance(value, tuple) else f"{value:g}"
+        for metric, value in paper.items()
+    }
 
 
 def n_of(row: Mapping[str, Any]) -> str:
@@ -241,49 +254,3 @@ def _rounded(value: Any, digits: int) -> Any:
     if isinstance(value, float):
         return float(np.format_float_positional(value, digits, unique=False, fractional=False, trim="-"))
     return value
-
-
-@dataclass(frozen=True)
-class Model:
-    """A row of table 2: title, short title, and the paper's scores (empty if the paper has no such row)."""
-
-    title: str
-    short: str
-    paper: Mapping[str, Number]
-
-
-def models(numbers: Results) -> dict[str, Model]:
-    """Return the rows of table 2 in the paper's order.
-
-    If networks had only one training skin, the title of their row says so.
-    """
-    titles = TABLE_2_ROWS | {"control": CONTROL}
-    if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
-        pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
-        titles["adapted"] = titles["adapted"].replace(f"{ADAPTED_POKES_N} indentations", pokes)
-    named = {row: Model(title, TITLES[row], TABLE_2.get(row, {})) for row, title in titles.items()}
-    if is_pooled(numbers):
-        return named
-    one_skin = {row: titles[row].replace("Multi-sensor", ONE_TRAINING_SKIN) for row in ("triplet", "adapted")}
-    return named | {
-        "multi": Model(f"{ONE_TRAINING_SKIN} (paper: single-sensor)", "one training skin", TABLE_2["single"]),
-        "triplet": Model(one_skin["triplet"], "one training skin + triplet", {}),
-        "adapted": Model(one_skin["adapted"], TITLES["adapted"], {}),
-    }
-
-
-def table_2_rows(numbers: Results) -> dict[str, tuple[Model, Mapping[str, Any]]]:
-    """Return the computed rows of table 2 in the paper's order; the control, which the paper lacks, comes last."""
-    ours = numbers["table2"] | control_of(numbers)
-    return {row: (model, ours[row]) for row, model in models(numbers).items() if row in ours}
-
-
-def control_of(numbers: Results) -> dict[str, Any]:
-    """Return the control's row under its name; return an empty dict if there is no control."""
-    return {name: row for name, row in numbers.get("adapt", {}).items() if name == "control"}
-
-
-def is_pooled(numbers: Results) -> bool:
-    """Return whether any leave-one-board-out model was trained on several skins; True if there are no such models."""
-    boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()
-    return not boards or max(board["trained_on_skins_n"] for board in boards) > 1

@@ -68,12 +68,15 @@ class Stat:
 
     @classmethod
     def of(cls, stat: "Stat | Mapping[str, Any]") -> "Stat":
-        """Return a statistic from its entry in numbers.json, which has the values of boards by name or in a list."""
+        """Return a statistic from its entry in numbers.json, which has the values of boards by name or in a list.
+
+        An entry without `n` is a single number.
+        """
         if isinstance(stat, Stat):
             return stat
         if "by_board" in stat:
             return cls(stat["mean"], len(stat["by_board"]), values=tuple(stat["by_board"].values()))
-        return cls(**{name: stat[name] for name in _FIELDS if name in stat})
+        return cls(**{"n": 1} | {name: stat[name] for name in _FIELDS if name in stat})
 
     @property
     def ends(self) -> tuple[float, ...]:

@@ -10,8 +10,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import COLUMNS, PAPER_METRICS, show, show_difference, tabulate
-from pipeline.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
+from pipeline.formatting import TITLES, show_difference
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import join, select, write_scores
 from pipeline.settings import Adaptations, Settings
@@ -160,29 +159,6 @@ def draw_forces(
     }  # fmt: skip
 
 
-VARIANTS = {"before": "before adaptation", "after": "adapted", "control": "control: trained as long, without pokes"}
-OF_SHAPE = "direction and length of the change of field (ours): "
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the variants of the paper's recipe and, if the scene has recipe `shape`, of this recipe."""
-    lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
-    if SHAPE in numbers:
-        shape_numbers = numbers[SHAPE]
-        lines += [
-            _line(OF_SHAPE + title, shape_numbers, name, source)
-            for name, title in VARIANTS.items()
-            if name in shape_numbers
-        ]
-    spread = (
-        "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
-        f"{numbers['seeds_n']} networks. The networks of one fold predict all these boards, so the interval does not "
-        "include the variation between choices of training boards. ± (seeds) is the standard deviation over "
-        f"{numbers['seeds_n']} network seeds on one skin, averaged over skins."
-    )
-    return {"flexible": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
-
-
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot predicted against true force before and after adaptation, with the diagonal and the bias."""
     every_N = [value for forces in drawn.values() for side in forces.values() for value in side]
@@ -193,7 +169,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.plot(ends_N, ends_N, color=COLOURS[0], linewidth=0.8)
             axes.scatter(forces["true_N"], forces["predicted_N"], s=7, color=colour, alpha=0.6, linewidths=0)
             bias = f"bias {show_difference(numbers['bias_f_N'][name])} N"
-            axes.set_title(f"{VARIANTS[name]}:\n{bias}", loc="left", fontsize=9)
+            axes.set_title(f"{TITLES[name]}:\n{bias}", loc="left", fontsize=9)
             axes.set(xlabel="true force / N")
         panels[0].set_ylabel("predicted force / N")
         title = (
@@ -202,30 +178,3 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return {"flexible.svg": svg(figure)}
-
-
-def _meaning(numbers: Mapping[str, Any]) -> str:
-    gap_mm = numbers["gap_mm"]
-    return (
-        f"Networks of fold {numbers['fold']}, trained on {numbers['trained_on_skins_n']} skins of rigid boards and "
-        f"tested on {numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted with "
-        f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted minus true force, also as a percentage of "
-        f"the mean force; the paper reports {FLEXIBLE_BIAS} after adaptation, without a number. In our simulation, "
-        f"|dB| at equal depth is {show(numbers['strength_ratio'])} times as large as on rigid boards (± over depths). "
-        f"The gap between chips and skin is {numbers['gap_less_pct']:.0f} % smaller on flexible boards "
-        f"({gap_mm['flexible']:g} mm) than on rigid boards ({gap_mm['rigid']:g} mm). In the paper, it is "
-        f"{FLEXIBLE_GAP_LESS_PCT:g} % smaller. The paper's numbers are for adapted networks, and its accuracy is "
-        "approximate."
-    )
-
-
-def _line(title: str, numbers: Mapping[str, Any], name: str, source: str) -> dict[str, str]:
-    line = {"networks": title, "source": source}
-    paper = FLEXIBLE if name == "after" else {}
-    for metric, column in COLUMNS.items():
-        line[f"{column} (ours)"] = show(numbers[name].get(metric))
-        if metric in PAPER_METRICS:
-            line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
-    line |= {"bias of F, N": show_difference(numbers["bias_f_N"][name])}
-    line |= {"bias of F, %": show_difference(numbers["bias_f_pct"][name])}
-    return line | {"n": str(numbers[name]["accuracy_pct"]["n"])}

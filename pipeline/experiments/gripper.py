@@ -14,8 +14,7 @@ import pandas as pd
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
-from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.experiments.sensitivity import group_by_level
+from pipeline.experiments.results import group_by_level, read_captures, read_losses, write_results
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
@@ -237,44 +236,7 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     }
 
 
-MEANING = (
-    "A controller closes a gripper until the estimated force equals the intended force (the aim). It computes "
-    "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times per second. During a run, the stiffness "
-    "of the object rises to three times its nominal value, falls to a third of this value, and returns to it. The "
-    "{objects_n} objects have nominal stiffnesses of {soft:g} to {hard:g} N/mm. Each is held on each of {skins_n} "
-    "skins (one per board), at the skin's middle. The networks were trained without the board. `map` is the universal "
-    "model that comes with the project. The known press has the intended force, and is at the place where the object "
-    "is held later. As a factor: all estimates are multiplied by the factor that corrects the estimate for this "
-    "press. As a label: the universal model is calibrated with this press. The true force is scored from one second "
-    "on. Held: the mean force of the run is within {within_pct:g} % of the aim. Always within: the force is within "
-    "{within_pct:g} % of the aim at all times. Error: mean absolute deviation from the aim over a run. [low, high]: "
-    "95 % confidence interval over boards. Each of the {seeds_n} networks of a board controls its own runs. ± "
-    "(seeds): standard deviation over {seeds_n} network seeds on one board, averaged over boards."
-)
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate how often and how accurately each force was held with each estimator."""
-    table = pd.DataFrame(
-        {
-            "aim, N": f"{row['aim_N']:g}",
-            "force estimated by": row["feedback"],
-            "one known press": PRESSES[row["press"]],
-            "held, % of runs": f"{row['held_pct']:.0f}",
-            "always within, % of runs": f"{row['always_pct']:.0f}",
-            "median error, %": f"{row['median_error_pct']:.1f}",
-            "worst run's error, %": f"{row['worst_error_pct']:.0f}",
-            "error, % (boards)": _interval(row["error_pct"]),
-            "runs": row["runs_n"],
-            "source": source,
-        }
-        for row in numbers["rows"]
-    )
-    objects = numbers["stiffness_N_mm"]
-    stiffness = {"soft": min(objects), "hard": max(objects), "objects_n": len(objects)}
-    table.attrs["meaning"] = MEANING.format(**numbers, **stiffness)
-    return {"gripper": table}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -296,9 +258,3 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         title = f"Force control with estimated forces, by model and by use of one known press ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"gripper.svg": svg(figure)}
-
-
-def _interval(stat: Mapping[str, Any]) -> str:
-    low_high = f" [{stat['ci95'][0]:.1f}, {stat['ci95'][1]:.1f}]" if "ci95" in stat else ""
-    seeds = f" ± {stat['sd_seeds']:.1f} (seeds)" if "sd_seeds" in stat else ""
-    return f"{stat['mean']:.1f}{low_high}{seeds}"

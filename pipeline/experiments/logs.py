@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
-from pipeline import paper
 from pipeline.experiments.results import only, write_results
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
@@ -141,85 +139,6 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
     return {"contacts_n": contacts_n(estimated.contact)} | {name: scores[name] for name in SCORES if name in scores}
 
 
-# --- Tables and figures ---
-
-MEANING = (  # the experiment's numbers are inserted by `str.format`
-    "The log has a rate of {rate_hz:.0f} Hz and contains only times and readings, as a board writes it to an SD card. "
-    "It begins with a quiet time without contact, which is followed by footfalls at random places. The mean of the "
-    "quiet readings is the no-load reading. A reading is detected as contact if the field has changed by much more "
-    "than the noise of the quiet readings. Networks that were trained without this board predict places and forces. "
-    "Each network is scored separately: ± is the standard deviation over {networks_n} network seeds. Errors are "
-    "computed for the readings that are detected as contact, from the true values of the simulation. The board does "
-    "not rotate, so the earth's field is constant and is subtracted with the no-load reading. In a dog's shoe or on a "
-    "hand, the board would rotate."
-)
-TURNING = (
-    "The same log, as if the board pitched in the earth's field of {earth_uT:.0f} µT. The pitch angle is a sine with "
-    "the given amplitude and one period per step ({turning_period_s:.2g} s). The amplitudes are assumed. The wearer "
-    "walks north, which is the worst direction. The field in the axes of the board changes with the pitch, and these "
-    "changes are mistaken for contacts. As a remedy, an additional chip of the same type and noise, which is not under "
-    "the skin, is read with every frame. Its reading is rotated to the axes of each chip and subtracted from the "
-    "chip's reading. Errors are computed for the readings in contact that were detected as contact. The mean force "
-    "error is therefore smaller if more weak contacts are detected. ± is the standard deviation over network seeds."
-)
-VARIANTS = {"as logged": None, "reference chip subtracted": "reference_chip"}
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the contacts of the log, and scores if the true contacts are known.
-
-    The paper shows its logs only as videos.
-    """
-    account = numbers["account"]
-    rows = [
-        ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
-        ("duration, s", f"{numbers['duration_s']:.1f}", "–"),
-        ("readings", f"{numbers['readings_n']}", "–"),
-        ("readings lost to failed reads and stuck chips", f"{account['rows_read_n'] - account['rows_n']}", "–"),
-        ("frames missing from gaps between times", f"{account['gap_frames_n']}", "–"),
-        ("contacts found", f"{numbers['contacts_n']}", "–"),
-        ("true contacts", _show(numbers, "contacts_true_n"), "–"),
-        ("readings in contact", f"{numbers['contact_readings_n']}", "–"),
-        ("readings in contact that were missed", _show(numbers, "missed_readings_n"), "–"),
-        ("largest force of a missed reading, N", _show(numbers, "missed_force_max_N"), "–"),
-        ("readings without contact detected as contact", _show(numbers, "false_readings_n"), "–"),
-        ("largest estimated force, N", _show(numbers, "force_max_N"), "–"),
-        ("largest true force, N", _show(numbers, "force_true_max_N"), "–"),
-        ("accuracy, %", _show(numbers, "accuracy_pct"), "–"),
-        ("MSE_xy, mm²", _show(numbers, "mse_xy_mm2"), "–"),
-        ("MSE_F, N²", _show(numbers, "mse_f_N2"), "–"),
-    ]
-    table = pd.DataFrame(
-        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
-    )
-    table.attrs["meaning"] = MEANING.format(**{name: numbers[name] for name in ("rate_hz", "networks_n")})
-    return {"logs": table} | ({"logs_turning": _turning(numbers, source)} if "turning" in numbers else {})
-
-
-def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Tabulate the scores for a board that pitches, by the amplitude of the pitch."""
-    rows = []
-    for row in numbers["turning"]:
-        for title, name in VARIANTS.items():
-            scores = row if name is None else row[name]
-            rows.append(
-                {
-                    "pitch / °": f"± {row['pitch_deg']:g}",
-                    "readings": title,
-                    "contacts found": _show(scores, "contacts_n"),
-                    "true contacts": _show(numbers, "contacts_true_n"),
-                    "readings without contact detected as contact": _show(scores, "false_readings_n"),
-                    "readings in contact that were missed": _show(scores, "missed_readings_n"),
-                    "MSE_F / N²": _show(scores, "mse_f_N2"),
-                    "accuracy / %": _show(scores, "accuracy_pct"),
-                    "source": source,
-                }
-            )
-    table = pd.DataFrame(rows)
-    table.attrs["meaning"] = TURNING.format(**{name: numbers[name] for name in ("turning_period_s", "earth_uT")})
-    return table
-
-
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot the estimated and the true force, x and y over time, during contacts only."""
     t_s = np.array(drawn["t_s"])
@@ -242,12 +161,3 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
         panels[0].set_title(f"Estimates from a log at {numbers['rate_hz']:.0f} Hz ({source})", loc="left", fontsize=11)
         return {"logs.svg": svg(figure)}
-
-
-def _show(numbers: Mapping[str, Any], name: str) -> str:
-    if name not in numbers:
-        return "unknown"
-    if isinstance(numbers[name], int):
-        return f"{numbers[name]}"
-    spread = numbers.get("spread", {})
-    return f"{numbers[name]:.3g}" + (f" ± {spread[name]:.2g}" if name in spread else "")

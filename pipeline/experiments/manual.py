@@ -14,11 +14,8 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import COLUMNS, PAPER_METRICS, gain, show, show_difference, tabulate
-from pipeline.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.scores import write_scores
 from pipeline.settings import Adaptations, Settings
-from pipeline.statistics import VERDICTS, Stat, verdict
 from pipeline.training.jobs import (
     AdaptationPokes,
     PretrainedNetworks,
@@ -121,61 +118,3 @@ def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, An
         if other in variants
     }
     return {**measured, **counts, **variants, "paired": differences}
-
-
-VARIANTS = {
-    "before": "before adaptation",
-    "after": "adapted with hand pokes",
-    "control": "control: trained as long, without pokes",
-    "grid": "adapted with as many robot pokes",
-}
-DIFFERENCES = {
-    "after_minus_before": "with hand pokes minus before, on the same skin",
-    "after_minus_control": "with hand pokes minus without pokes, on the same skin",
-    "after_minus_grid": "with hand pokes minus with robot pokes, on the same skin",
-}
-PAPER_DIFFERENCES = {"after_minus_before": GAINS["by_hand"]}
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the scores of the variants, and the differences between variants on the same skins."""
-
-    def judge(difference: Stat | None, metric: str) -> str:
-        """Format the verdict on whether a difference is a gain, and the size of the difference."""
-        return "–" if difference is None else f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
-
-    lines = []
-    for name, title in VARIANTS.items():
-        if name in numbers:
-            cells = {metric: show(numbers[name].get(metric)) for metric in COLUMNS}
-            lines.append(_line(title, numbers[name], cells, MANUAL.get(name, {}), source))
-    for name, title in DIFFERENCES.items():
-        if name in numbers["paired"]:
-            difference = numbers["paired"][name]
-            cells = {metric: judge(difference.get(metric), metric) for metric in COLUMNS}
-            lines.append(_line(title, difference, cells, PAPER_DIFFERENCES.get(name, {}), source))
-    meaning = (
-        f"Each skin has {numbers['pokes_n']} hand pokes (paper: {MANUAL_POKES_N}), along {numbers['lines_n']} lines. "
-        "The order of the pokes along a line is known, but not their places. Networks that were trained without the "
-        "skin's board are adapted with these pokes, and tested on pokes by the robot on a grid of the same skin. The "
-        "rows of differences state whether adaptation with hand pokes is better than the alternative. "
-        f"{VERDICTS}"
-    )
-    spread = (
-        "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
-        f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
-        "on one skin, averaged over skins. In the rows of differences, it is the standard deviation of the differences "
-        "between networks with the same seed."
-    )
-    return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
-
-
-def _line(
-    title: str, ours: Mapping[str, Any], cells: Mapping[str, str], paper: Mapping[str, float], source: str
-) -> dict[str, str]:
-    line = {"networks": title, "source": source}
-    for metric, column in COLUMNS.items():
-        line[f"{column} (ours)"] = cells[metric]
-        if metric in PAPER_METRICS:
-            line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
-    return line | {"n": str(ours["accuracy_pct"]["n"])}

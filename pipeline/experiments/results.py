@@ -4,6 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from jaxtyping import Float32, Int32
+
 from pipeline.statistics import as_json
 from reskin import io
 from reskin.errors import SchemaError
@@ -29,6 +32,30 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
         remedy = "Set skins_n: 1 for the protocol of the experiment in the scene's file, and run `dvc repro`."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
     return captures[0]
+
+
+def group_by_level(
+    db_uT: Float32[np.ndarray, "f ch"],
+    indentation: Int32[np.ndarray, " f"],
+    force_N: Float32[np.ndarray, " f"],
+    *,
+    levels_n: int,
+    where: str,
+) -> Float32[np.ndarray, "n p r ch"]:
+    """Reshape readings to axes (filling of the glass, weight level, reading, channel).
+
+    Successive readings with the same logged force form a stop, at one weight level. Raises `SchemaError` unless every
+    filling has `levels_n` stops, all with the same number of readings.
+    """
+    starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
+    stops = np.split(np.arange(len(force_N)), starts)
+    fillings_n = len(np.unique(indentation))
+    lengths = {len(stop) for stop in stops}
+    if len(stops) != fillings_n * levels_n or len(lengths) != 1:
+        got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
+        rule = f"each filling needs {levels_n} stops, all with the same number of readings"
+        raise SchemaError(f"{where}: {rule}; got {got}. Run stages simulate and ingest_simulated again.")
+    return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:

@@ -6,48 +6,22 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Float32, Float64, Int32
+from jaxtyping import Float, Float32, Float64
 from scipy.special import ndtr, ndtri
 
 from pipeline import paper
-from pipeline.experiments.results import only, read_captures, read_losses, write_results
+from pipeline.experiments.results import group_by_level, only, read_captures, read_losses, write_results
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
 from pipeline.stage import say
-from pipeline.statistics import FEW_BOARDS, UNDECIDED
 from reskin.data.baseline import subtract
-from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
 # A weight difference is resolved if, in at least this fraction of pairs of readings, the reading under the larger
 # weight has the larger response.
 RESOLVED_SHARE = 0.95
 WATER_N_PER_ML = 9.81e-3  # weight of 1 mL (1 g) of water at 9.81 m/s^2
-
-
-def group_by_level(
-    db_uT: Float32[np.ndarray, "f ch"],
-    indentation: Int32[np.ndarray, " f"],
-    force_N: Float32[np.ndarray, " f"],
-    *,
-    levels_n: int,
-    where: str,
-) -> Float32[np.ndarray, "n p r ch"]:
-    """Reshape readings to axes (filling of the glass, weight level, reading, channel).
-
-    Successive readings with the same logged force form a stop, at one weight level. Raises `SchemaError` unless every
-    filling has `levels_n` stops, all with the same number of readings.
-    """
-    starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
-    stops = np.split(np.arange(len(force_N)), starts)
-    fillings_n = len(np.unique(indentation))
-    lengths = {len(stop) for stop in stops}
-    if len(stops) != fillings_n * levels_n or len(lengths) != 1:
-        got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
-        rule = f"each filling needs {levels_n} stops, all with the same number of readings"
-        raise SchemaError(f"{where}: {rule}; got {got}. Run stages simulate and ingest_simulated again.")
-    return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 
 def analyse_levels(
@@ -173,43 +147,7 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     say(f"{settings.scene}: smallest resolved weight difference: {resolved or 'none'}, from {fillings}")
 
 
-MEANING = (  # the experiment's numbers are inserted by `str.format`
-    "The weight on the skin's centre increases in equal steps. The flat foot of the glass is simulated as the rig's "
-    "round tip. The response of a reading is the component of its change of field along a fixed direction, which is "
-    "the mean direction in one half of the fillings. The other half is held out. A difference of weight is resolved "
-    "if, for this and all larger differences, the reading under the larger weight has the larger response in at least "
-    "{told_pct:g} % of the pairs of readings of a held-out filling. Whether the response always rises is tested with "
-    "the smallest step at which the mean rise exceeds the noise of one filling (of the mean of a stop's readings) in "
-    "{told_pct:g} % of cases. With smaller steps, noise alone can make the response fall."
-)
 READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the smallest resolved step, in N and mL of water, and whether the response is monotonic."""
-    rows = []
-    for name, title in READINGS.items():
-        rows += [
-            (
-                f"smallest resolved step, {title}, N",
-                _show(numbers["smallest_step_N"], name, numbers),
-                f"< {paper.SENSITIVITY_N:g}",
-            ),
-            (f"smallest resolved step, {title}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
-            (f"smallest resolved step from |dB| alone, {title}, N", _show(numbers["by_length_N"], name, numbers), "–"),
-        ]
-    rise = numbers["monotonic"]
-    rows += [
-        ("mean response rises at every step above the noise", _rises(rise), paper.MONOTONIC),
-        (f"falls between neighbouring levels, {numbers['step_N']:g} N apart", _falls(rise["neighbours"], numbers), "–"),
-        ("gain (slope of a fitted line), µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
-        ("noise of one reading along the response, µT", f"{numbers['noise_uT']:.2g}", "–"),
-    ]
-    table = pd.DataFrame(
-        [{"what": what, "ours": ours, "paper": theirs, "source": source} for what, ours, theirs in rows]
-    )
-    table.attrs["meaning"] = MEANING.format(told_pct=numbers["told_pct"])
-    return {"sensitivity": table}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -234,36 +172,3 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
         figure.suptitle(f"Response while a glass on the skin is filled ({source})", x=0.01, ha="left", fontsize=11)
         return {"sensitivity.svg": svg(figure)}
-
-
-def _rises(rise: Mapping[str, Any]) -> str:
-    ranks = f"rank correlation {rise['spearman']:.4f}"
-    if "step_N" not in rise:
-        return f"{UNDECIDED}: the rise exceeds the noise at no step; {ranks}"
-    verb = "rises" if rise["holds"] else "does not rise"
-    rises_n = rise["pairs_n"] - rise["falls_n"]
-    return (
-        f"{FEW_BOARDS}; {verb} on this board: it rises in {rises_n} of {rise['pairs_n']} pairs of levels that are "
-        f"{rise['step_N']:.3g} N apart, {ranks}"
-    )
-
-
-def _falls(neighbours: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
-    expected = f", {neighbours['expected_falls_n']:.1f} expected from noise" if "expected_falls_n" in neighbours else ""
-    return f"{neighbours['falls_n']} of {numbers['levels_n'] - 1}{expected}"
-
-
-def _show(steps_N: Mapping[str, float], name: str, numbers: Mapping[str, Any]) -> str:
-    if name not in steps_N:
-        return f"none up to {numbers['range_N']:g}"
-    return f"{_least(steps_N[name], numbers)}{steps_N[name]:.3g}"
-
-
-def _show_mL(name: str, numbers: Mapping[str, Any]) -> str:
-    if name not in numbers["smallest_step_mL"]:
-        return "none"
-    return f"{_least(numbers['smallest_step_N'][name], numbers)}{numbers['smallest_step_mL'][name]:.2g}"
-
-
-def _least(step_N: float, numbers: Mapping[str, Any]) -> str:
-    return "at most " if step_N <= numbers["step_N"] else ""  # step_N is the finest step tried

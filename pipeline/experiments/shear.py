@@ -12,8 +12,6 @@ import pandas as pd
 from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import show, tabulate
-from pipeline.paper import SHEAR
 from pipeline.plot import COLOURS, drawing, svg
 from pipeline.scores import make_table, select, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
@@ -96,42 +94,7 @@ def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, An
     return {**by_reading, "by_line": by_line, "seeds_n": scores["seed"].nunique(), **measured}
 
 
-TITLES = {
-    "mse_fxy_N2": "MSE_Fxy, N²", "mse_fz_N2": "MSE_Fz, N²", "mse_xy_mm2": "MSE_xy, mm²", "accuracy_pct": "accuracy, %",
-    "explained_fxy": "explained variance of Fxy", "explained_fz": "explained variance of Fz",
-}  # fmt: skip
 FORCES = ("Fx", "Fy", "Fz")
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the scores of both splits and the paper's numbers. The paper does not say how it split the readings."""
-    splits = {
-        "random readings held out (ours; the paper does not state its split)": numbers,
-        "whole lines held out": numbers["by_line"],
-    }
-    lines = []
-    for split, scores in splits.items():
-        line = {"split": split, "source": source}
-        for metric, title in TITLES.items():
-            line[f"{title} (ours)"] = show(scores[metric])
-            if metric in SHEAR:
-                line[f"{title} (paper)"] = "{:g} ± {:g}".format(*SHEAR[metric])
-        lines.append(line | {"n": str(scores["accuracy_pct"]["n"])})
-    rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
-    meaning = (
-        f"The data are {numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in "
-        f"{numbers['passes_n']} passes. All passes drag along the same paths, so each held-out line has the same path "
-        f"as a line in each of the {numbers['passes_n'] - 1} other passes. The rms values of our forces are {rms_N}. "
-        "The paper does not state its forces. Errors of different forces are hard to compare, because an MSE grows "
-        "with the square of the force. The explained variance (1 - MSE / variance) does not grow with the force. Our "
-        "MSE_Fxy is the mean over two axes. The paper does not state whether its MSE is a mean or a sum over axes."
-    )
-    spread = (
-        "± is the standard deviation over n random splits; the score of a split is the mean over "
-        f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
-        "on one split, averaged over splits."
-    )
-    return {"shear": tabulate(lines, meaning=meaning, spread=spread)}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

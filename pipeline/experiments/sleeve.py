@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import COLUMNS, scores, show, tabulate
-from pipeline.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
+from pipeline.formatting import show
 from pipeline.plot import COLOURS, ERROR_COLOURS, drawing, svg
 from pipeline.scores import make_table, write_scores
 from pipeline.settings import SectionWithTraining, Settings, Training
@@ -32,7 +31,7 @@ from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
 NEAR_MM = 4.0  # a place closer than this to a border between boards is near it (assumed: twice the skin's thickness)
-PARTS = {"near_seam": "median error near a border, mm", "inside": "median error elsewhere, mm"}
+PLACES = ("median_error_mm", "p95_error_mm")  # scores over all places, besides those of `reskin.metrics`
 
 
 class Sleeve(SectionWithTraining):
@@ -220,28 +219,6 @@ def draw_errors(
     return rounded | borders | {"area_mm": list(area.sides_mm)}
 
 
-PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % of errors below, mm"}
-NO_NUMBER = "none, only a demonstration"
-SPREAD = "± is the standard deviation over the network seeds; column `seeds` gives their number."
-NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the scores of every method, and the set-up of the sleeve compared with the paper's."""
-    lines = [_line("the paper's network", numbers, source)]
-    lines += [
-        _line(NAMES.get(name, f"network, recipe {name}"), variant_scores, source)
-        for name, variant_scores in numbers["variants"].items()
-    ]
-    near_n, inside_n = (numbers[part]["pokes_n"] if part in numbers else 0 for part in PARTS)
-    meaning = (
-        f"The methods are trained on the first {numbers['trained_n']} pokes of one skin, and tested on its last "
-        f"{numbers['tested_n']} pokes. Of the tested pokes, {near_n} are less than {numbers['near_mm']:g} mm from a "
-        f"border between two boards, and {inside_n} are elsewhere. The paper states no number here: {SLEEVE_WORDS}."
-    )
-    return {"sleeve": tabulate(lines, meaning=meaning, spread=SPREAD), "sleeve_set_up": _set_up(numbers, source)}
-
-
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw a map of the skin: every tested poke, coloured by its error, with chips and borders between boards."""
     with drawing(4.7, 6.6) as figure:
@@ -275,22 +252,3 @@ def _draw_boards(axes: Any, drawn: Mapping[str, Any]) -> None:
     axes.set(xlim=(-1.5, x_mm + 1.5), ylim=(-1.5, y_mm + 1.5))
     for side in ("left", "bottom"):
         axes.spines[side].set_visible(False)
-
-
-def _line(name: str, method_scores: Mapping[str, Any], source: str) -> dict[str, str]:
-    line = {"method": name, "source": source} | scores(method_scores, COLUMNS | PLACES)
-    for part, title in PARTS.items():
-        line[title] = show(method_scores[part]["median_error_mm"]) if part in method_scores else "–"
-    return line | {"paper": NO_NUMBER, "seeds": str(method_scores["accuracy_pct"]["n"])}
-
-
-def _set_up(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    printed = {"chips": str(SLEEVE["chips_n"]), "rate, Hz": f"{SLEEVE['rate_hz']:g}", "skin, mm": SLEEVE_SKIN}
-    ours = {
-        "chips": str(numbers["chips_n"]),
-        "rate, Hz": f"{numbers['rate_hz']:.1f}",
-        "skin, mm": "{:g} x {:g}".format(*numbers["area_mm"]),
-    }
-    return tabulate(
-        [{"what": what, "ours": value, "paper": printed[what], "source": source} for what, value in ours.items()]
-    )

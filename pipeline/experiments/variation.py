@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float, Int
 from pydantic import Field
 
 from pipeline.description import pace, rms
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.formatting import tabulate
-from pipeline.paper import FIGURE_4
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.settings import Settings
 from reskin import io
@@ -182,40 +179,6 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
         rule = f"at most the {len(ranked)} skins of the main captures"
         raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Reduce variation.skins_n.")
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
-
-
-MEANING = (
-    "Differences between pokes with the same place and depth: rms over the channels, and as a percentage of the change "
-    "of field that a poke causes. Field as read: no no-load reading is subtracted. Change of field: the no-load "
-    "reading of the same indentation is subtracted, as in the inputs of a model."
-)
-
-
-def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the differences between the fields of equal indentations, over time and between skins."""
-    lines = []
-    for place in numbers["places"]:
-        time, skins = place["time"], place["skins"]
-        place_cells = {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "depth, mm": f"{numbers['depth_mm']:g}"}
-        over = f"over {time['contacts_n']:,} contacts of {numbers['worn_skin']} ({time['visits_n']} pokes here)"
-        rows = [
-            (f"{over}: field as read", time["raw_change_uT"], time["raw_change_pct"]),
-            (f"{over}: change of field", time["db_change_uT"], time["db_change_pct"]),
-        ]
-        if "spread_uT" in skins:
-            over = f"between {len(skins['skins'])} skins: change of field"
-            rows.append((over, skins["spread_uT"], skins["spread_pct"]))
-        for what, rms_uT, pct in rows:
-            values = {"difference, µT": f"{rms_uT:.3g}", "difference, % of the change": f"{pct:.3g}"}
-            lines.append(place_cells | {"what": what} | values | {"source": source})
-    meaning = MEANING
-    if "shown_s" in numbers and "warmer_K" in numbers:
-        meaning += (
-            f" The contacts that are compared over time take {numbers['shown_s']:,.0f} s. In this time, the "
-            f"temperature of the chips changes by {numbers['warmer_K']:+.2g} K, so the field changes with temperature "
-            "as well as with wear."
-        )
-    return {"variation": tabulate(lines, meaning=f"{meaning} Paper: {FIGURE_4}.")}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

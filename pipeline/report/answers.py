@@ -9,17 +9,10 @@ from math import sqrt
 from statistics import fmean
 from typing import Any
 
-from pipeline.formatting import (
-    Results,
-    Statistic,
-    models,
-    show,
-    show_with_unit,
-    three_digits,
-    two_digits,
-)
+from pipeline.formatting import Statistic, show, show_with_unit, three_digits, two_digits
 from pipeline.paper import ADAPTED_POKES_N, PLACE_ACCURACY_MIN_PCT
 from pipeline.report.figures import IN_CONTEXT, constant_force, unseen_rows
+from pipeline.report.table_2 import Results, models
 from pipeline.statistics import Stat
 
 PLACE, FORCE = "place", "force"

@@ -13,8 +13,9 @@ from typing import Any, Literal
 import pandas as pd
 
 from pipeline import paper, statistics
-from pipeline.formatting import FEW_POINTS, gain, is_pooled, reworded, show, show_difference
+from pipeline.formatting import FEW_POINTS, gain, reworded, show, show_difference
 from pipeline.report.experiments import add_rows
+from pipeline.report.table_2 import is_pooled
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS, Stat
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError

@@ -1,6 +1,7 @@
 """Tables, figures, page sections and checklist rows that experiments add to a report.
 
-An experiment's module makes its tables and figures; its YAML file contains its section and its checklist rows.
+An experiment's module makes its figures, and `pipeline.report.experiment_tables` makes its tables. Its YAML file
+contains its section and its checklist rows.
 """
 
 from collections.abc import Iterable, Mapping
@@ -11,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.catalogue import experiment_files, module_name
+from pipeline.report.experiment_tables import TABLES
 from pipeline.scenes import ANALYSES, EXPERIMENTS
 from pipeline.scores import select
 
@@ -31,9 +33,9 @@ def experiment_numbers(results: Mapping[str, Any], table: pd.DataFrame) -> dict[
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Make the tables of every experiment with results in numbers.json; return them by name."""
     tables: dict[str, pd.DataFrame] = {}
-    for key, module in _modules(numbers).items():
-        if hasattr(module, "tables"):
-            tables |= module.tables(numbers[key], source)
+    for key, make in TABLES.items():
+        if key in numbers:
+            tables |= make(numbers[key], source)
     return tables
 
 

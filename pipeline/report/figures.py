@@ -14,10 +14,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.formatting import COLUMNS, TITLES, n_of, table_2_rows, two_digits
+from pipeline.formatting import COLUMNS, TITLES, n_of, two_digits
 from pipeline.paper import ADAPTED_POKES_N, TABLE_2, Number
 from pipeline.plot import COLOURS, ERROR_COLOURS, MARKERS, drawing, svg
 from pipeline.plot_layout import WIDTH_IN
+from pipeline.report.table_2 import table_2_rows
 from pipeline.statistics import Stat
 
 HEADLINE = "headline.svg"

@@ -7,8 +7,8 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.formatting import control_of
 from pipeline.paper import PLATEAU_POKES_N
+from pipeline.report.table_2 import control_of
 from pipeline.scenes import EXPERIMENTS, TABLE_2
 from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
 from pipeline.statistics import (

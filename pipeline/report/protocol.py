@@ -7,7 +7,8 @@ from typing import Any
 import pandas as pd
 
 from pipeline import paper
-from pipeline.formatting import Results, tabulate
+from pipeline.formatting import tabulate
+from pipeline.report.table_2 import Results
 
 # What the paper ran (sections 3 to 6).
 SINGLE_READINGS_N = 50_000  # section 4: "We collect a total of 50K samples"

@@ -3,8 +3,9 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.formatting import PAPER_METRICS, TITLES, models
+from pipeline.formatting import PAPER_METRICS, TITLES
 from pipeline.report.figures import unseen_rows
+from pipeline.report.table_2 import models
 
 SHORT_TITLES = {
     "accuracy_pct": "within 1 mm, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F",

@@ -15,18 +15,15 @@ from pipeline.formatting import (
     INTERVAL,
     PAPER_METRICS,
     TITLES,
-    Model,
     beside,
-    models,
     n_of,
-    reworded,
+    printed,
     scored,
     scores,
     show,
     show_both,
     show_difference,
     show_with_unit,
-    table_2_rows,
     tabulate,
     three_digits,
     to_markdown,
@@ -37,6 +34,7 @@ from pipeline.report.experiments import experiment_tables
 from pipeline.report.figures import unseen_rows
 from pipeline.report.numbers import timed_rows
 from pipeline.report.protocol import protocol_table, protocols
+from pipeline.report.table_2 import Model, models, table_2_rows
 from pipeline.statistics import Stat
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import ParamsError
@@ -216,7 +214,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
         tables["single_sensor"] = _single(numbers, source)
     if "hover" in numbers:
         tables["hover"] = _hover(numbers, source)
-    tables |= {name: _reworded(table) for name, table in experiment_tables(numbers, source).items()}
+    tables |= experiment_tables(numbers, source)
     makers: dict[str, Callable[[Any, str], pd.DataFrame]] = {
         "sweep_pokes": sweep_pokes_table, "sweep_sensors": sweep_sensors_table,
         "audit": audit_table, "drift": drift_table, "compare": compare_table, "chosen": chosen_table,
@@ -247,13 +245,6 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     return tables if claims.empty else tables | {"claims": claims}
 
 
-def _reworded(table: pd.DataFrame) -> pd.DataFrame:
-    """Write verdicts in the words of reports."""
-    texts = table.map(lambda cell: reworded(cell) if isinstance(cell, str) else cell)
-    texts.attrs = {name: reworded(note) for name, note in table.attrs.items()}
-    return texts
-
-
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
     """Write every table as Markdown for readers and as CSV for programs: text by file name."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
@@ -280,10 +271,10 @@ def compare_table(numbers: Numbers, source: str) -> pd.DataFrame:
 
 def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
     """List scores by number of unlabelled pokes of the new skin; the paper gives them for two numbers of pokes."""
-    printed = {0: TABLE_2["triplet"], ADAPTED_POKES_N: TABLE_2["adapted"]}
+    in_table_2 = {0: TABLE_2["triplet"], ADAPTED_POKES_N: TABLE_2["adapted"]}
     lines = [
         {"pokes": str(row["pokes_n"]), "source": source}
-        | beside(row, _printed(printed.get(row["pokes_n"], {})), show, paper="paper, table 2")
+        | beside(row, printed(in_table_2.get(row["pokes_n"], {})), show, paper="paper, table 2")
         for row in sorted(rows, key=lambda row: row["pokes_n"])
     ]
     return tabulate(lines, meaning=f"The paper says of its figure 6a: {FIGURE_6A}. {CONTROLLED}")
@@ -464,14 +455,10 @@ def _means(row: Mapping[str, Any]) -> dict[str, float]:
 
 def _beside_paper(rows: Mapping[str, tuple[Mapping[str, Any], Mapping[str, Number]]], source: str) -> pd.DataFrame:
     lines = [
-        {"model": name, "source": source} | beside(ours, _printed(paper), show_both)
+        {"model": name, "source": source} | beside(ours, printed(paper), show_both)
         for name, (ours, paper) in rows.items()
     ]
     return pd.DataFrame(lines)
-
-
-def _printed(paper: Mapping[str, Number]) -> dict[str, str]:
-    return {metric: f"{mean:g} ± {sd:g}" for metric, (mean, sd) in paper.items()}
 
 
 def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
@@ -631,8 +618,8 @@ def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
     lines = []
     for row in numbers["paired"]:
         first, second = known[row["of"]].paper, known[row["over"]].paper
-        printed = {m: f"{first[m][0] - second[m][0]:+.4g}" for m in first if m in second and first != second}
-        cells = beside(row, printed, show_difference, paper="paper: difference of means")
+        gains = {m: f"{first[m][0] - second[m][0]:+.4g}" for m in first if m in second and first != second}
+        cells = beside(row, gains, show_difference, paper="paper: difference of means")
         lines.append({"difference": _difference_of(row, known), "source": source} | cells)
     return tabulate(lines, spread=PAIRED)
 

@@ -1,4 +1,4 @@
-"""Tests of folds, which divide rows into training rows, test rows and the pool (pokes for adaptation or for labels).
+"""Tests of folds, which divide rows into training rows, test rows and the pool (pokes for adaptation).
 
 Further tests are about the JSON format of folds.
 """
@@ -211,84 +211,6 @@ def test_numbers_of_skins_that_are_listed_twice_raise_an_error():
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
-LABELS = Split(labels_pool_n=5, labels_draws_n=3)
-PLACES_N = 4
-# The place numbers of ten indentations. As in recordings, some places are pressed more often than others.
-PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])
-
-
-def poked_rows(boards_n: int = 3, readings_n: int = 2):
-    """Return rows of two skins per board.
-
-    Each skin has ten indentations in two passes, at the places `PLACES`.
-    """
-    labels = [
-        (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
-        for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
-    ]  # fmt: skip
-    boards, skins, places, _, passes = (list(column) for column in zip(*labels, strict=True))
-    target = np.stack([2.0 * np.array(places), np.zeros(len(places)), np.ones(len(places))], axis=1)
-    indentation = np.arange(len(labels)) // readings_n
-    return replace(rows(boards, skins, passes), target=target.astype(np.float32), indentation=indentation)
-
-
-@given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
-def test_label_pool_has_the_same_number_of_indentations_on_each_held_out_skin(seed, pool_n, draws_n):
-    table = poked_rows()
-    folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
-    assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
-    for fold in folds:
-        held = np.flatnonzero(table.board == fold.name[:2])
-        # Every held-out row is either in the pool or in the test set.
-        assert sorted([*fold.pool, *fold.test]) == held.tolist()
-        assert sorted([*fold.train, *held]) == list(range(len(table)))
-        assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
-        for skin in np.unique(table.skin[held]):
-            assert len(np.unique(table.indentation[fold.pool[table.skin[fold.pool] == skin]])) == pool_n
-
-
-@given(st.integers(0, 2**32), st.integers(1, 8))
-def test_label_pool_is_spread_evenly_over_places(seed, pool_n):
-    table = poked_rows()
-    for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
-        for skin in np.unique(table.skin[fold.pool]):
-            pool_of_skin = fold.pool[table.skin[fold.pool] == skin]
-            first = pool_of_skin[np.unique(table.indentation[pool_of_skin], return_index=True)[1]]
-            visits = np.bincount((table.target[first, 0] / 2).astype(int), minlength=PLACES_N)
-            assert visits.max() <= -(-pool_n // PLACES_N)
-
-
-def test_label_pool_depends_on_the_seed_but_not_on_the_number_of_draws():
-    table = poked_rows()
-    first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
-    fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
-    assert [fold.pool.tolist() for fold in first] == [fold.pool.tolist() for fold in again]
-    assert len({tuple(fold.pool) for fold in [*first, *other]}) == 2 * len(first)
-    assert [fold.pool.tolist() for fold in fewer] == [fold.pool.tolist() for fold in first[::3]]
-
-
-def test_skins_of_a_board_have_different_label_pools():
-    table = poked_rows(boards_n=2)
-    own_n = len(PLACE)
-    for fold in draw_folds(table, ["labels"], LABELS, 0):
-        one, other = (
-            {*table.indentation[fold.pool[table.skin[fold.pool] == skin]] % own_n}
-            for skin in np.unique(table.skin[fold.pool])
-        )
-        assert one != other
-
-
-def test_folds_with_labels_do_not_depend_on_the_pool_for_adaptation():
-    table = poked_rows()
-    plain, pooled = (
-        draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
-        for passes_n in (None, 1)
-    )
-    for one, other in zip(plain, pooled, strict=True):
-        for side in ("train", "pool", "test"):
-            assert (getattr(one, side) == getattr(other, side)).all()
-
-
 ALMOST_ALL = Split(random_test_fraction=0.95, random_repeats_n=1)
 POOL_OF_2 = Split(pool_passes_n=2)
 MANY_SENSORS = Split(sensors_skins_n=(3, 16), sensors_draws_n=1)
@@ -307,15 +229,6 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
         (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins of all boards but b0; got 16"),
         (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins of all boards but b0; got 15"),
-        (ONE_BOARD, "labels", LABELS, "experiment lobo: boards must be two or more; got 1"),
-        (
-            poked_rows(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
-            "fold labels/b0: split.labels_pool_n must be less than the number of indentations per skin; got 10",
-        ),
-        (
-            poked_rows(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
-            "skin b0_s0: the number of pokes to draw must be at most the 10 indentations of the skin's pool; got 11",
-        ),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
 )  # fmt: skip

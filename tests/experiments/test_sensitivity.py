@@ -11,15 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, norm, spearmanr
 
+from pipeline.experiments.results import group_by_level
 from pipeline.experiments.sensitivity import (
     analyse_levels,
     direction,
     figures,
-    group_by_level,
     monotonic,
     ordered_share,
     smallest_step_N,
-    tables,
 )
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
@@ -181,36 +180,10 @@ def test_readings_are_sorted_by_filling_and_weight():
         group_by_level(db_uT[1:], indentation[1:], force_N[1:], levels_n=3, where="glass")
 
 
-RISES = "mean response rises at every step above the noise"
-
-
 def glass(noise_uT):
     noise = noise_uT * rng_for(0, "glass").standard_normal((8, 11, 5, 3))
     levels = np.arange(11)[:, None, None] * np.array([3.0, 4.0, 0.0]) + noise
     return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
-
-
-def test_table_says_at_most_if_even_the_finest_step_is_resolved():
-    table = tables(glass(0.0)[0], "simulated")["sensitivity"]
-    assert table["ours"][0] == "at most 0.1"
-    assert table["ours"][1] == "at most 10"  # A weight of 0.1 N is 10.2 mL of water.
-    assert set(table["source"]) == {"simulated"}
-    assert table["paper"][0] == "< 0.2"
-
-
-def test_table_states_that_no_step_is_resolved():
-    table = tables(glass(1e3)[0], "simulated")["sensitivity"]
-    assert table["ours"][0] == "none up to 1"
-    assert table["ours"][1] == "none"
-    assert "undecided: the rise exceeds the noise at no step" in table.set_index("what")["ours"][RISES]
-
-
-def test_table_states_the_step_at_which_monotonicity_is_judged():
-    table = tables(glass(0.0)[0], "simulated")["sensitivity"]
-    found = table.set_index("what")["ours"]
-    assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this board: it rises in 10 of 10 pairs")
-    assert found["falls between neighbouring levels, 0.1 N apart"] == "0 of 10"  # Without noise, there are no falls.
-    assert "at least 95 % of the pairs" in table.attrs["meaning"]
 
 
 def test_figure_names_its_source_and_is_reproducible():

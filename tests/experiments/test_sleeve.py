@@ -1,12 +1,10 @@
 """Tests of experiment sleeve, in which one large skin covers several boards.
 
-The tests cover held-out indentations, borders between boards, the frame rate, scores and the map of errors.
+The tests cover held-out indentations, borders between boards, the frame rate, scores, and the map of errors.
 """
 
-import re
-from xml.etree import ElementTree
-
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,17 +12,15 @@ from sklearn.metrics import mean_squared_error
 
 from pipeline.experiments.sleeve import (
     NEAR_MM,
-    Area,
     draw_errors,
     errors_mm,
-    figures,
     hold_out_last,
     lay_out,
-    over_seeds,
     rate_hz,
     score_places,
-    tables,
+    summarise,
 )
+from pipeline.scores import make_table
 from reskin.data.rows import Rows
 from reskin.errors import ParamsError
 from reskin.schema import Readings
@@ -115,41 +111,48 @@ def test_frame_rate_cannot_be_measured_from_single_readings():
 
 
 def test_scores_equal_scikit_learn_and_loops():
-    true, predicted, indentation = predictions()
-    scored = score_places(true, [predicted], indentation, AREA)
+    true, predicted, _ = predictions()
+    near = AREA.near_border(true[:, :2])
+    scored = score_places(true, predicted, near)
     far_mm = [np.hypot(p[0] - t[0], p[1] - t[1]) for t, p in zip(true, predicted, strict=True)]
-    assert scored["mse_xy_mm2"]["mean"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
-    assert scored["mse_f_N2"]["mean"] == pytest.approx(mean_squared_error(true[:, 2], predicted[:, 2]))
+    assert scored["mse_xy_mm2"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
+    assert scored["mse_f_N2"] == pytest.approx(mean_squared_error(true[:, 2], predicted[:, 2]))
     # The median of 180 values is the mean of the two in the middle.
-    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())
-    assert scored["p95_error_mm"]["mean"] == pytest.approx(np.quantile(far_mm, 0.95))
-    near = [far for far, one in zip(far_mm, true, strict=True) if AREA.near_border(one[None, :2])[0]]
-    assert scored["near_seam"]["median_error_mm"]["mean"] == pytest.approx(np.median(near))
-    assert 3 * scored["near_seam"]["pokes_n"] == len(near)
-    assert scored["near_seam"]["pokes_n"] + scored["inside"]["pokes_n"] == 60
+    assert scored["median_error_mm"] == pytest.approx(np.sort(far_mm)[89:91].mean())
+    assert scored["p95_error_mm"] == pytest.approx(np.quantile(far_mm, 0.95))
+    of_part_mm = [far for far, one in zip(far_mm, near, strict=True) if one]
+    assert scored["median_error_near_seam_mm"] == pytest.approx(np.median(of_part_mm))
 
 
 @given(st.floats(0, 20), st.integers(0, 100))
 def test_all_place_errors_equal_the_offset_that_all_predictions_share(off_mm, seed):
-    true, _, indentation = predictions(seed)
-    scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
-    for part in (scored, scored["near_seam"], scored["inside"]):
-        assert part["median_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
-    assert scored["p95_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
+    true, _, _ = predictions(seed)
+    scored = score_places(true, true + (0.6 * off_mm, -0.8 * off_mm, 0.0), AREA.near_border(true[:, :2]))
+    for name in ("median_error_mm", "p95_error_mm", "median_error_near_seam_mm", "median_error_inside_mm"):
+        assert scored[name] == pytest.approx(off_mm, abs=1e-9)
 
 
-def test_border_scores_are_missing_if_no_press_is_near_a_border():
-    alone = lay_out((50.8, 101.6), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0)
-    true, predicted, indentation = predictions()
-    scored = score_places(true, [predicted], indentation, alone)
-    assert "near_seam" not in scored
-    assert scored["inside"]["pokes_n"] == 60
+def scores_of(**networks: list[np.ndarray]) -> pd.DataFrame:
+    """Score the predictions of each network of each method; no place is near a border."""
+    true, _, _ = predictions()
+    rows = [
+        {"method": method, "seed": seed} | score_places(true, predicted, np.zeros(len(true), bool))
+        for method, by_seed in networks.items() for seed, predicted in enumerate(by_seed)
+    ]  # fmt: skip
+    return make_table(rows)
 
 
-def test_scores_have_mean_and_standard_deviation_over_seeds():
-    assert over_seeds([{"a": 1.0}]) == {"a": {"mean": 1.0, "n": 1}}
-    two = over_seeds([{"a": 1.0}, {"a": 3.0}])["a"]
-    assert (two["mean"], two["n"], two["sd"]) == (2.0, 2, pytest.approx(np.sqrt(2)))
+def test_numbers_of_each_method_are_means_over_its_networks():
+    true, first, _ = predictions()
+    second = true + 2 * (first - true)
+    measured = {"chips_n": 16, "tested": {"near_seam": 0, "inside": 60}}
+    numbers = summarise(scores_of(paper=[first, second], knn=[first]), measured)
+    one_mm, two_mm = np.median(errors_mm(true, first)), np.median(errors_mm(true, second))
+    assert numbers["median_error_mm"].mean == pytest.approx((one_mm + two_mm) / 2)
+    assert (numbers["median_error_mm"].n, numbers["chips_n"]) == (2, 16)
+    assert numbers["variants"]["knn"]["inside"]["median_error_mm"].mean == pytest.approx(one_mm)
+    assert numbers["inside"]["pokes_n"] == 60
+    assert "near_seam" not in numbers  # no press is near a border
 
 
 def test_each_tested_indentation_is_plotted_once():
@@ -160,73 +163,4 @@ def test_each_tested_indentation_is_plotted_once():
     np.testing.assert_allclose(plotted["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
     assert len(plotted["chips_x_mm"]) == len(CROSS_MM)
     assert (plotted["borders_x_mm"], plotted["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
-    assert isinstance(AREA, Area)
-
-
-SVG = "{http://www.w3.org/2000/svg}"
-
-
-def numbers_and_figure_data(n=40):
-    true, predicted, indentation = predictions(n=n)
-    others = {"shape": [predicted, true], "knn-raw": [predicted]}
-    numbers = {
-        "chips_n": 16, "rate_hz": 132.98, "area_mm": list(AREA.sides_mm), "pokes_n": 5 * n, "trained_n": 4 * n,
-        "tested_n": n, "near_mm": NEAR_MM, **score_places(true, [predicted], indentation, AREA),
-        "variants": {name: score_places(true, outputs, indentation, AREA) for name, outputs in others.items()},
-    }  # fmt: skip
-    return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
-
-
-def test_table_lists_methods_without_a_number_of_the_paper():
-    numbers, _ = numbers_and_figure_data()
-    table = tables(numbers, "simulated")["sleeve"]
-    assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
-    assert set(table["source"]) == {"simulated"}
-    assert set(table["paper"]) == {"none, only a demonstration"}
-    assert table["seeds"].tolist() == ["1", "2", "1"]
-    assert "±" in table["accuracy, %"][1]
-    assert "column `seeds` gives their number" in table.attrs["spread"]
-    # The table gives three digits.
-    assert float(table["median error, mm"][0]) == pytest.approx(numbers["median_error_mm"]["mean"], rel=5e-3)
-    near = numbers["near_seam"]["median_error_mm"]["mean"]
-    assert float(table["median error near a border, mm"][0]) == pytest.approx(near, rel=5e-3)
-    assert f"first {4 * 40} pokes" in table.attrs["meaning"]
-
-
-def test_table_has_a_dash_for_border_errors_if_no_press_is_near_a_border():
-    numbers, _ = numbers_and_figure_data()
-    del numbers["near_seam"]
-    table = tables(numbers, "simulated")["sleeve"]
-    assert table["median error near a border, mm"][0] == "–"
-    assert "0 are less than" in table.attrs["meaning"]
-
-
-def test_table_compares_our_skin_and_boards_with_those_of_the_paper():
-    table = tables(numbers_and_figure_data()[0], "simulated")["sleeve_set_up"].set_index("what")
-    assert table.loc["chips", ["ours", "paper"]].tolist() == ["16", "40"]
-    assert table.loc["rate, Hz", ["ours", "paper"]].tolist() == ["133.0", "133"]
-
-
-def test_map_shows_tested_presses_chips_and_source():
-    numbers, figure_data = numbers_and_figure_data()
-    texts = figures(numbers, figure_data, "simulated")
-    assert list(texts) == ["sleeve.svg"]
-    marks = [
-        len(group.findall(f".//{SVG}use")) for group in ElementTree.fromstring(texts["sleeve.svg"]).iter(f"{SVG}g")
-    ]
-    assert len(figure_data["x_mm"]) == 40
-    assert len(figure_data["chips_x_mm"]) in marks
-    assert 40 in marks
-    text = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
-    for label in ("(simulated)", "x / mm", "y / mm", "place error", "border between boards"):
-        assert label in text
-
-
-def test_equal_predictions_and_source_give_an_equal_figure():
-    numbers, figure_data = numbers_and_figure_data()
-    once, again, other = (
-        figures(numbers, figure_data, source)["sleeve.svg"] for source in ("simulated", "simulated", "x")
-    )
-    assert once == again
-    assert once != other
-    assert np.isfinite(figure_data["error_mm"]).all()
+    assert np.isfinite(plotted["error_mm"]).all()

@@ -17,10 +17,8 @@ from pipeline.experiments.variation import (
     first_of_each_board,
     over_skins,
     over_time,
-    tables,
     variation,
 )
-from pipeline.formatting import to_markdown
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
@@ -145,26 +143,6 @@ def figure_data(last_uT: float = 40.0) -> dict:
     time = {"contacts_n": [0, 9750], "b_uT": [[0.0] * 15, [last_uT] * 15]}
     place = {"time": time, "skins": {"s0": [1.0] * 15, "s1": [-300.0] * 15}}
     return {"places": [place | {"x_mm": x_mm, "y_mm": 8.0} for x_mm in (8.0, 4.0)]}
-
-
-def test_table_has_the_change_over_time_and_the_spread_of_each_place():
-    table = tables(numbers(), "simulated")["variation"]
-    assert table["place, mm"].tolist() == ["8, 8"] * 3 + ["4, 8"] * 3
-    assert table["difference, µT"].tolist() == ["23.7", "5.21", "241"] * 2
-    assert table["difference, % of the change"].tolist() == ["8.98", "1.97", "96.1"] * 2
-    assert set(table["source"]) == {"simulated"}
-    assert "obvious variation across the samples" in to_markdown(table)
-
-
-def test_notes_state_the_warming():
-    text = to_markdown(tables(numbers(), "simulated")["variation"])
-    assert "take 575 s. In this time, the temperature of the chips changes by +1.9 K" in text
-    cold = {name: value for name, value in numbers().items() if name != "warmer_K"}
-    assert "temperature of the chips" not in to_markdown(tables(cold, "recorded")["variation"])
-
-
-def test_single_skin_has_no_spread_between_skins():
-    assert tables(numbers(("s0",)), "simulated")["variation"]["difference, µT"].tolist() == ["23.7", "5.21"] * 2
 
 
 def test_figures_name_their_channels_places_and_skins():

@@ -359,7 +359,10 @@ def test_p_value_of_a_claim_of_several_parts_follows_the_direction_of_the_first_
     claim = row(rule="each", ours="x.accuracy_pct")
 
     def parts(*means: float) -> list[dict]:
-        return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
+        return [
+            {"accuracy_pct": {"mean": mean, "n": 6, "se": se, "df": 5}}
+            for mean, se in zip(means, (0.5, 1.0), strict=True)
+        ]
 
     alone = [claim_p_value(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
     # This is the p-value of the first part. That of the second part would be 0.85.

@@ -1,15 +1,12 @@
 """Tests of the figures in the report: marks, units, source, the paper's numbers, and reproducible files."""
 
-import json
 import re
 import xml.etree.ElementTree as ET
-from copy import deepcopy
 from html import unescape
 
 import numpy as np
 import pytest
 
-from pipeline.formatting import models
 from pipeline.paper import TABLE_2
 from pipeline.plot import drawing, svg
 from pipeline.report.figures import (
@@ -18,12 +15,10 @@ from pipeline.report.figures import (
     FORCE,
     FORCE_LABEL,
     HEADLINE,
-    LABELS,
+    IN_CONTEXT,
     PLACE_LABEL,
-    WAYS,
     Outline,
     bars,
-    boards_rows,
     error_grid,
     headline_figures,
     learning_figures,
@@ -31,9 +26,10 @@ from pipeline.report.figures import (
     sweep_pokes,
     sweep_sensors,
     unseen_boards,
+    unseen_rows,
 )
-from tests.report.synthetic import all_experiments, texts_of
-from tests.stages.checkout import ROOT
+from pipeline.report.table_2 import models
+from tests.report.synthetic import all_experiments, new_board, texts_of
 
 PLACES_MM = np.array([[0.0, 0.0], [0.0, 2.0], [2.0, 0.0], [2.0, 2.0]] * 3)
 
@@ -188,19 +184,7 @@ def test_equal_numbers_give_an_equal_figure_of_table_2():
     assert headline_figures({name: numbers[name] for name in ("provenance",)}, "recorded") == {}
 
 
-@pytest.fixture(scope="module")
-def lab() -> dict:
-    numbers = json.loads((ROOT / "reports/lab/numbers.json").read_text())
-    for i, row in enumerate(numbers["random_presses"]["rows"]):
-        row["mse_f_N2"] = {"mean": 1.0 + i, "n": 2, "values": [0.5 + i, 1.5 + i]}
-    return numbers
-
-
-def test_figure_of_labels_has_a_line_for_each_method(lab):
-    labels = texts_of(headline_figures(lab, "recorded")[LABELS])
-    assert all(f"{row['method']} ({row['inputs']})" in labels for row in lab["labels"])
-    assert "recorded" in labels
-    assert "positions not corrected" in labels
+LAB = all_experiments("recorded") | {"new_board": new_board()}
 
 
 def titles(svg: str) -> list[str]:
@@ -208,15 +192,12 @@ def titles(svg: str) -> list[str]:
 
 
 @pytest.mark.parametrize("large", [True, False])
-def test_figure_of_unseen_boards_has_a_mark_for_each_board_and_for_the_paper(lab, large):
-    shown = titles(unseen_boards(lab, "recorded", large=large))
-    rows = boards_rows(lab)
-    assert {row["labels"] for row in rows} >= {"0", "10", "40"}
-    for row in rows:
-        places, forces = row["accuracy_pct"]["values"], [mse**0.5 for mse in row["mse_f_N2"]["values"]]
-        for axis, values in ((PLACE_LABEL, places), (FORCE_LABEL, forces)):
-            for value in values:
-                assert f"{WAYS[row['method']]}\n{axis} = {value:.4g}\n{row['labels']} labels" in shown
+def test_figure_of_unseen_boards_has_a_mark_for_each_board_and_for_the_paper(large):
+    shown = titles(unseen_boards(LAB, "recorded", large=large))
+    for row in unseen_rows(LAB):
+        for axis, metric in ((PLACE_LABEL, "accuracy_pct"), (FORCE_LABEL, "rms_f_N")):
+            for value in row[metric]["by_board"].values():
+                assert f"{IN_CONTEXT[row['method']]}\n{axis} = {value:.4g}\n{row['labels_n']} labels" in shown
     (mean, sd), (mse, sd_mse) = (TABLE_2["adapted"][metric] for metric in ("accuracy_pct", "mse_f_N2"))
     for axis, middle, low, high in (
         (PLACE_LABEL, mean, mean - sd, min(mean + sd, 100)),
@@ -226,39 +207,19 @@ def test_figure_of_unseen_boards_has_a_mark_for_each_board_and_for_the_paper(lab
         assert any(f"{axis} = {middle:.4g}" in title and ends in title for title in shown)
 
 
-def test_figure_of_unseen_boards_shows_the_force_error_of_a_constant_estimate(lab):
-    """If forces 1 and 3 N (board 1), and 2 and 8 N (board 2), were estimated as their means, the errors were 1, 3 N."""
-    numbers = deepcopy(lab)
-    for row in boards_rows(numbers):
-        row |= {"mse_f_N2": {"values": [0.5, 18.0]}, "r2_f": {"values": [0.5, -1.0]}}
-    shown = titles(headline_figures(numbers, "recorded")[FORCE])
+def test_figure_of_unseen_boards_shows_the_force_error_of_a_constant_estimate():
+    shown = titles(headline_figures(LAB, "recorded")[FORCE])
     for error_N in (1, 3):
         assert f"{CONSTANT_NAME}\n{FORCE_LABEL} = {error_N}\n{CONSTANT_ROW}" in shown
-    for row in boards_rows(numbers):  # R² is missing if all forces of a board are equal
-        del row["r2_f"]
-    text = headline_figures(numbers, "recorded")[FORCE]
-    assert FORCE_LABEL in texts_of(text)
-    assert CONSTANT_ROW not in texts_of(text)
 
 
-def test_title_of_the_figure_of_unseen_boards_has_two_short_lines(lab):
-    text = headline_figures(lab, "recorded")[HEADLINE]
-    lines = [
-        line
-        for line in text.splitlines()
-        if "boards never seen" in line or "marks are boards, numbers their means" in line
-    ]
-    assert [re.sub("<[^>]*>", "", line).strip() for line in lines] == [
-        "2 boards never seen in training (recorded):",
-        "marks are boards, numbers their means",
-    ]
-
-
-def test_places_and_forces_of_unseen_boards_are_in_separate_figures(lab):
-    figures = headline_figures(lab, "recorded")
+def test_places_and_forces_of_unseen_boards_are_in_separate_figures():
+    figures = headline_figures(LAB, "recorded")
     assert PLACE_LABEL in texts_of(figures[HEADLINE])
     assert FORCE_LABEL in texts_of(figures[FORCE])
     assert FORCE_LABEL not in texts_of(figures[HEADLINE])
+    without_forces = [{name: row[name] for name in row if name != "rms_f_N"} for row in LAB["new_board"]]
+    assert list(headline_figures(LAB | {"new_board": without_forces}, "recorded")) == [HEADLINE]
 
 
 def test_caption_names_the_rows_whose_bars_have_another_meaning():

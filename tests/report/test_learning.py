@@ -1,19 +1,15 @@
-"""Tests of the tables about training with many skins, and of the blocks in README and docs that contain them."""
+"""Tests of the tables about training with many skins."""
 
-from pipeline.formatting import CONTROL, to_markdown
+from pipeline.formatting import to_markdown
 from pipeline.paper import TABLE_2
-from pipeline.report.readme import blocks_of
+from pipeline.report.table_2 import CONTROL
 from pipeline.report.tables import (
     audit_table,
     chosen_table,
-    labels_table,
     make_tables,
-    paired_boards_table,
     paired_table,
-    sweep_pokes_table,
-    sweep_sensors_table,
 )
-from tests.report.synthetic import over_boards
+from tests.report.synthetic import new_board, over_boards
 
 
 def stat(mean: float, sd: float | None = 1.0, n: int = 6) -> dict:
@@ -47,13 +43,6 @@ PAIRED = [
 NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIRED}
 
 
-def test_table_of_paired_differences_lists_each_board():
-    table = paired_boards_table(NUMBERS, "simulated")
-    rows = table[table["difference"] == "adapted − multi-sensor + triplet"]
-    assert rows["held-out board"].tolist() == ["b0", "b1"]
-    assert rows["accuracy, %"].tolist() == ["+5", "+7"]
-
-
 def test_table_of_paired_differences_has_the_difference_of_the_papers_means():
     table = paired_table(NUMBERS, "simulated")
     assert table["difference"].tolist() == [
@@ -70,7 +59,6 @@ def test_table_of_paired_differences_has_the_difference_of_the_papers_means():
     # paper has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
-    assert "95 % interval over n boards" in to_markdown(table)
 
 
 def test_network_of_one_training_skin_is_not_called_multi_sensor():
@@ -98,36 +86,6 @@ def test_rows_of_table_2_are_in_the_order_of_the_paper():
     assert table["accuracy, % (ours)"].tolist()[-1] == "82.0 ± 1.0"
 
 
-def test_table_states_a_number_of_pokes_other_than_the_papers():
-    numbers = all_numbers() | {"adapt": {"pokes_n": 65, "control": row(82.0)}}
-    (name,) = [name for name in make_tables(numbers)["table2"]["model"] if "adapted" in name]
-    assert name.endswith("adapted using 65 indentations (paper: 390)")
-
-
-def test_rows_of_sweeps_are_sorted_by_count():
-    table = sweep_pokes_table([{"pokes_n": n, **row(80.0 + n / 100)} for n in (390, 0, 65)], "simulated")
-    assert table["pokes"].tolist() == ["0", "65", "390"]
-    assert table["accuracy, % (ours)"].tolist() == ["80.0 ± 1.0", "80.7 ± 1.0", "83.9 ± 1.0"]
-    assert table["accuracy, % (paper, table 2)"].tolist() == ["81.03 ± 12.86", "–", "87 ± 11.81"]
-    rows = [{"method": m, "skins_n": n, **row(n)} for m in ("adapted", "multi") for n in (15, 3)]
-    table = sweep_sensors_table(rows, "simulated")
-    assert table["training skins"].tolist() == ["3", "3", "15", "15"]
-    assert table["method"].tolist() == ["multi-sensor", "adapted"] * 2
-
-
-def test_table_of_labels_has_scores_as_labelled_and_registered():
-    one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
-    (line,) = labels_table([one], "recorded").to_dict("records")
-    assert line == {
-        "method": "ridge", "inputs": "shape", "labels": "20", "source": "recorded", "accuracy, %": "30.0 ± 1.0",
-        "MSE_xy, mm²": "0.5 ± 1.0", "MSE_F, N²": "–", "R² of F": "–", "accuracy, % (registered)": "42.0 ± 1.0",
-        "MSE_xy, mm² (registered)": "0.2 ± 1.0", "n": "6",
-    }  # fmt: skip
-    uncertain = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
-    (_, line) = labels_table([one, uncertain], "recorded").to_dict("records")
-    assert (line["coverage of 90 % intervals, %"], line["half-width of 90 % intervals, mm (median)"]) == ("91", "–")
-
-
 def test_leak_that_is_not_known_is_highlighted_in_the_audit():
     check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
     rows = [check, check | {"holds": False, "known": True, "found": 6}, check | {"holds": False}]
@@ -145,6 +103,9 @@ def test_chosen_settings_are_marked_among_the_candidates():
     assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
 
 
+PARTS = {places: {"accuracy_pct": 80.0, "mse_xy_mm2": 0.5} for places in ("as_labelled", "registered")}
+
+
 def all_numbers() -> dict:
     provenance = {
         "source": "simulated",
@@ -155,16 +116,15 @@ def all_numbers() -> dict:
         "device": "z",
         "seconds": 1.0,
     }
-    one = {"method": "ridge", "inputs": "raw"}
     check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
     return NUMBERS | {
         "provenance": provenance,
-        "lobo": {"by_board": {board: one | part() for board, one in BOARDS.items()}},
+        "lobo": {"by_board": {board: one | PARTS for board, one in BOARDS.items()}},
         "variants": {"lobo": {"paper": row(84.0)}},
         "capture": {"captures_n": 18, "left_out": {}},
         "sweep_pokes": [{"pokes_n": 0, **row(81.0)}],
         "sweep_sensors": [{"method": "multi", "skins_n": 3, **row(60.0)}],
-        "labels": [one | {"labels_n": 0, "as_labelled": row(30.0), "registered": row(42.0)}],
+        "new_board": new_board(),
         "audit": [check],
         "chosen": {
             "multi": {
@@ -176,11 +136,6 @@ def all_numbers() -> dict:
     }
 
 
-def part() -> dict:
-    scores = {"accuracy_pct": 80.0, "mse_xy_mm2": 0.5}
-    return {"as_labelled": scores, "registered": scores}
-
-
 def test_table_of_each_experiment_names_its_source():
     expected = {
         "claims",
@@ -188,7 +143,7 @@ def test_table_of_each_experiment_names_its_source():
         "paired_boards",
         "sweep_pokes",
         "sweep_sensors",
-        "labels",
+        "new_board",
         "audit",
         "chosen",
     }
@@ -198,21 +153,3 @@ def test_table_of_each_experiment_names_its_source():
         assert set(tables[name]["source"]) == {"simulated"}
     nothing = {name: all_numbers()[name] for name in ("provenance", "variants", "capture")}
     assert not expected & set(make_tables(nothing))
-
-
-def test_readme_has_the_claims_of_the_paper_below_table_2():
-    described = {
-        "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
-    }
-    tables = make_tables(all_numbers())
-    results = blocks_of([all_numbers() | {"described": described, "trainings": {}}], [], {}, None)["results"]
-    table2, claims = to_markdown(tables["table2"]), to_markdown(tables["claims"])
-    assert f"{table2}\n\n{claims}" in results
-
-
-def test_costs_in_the_readme_are_those_of_the_recorded_run():
-    described = {"grid": {"source": "simulated", "over_skins": {}}}
-    numbers = all_numbers() | {"described": described, "trainings": {}}
-    numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
-    row = next(line for line in blocks_of([numbers], [], {}, None)["costs"].splitlines() if "`paper`" in line)
-    assert [cell.strip() for cell in row.split("|")[1:5]] == ["`paper`", "90", "0", "0"]

@@ -4,16 +4,15 @@ import json
 import re
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pipeline.training.universal import METHODS, WAYS
 
-from pipeline.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
+from pipeline.formatting import PAPER_METRICS, TITLES, rounded, show, show_digits, to_markdown
 from pipeline.paper import TABLE_2
 from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
 from pipeline.report.readme import fill
+from pipeline.report.table_2 import CONTROL, models
 from pipeline.report.tables import (
     HELD_OUT,
     LOCALISATION,
@@ -29,12 +28,11 @@ from pipeline.report.tables import (
     summary_table,
     table1,
 )
-from pipeline.scores import rows_of_cards
+from pipeline.scores import make_table, rows_of_cards
+from pipeline.statistics import as_json
 from reskin.errors import ParamsError, SchemaError
-from reskin.io import read_json
 from tests.report import synthetic
-from tests.report.synthetic import all_experiments, cost, stat
-from tests.stages.checkout import ROOT
+from tests.report.synthetic import all_experiments, cost, new_board, stat
 
 
 def card(experiment: str, fold: str, accuracy_pct: float, recipe: str = "paper") -> dict:
@@ -64,7 +62,11 @@ COUNTS = [
 def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
     capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
-    return {"provenance": provenance, "capture": capture, **learning_numbers(rows_of_cards(cards), headline="paper")}
+    return {
+        "provenance": provenance,
+        "capture": capture,
+        **as_json(learning_numbers(rows_of_cards(cards), headline="paper")),
+    }
 
 
 def test_scores_of_table_2_are_means_over_boards_or_pairs_of_skins():
@@ -76,10 +78,15 @@ def test_scores_of_table_2_are_means_over_boards_or_pairs_of_skins():
 
 
 def test_table_has_scores_of_predictions_from_readings_before_touch():
-    columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
-    predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
+    predicted = make_table(
+        {"experiment": "single_temporal", "fold": fold, "method": method, "accuracy_pct": accuracy, "mse_xy_mm2": mse}
+        for fold, method, accuracy, mse in (
+            ("s0", "noload", 10.0, 9.0), ("s0", "scan", 99.0, 0.1),
+            ("s1", "noload", 20.0, 8.0), ("s1", "scan", 97.0, 0.3),
+        )
+    )  # fmt: skip
     shown = numbers([card("single_temporal", "s0", 95.0)])
-    table = make_tables(shown | before_touch_numbers([predicted]))["single_sensor"]
+    table = make_tables(shown | as_json(before_touch_numbers(predicted)))["single_sensor"]
     assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15.0", "98.0"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
@@ -127,7 +134,7 @@ def test_lost_bytes_and_rows_are_counted_for_each_protocol():
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
         "variation": wear,  # This experiment uses the captures of `drift`, which are counted once.
         "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
-        "ambient": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
+        "compare": {"accounts": [], "left_out": {}},  # This experiment uses the main captures.
     }
     found = lost_by_protocol(losses)
     assert set(found) == {"wear", "drag"}
@@ -243,15 +250,15 @@ def test_summary_has_our_scores_beside_the_papers_and_a_row_for_the_control():
     assert "R² of F" in table
 
 
-def test_summary_of_recordings_has_scores_with_labels():
-    numbers = read_json(ROOT / "reports/lab/numbers.json")
-    table, usual = summary_table(numbers), numbers["labels"][0]["method"]
-    lines = table.set_index(HELD_OUT).to_dict("index")
-    assert list(lines) == [*(f"{METHODS[1]}{way}" for way in WAYS.values()), usual]
-    for row in numbers["labels"]:
-        if row["method"] in lines and row["labels_n"] in (0, 40):
-            shown = lines[row["method"]][f"within 1 mm, %, {row['labels_n']} labels"]
-            assert shown == show(row["as_labelled"]["accuracy_pct"])
+def test_summary_of_unseen_boards_has_the_fewest_and_the_most_labels():
+    rows = new_board()
+    table = summary_table(all_experiments("recorded") | {"new_board": rows}).set_index(HELD_OUT)
+    assert table.index.tolist() == [TITLES["shipped"], TITLES["rig"]]
+    for row in rows:
+        if row["method"] != "constant" and row["labels_n"] in (0, 40):
+            shown = table.loc[TITLES[row["method"]], f"within 1 mm, %, {row['labels_n']} labels"]
+            assert shown == show(row["accuracy_pct"])
+    assert not any("10 labels" in column for column in table)
 
 
 def test_scene_without_held_out_boards_has_no_summary():
