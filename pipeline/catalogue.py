@@ -25,15 +25,15 @@ STAGES = {
 }
 MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
 EXPERIMENTS_PACKAGE = "pipeline.experiments"
-Kind = Literal["models", "files", "curve", "analysis", "study", "report"]
+Kind = Literal["models", "files", "curve", "analysis", "report"]
 
 
 class Experiment(Strict):
     """An experiment that scenes can run, and its requirements for a scene.
 
     kind: what the stage writes. `models`: networks with JSON cards. `files`: model files that other experiments score.
-    `curve`: points of a curve. `analysis`: numbers, figure data and capture losses. `study`: numbers only. `report`:
-    nothing, because the report stage computes it. Each analysis or study is a module of `pipeline.experiments`.
+    `curve`: points of a curve. `analysis`: numbers, figure data and capture losses. `report`: nothing, because the
+    report stage computes it. Each analysis is a module of `pipeline.experiments`.
     stage: the DVC stage that runs the experiment.
     key: the name of the results in numbers.json; it stays the same if the experiment is renamed.
     needs: other experiments that the scene must also run.

@@ -65,7 +65,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
         "simulate": simulate, "ingest_simulated": ingest_simulated, "ingest": ingest, "ingest_many": many,
         "describe": list(scenes), "split": list(scenes),
     }  # fmt: skip
-    for stage in (*stages(EXPERIMENTS, "models", "files", "curve", "study"), *ANALYSES):
+    for stage in (*stages(EXPERIMENTS, "models", "files", "curve"), *ANALYSES):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
     for experiment in EXPERIMENTS.values():
         if experiment.protocol is not None and experiment.recorded:

@@ -97,10 +97,6 @@ class Scene(Strict, extra="allow"):
         return tuple(experiment.name for experiment in self.entries if experiment.kind == "analysis")
 
     @property
-    def studies(self) -> tuple[str, ...]:
-        return tuple(experiment.name for experiment in self.entries if experiment.kind == "study")
-
-    @property
     def with_folds(self) -> tuple[str, ...]:
         """The experiments for which folds are drawn."""
         return tuple(experiment.name for experiment in self.entries if experiment.folds is not None)

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Float32, Int
 
+from pipeline.experiments.results import write_results
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training.choice import fingerprint, settings_of, without_budget
@@ -107,7 +108,7 @@ def audit(
             where = f"audit of {settings.scene}, {check.where}, {check.what}"
             raise LeakError(f"{where}: {check.found}. Rule: {check.rule}. {check.remedy}")
     rows = [{"rule": check.rule} | asdict(check) for check in checks]
-    io.write_json(results, [{key: value for key, value in row.items() if key != "remedy"} for row in rows])
+    write_results(results, [{key: value for key, value in row.items() if key != "remedy"} for row in rows], {})
     known_n = sum(check.known for check in checks)
     say(f"{settings.scene}: {len(checks)} checks found no leak, apart from {known_n} known or accepted ones")
 

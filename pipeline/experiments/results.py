@@ -70,7 +70,7 @@ def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, An
 
 def write_results(
     results: Path,
-    numbers: Mapping[str, Any],
+    numbers: Mapping[str, Any] | Sequence[Any],
     drawn: Mapping[str, Any],
     losses: Mapping[str, Any] = NO_LOSSES,
     trainings: Mapping[str, int] | None = None,

@@ -120,7 +120,7 @@ class Inputs:
     """Inputs of stage report, which are the results of other stages.
 
     - cards: model cards (JSON descriptions) of all trained networks.
-    - curves, analyses, studies: results of sweeps and of other experiments, by name.
+    - curves, analyses: results of sweeps and of other experiments, by name.
     - described: descriptions of the captures' fields, noise and forces.
     - final_model: numbers on the final model.
     - ingest_counts: counts of read and lost readings of each capture.
@@ -130,7 +130,6 @@ class Inputs:
     cards: list[dict[str, Any]]
     curves: dict[str, Any]
     analyses: dict[str, Any]
-    studies: dict[str, Any]
     described: dict[str, Any]
     final_model: dict[str, Any]
     ingest_counts: list[dict[str, Any]]
@@ -139,16 +138,11 @@ class Inputs:
 
 def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, models: Path, results: Path) -> Inputs:
     """Read the results of all stages that the scene runs."""
-
-    def read(names: Iterable[str]) -> dict[str, Any]:
-        return {name: io.read_json(results / f"{name}.json") for name in names}
-
     split_of_scene = io.read_json(folds)
     return Inputs(
         cards=read_cards(models, scene.model_stages),
         curves={experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()},
-        analyses=read(scene.analyses),
-        studies=read(scene.studies),
+        analyses={name: io.read_json(results / f"{name}.json") for name in scene.analyses},
         described={scene.described: io.read_json(results / "described.json")},
         final_model=final_numbers(models, scene_name) if "lobo" in scene.experiments else {},
         ingest_counts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
@@ -159,14 +153,12 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
 def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.DataFrame) -> dict[str, Any]:
     """Compute the content of numbers.json and provenance.json."""
     analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
-    studies = {EXPERIMENTS[name].key: result for name, result in inputs.studies.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
     runtime: dict[str, Any] = {"stages": stage_costs(costs)}
     seconds = SECONDS / settings.scene / "accuracy_and_cost.json"
     if "accuracy_and_cost" in scene.experiments and seconds.exists():
         runtime["accuracy_and_cost"] = io.read_json(seconds)
     experiments = {EXPERIMENTS[name].key: found for name, found in experiment_numbers(inputs.analyses, table).items()}
-    experiments |= studies
     numbers = {
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
