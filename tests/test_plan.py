@@ -45,7 +45,6 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("adapt", ADAPTED),
         ("sweep_pokes", (*ADAPTED, "pokes")),
         ("sweep_sensors", (*ADAPTED, "sensors")),
-        ("few_labels", ("lobo", "labels")),
         ("audit", ("lobo", "audit")),
     ],
 )
@@ -112,17 +111,15 @@ def test_recorded_scene_without_captures_is_an_error():
         make_plan({"lab": scene()}, Registry(captures={}))
 
 
-def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
+def test_stage_new_board_depends_on_the_model_that_the_scene_names(tmp_path):
     text = scene_text("mine", ["b1", "b2"], 60, 1, "reskin")
     captures = Registry(captures={"mine": {"c0": ENTRY}})
     generated = make_plan({"mine": parse_scene(YAML(typ="safe").load(text), "mine.yaml")}, captures)["stages"]
-    assert generated["calibrated"] == {"mine": SHIPPED}
+    assert generated["new_board"] == {"mine": SHIPPED}
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     (root / SCENES / "mine.yaml").write_text(text)  # This checkout contains no library, and therefore no model.
-    with pytest.raises(
-        ParamsError, match=r"universal.safetensors, which is named in section calibrated, was not found"
-    ):
+    with pytest.raises(ParamsError, match=r"universal.safetensors, which is named in section new_board, was not found"):
         plan.plan_of(root, ["mine"])
 
 

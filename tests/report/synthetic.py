@@ -111,6 +111,7 @@ def all_experiments(source: str = "simulated") -> dict:
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
         "compare": {"by_board": {}},
+        "interference": {"fields_uT": [1.0]},
         "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
     }  # fmt: skip
 
