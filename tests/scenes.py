@@ -44,7 +44,9 @@ SECTIONS: dict[str, dict[str, object]] = {
     "adapt": {"adapt": ADAPTATIONS},
     "pokes": {"sweep_pokes": {"pokes_n": [0, 8], "boards_n": 1}},
     "sensors": {},
-    "new_board": {"new_board": NEW_BOARD, "adapt": ADAPTATIONS, "compare": {"layout": "reskin", "labels_mirrored": False}},
+    "new_board": {
+        "new_board": NEW_BOARD, "adapt": ADAPTATIONS, "compare": {"layout": "reskin", "labels_mirrored": False},
+    },
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
 }  # fmt: skip
