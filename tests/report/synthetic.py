@@ -119,7 +119,8 @@ def all_experiments(source: str = "simulated") -> dict:
 def new_board(methods: tuple[str, ...] = ("shipped", "rig")) -> list[dict]:
     """Return rows of experiment new_board for two boards.
 
-    There are rows of the methods with 0, 10 and 40 labels, of a constant force, and of contact. With the most labels, a constant force has rms errors of 1 N on board b0 and 3 N on board b1.
+    There are rows of the methods with 0, 10 and 40 labels, of a constant force, and of contact. With the most labels, a
+    constant force has rms errors of 1 N on board b0 and 3 N on board b1.
     """
     split = {"split": "checkerboard", "pokes_n": 65}
 
