@@ -24,13 +24,13 @@ def recorded_scene(**changes: object) -> dict[str, object]:
 
 SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
+NEW_BOARD = {"presses_n": [12], "labels_n": [0, 10], "draws_n": 1, "model": None}
 # The content of params.yaml in tests.
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
     "faults": DEFAULT_POLICY.model_dump(),
     "recipes": {"paper": SHARED_RECIPE, "triplet": SHARED_RECIPE | {"triplet_weight": 0.1}},
     "adaptations": {"paper": {"unlabelled_weight": 0.1} | SCHEDULE},
-    "labellings": {"few": {"own_weight": 1.0} | SCHEDULE},
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 
@@ -44,12 +44,8 @@ SECTIONS: dict[str, dict[str, object]] = {
     "adapt": {"adapt": ADAPTATIONS},
     "pokes": {"sweep_pokes": {"pokes_n": [0, 8], "boards_n": 1}},
     "sensors": {},
-    "labels": {
-        "few_labels": {
-            "labels_n": [0], "recipe": "paper", "steps_n": 1, "recipes": {"network": {}}, "adapted": [],
-            "adapting": {"adaptation": "paper", "steps_n": 1}, "labelling": {"labelling": "few", "steps_n": 1},
-            "rows_max_n": 10, "methods": "tiny",
-        },
+    "new_board": {
+        "new_board": NEW_BOARD, "adapt": ADAPTATIONS, "compare": {"layout": "reskin", "labels_mirrored": False},
     },
     "audit": {"audit": {"settings": "chosen"}},
     "choice": {},
@@ -73,7 +69,6 @@ SPLIT_SETTINGS: dict[str, dict[str, object]] = {
     "single_pass": {"random_test_fraction": 0.1, "random_repeats_n": 1},
     "adapt": {"pool_passes_n": 1},
     "sensors": {"sensors_skins_n": [1], "sensors_draws_n": 1},
-    "labels": {"labels_pool_n": 8, "labels_draws_n": 1},
 }
 
 

@@ -45,7 +45,6 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("adapt", ADAPTED),
         ("sweep_pokes", (*ADAPTED, "pokes")),
         ("sweep_sensors", (*ADAPTED, "sensors")),
-        ("few_labels", ("lobo", "labels")),
         ("audit", ("lobo", "audit")),
     ],
 )
@@ -112,17 +111,15 @@ def test_recorded_scene_without_captures_is_an_error():
         make_plan({"lab": scene()}, Registry(captures={}))
 
 
-def test_stage_calibrated_depends_on_the_model_that_the_scene_names(tmp_path):
+def test_stage_new_board_depends_on_the_model_that_the_scene_names(tmp_path):
     text = scene_text("mine", ["b1", "b2"], 60, 1, "reskin")
     captures = Registry(captures={"mine": {"c0": ENTRY}})
     generated = make_plan({"mine": parse_scene(YAML(typ="safe").load(text), "mine.yaml")}, captures)["stages"]
-    assert generated["calibrated"] == {"mine": SHIPPED}
+    assert generated["new_board"] == {"mine": SHIPPED}
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     (root / SCENES / "mine.yaml").write_text(text)  # This checkout contains no library, and therefore no model.
-    with pytest.raises(
-        ParamsError, match=r"universal.safetensors, which is named in section calibrated, was not found"
-    ):
+    with pytest.raises(ParamsError, match=r"universal.safetensors, which is named in section new_board, was not found"):
         plan.plan_of(root, ["mine"])
 
 
@@ -167,20 +164,19 @@ def test_unknown_scene_is_an_error(tmp_path):
 
 
 def simulated_checkout(tmp_path, **changes):
-    """Return a function that creates a checkout with scene `one`: a copy of ci with changes in section simulate."""
+    """Create a checkout with scene `one`: a copy of ci with changes in section simulate."""
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
-    shutil.copy(ROOT / SCENES / "ci.yaml", root / SCENES / "one.yaml")
+    scene_settings = YAML(typ="safe").load((ROOT / SCENES / "ci.yaml").read_text())
+    scene_settings["new_board"]["model"] = None  # the checkout contains no library, and therefore no model
     for path, value in changes.items():
         *sections, name = path.split("__")
-        changed = root / SCENES / "one.yaml"
-        scene_settings = YAML(typ="safe").load(changed.read_text())
         section = scene_settings["simulate"]
         for part in sections:
             section = section[part]
         section[name] = value
-        with changed.open("w") as stream:
-            YAML().dump(scene_settings, stream)
+    with (root / SCENES / "one.yaml").open("w") as stream:
+        YAML().dump(scene_settings, stream)
     return root
 
 
@@ -202,8 +198,8 @@ def test_each_protocol_is_simulated_and_ingested_by_stages_of_its_own(tmp_path):
         ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than the 6 skins of rigid boards"),
         (
-            {"protocols__press__skins_n": 3},
-            "protocol press: skins_n must be 1, because its experiment reads only one skin, not 3",
+            {"protocols__glass__skins_n": 3},
+            "protocol glass: skins_n must be 1, because its experiment reads only one skin, not 3",
         ),
         ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards must not be rigid"),
     ],

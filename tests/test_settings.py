@@ -146,7 +146,7 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
 # Stages that read section `adaptations`, section `recipes`, or the physics of the skin.
-ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible", "accuracy_and_cost"}
+ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible", "new_board", "accuracy_and_cost"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "drift", "shear", "sleeve"}
 NUMERICAL = {"extremes", "accuracy_and_cost"}  # These experiments compare methods of the simulator.
 FINGERPRINTED = {"audit", "report"}  # These stages compare the fingerprint of the skin with that of scene tuning.
@@ -154,8 +154,7 @@ WITH_BOARDS = {"flexible", "logs", "sleeve", *NUMERICAL}  # They read the boards
 # File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml and of nominal.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
-    (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
-    (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
+    (PARAMS, "adaptations.paper.rate_max=0.0005", ADAPTING),
     (SKIN, "skin.modulus_kPa=300.0", {*SIMULATE, *FINGERPRINTED, "interference", *NUMERICAL}),
     (SKIN, "chip.gain_sel=4", {*SIMULATE, *FINGERPRINTED, "logs", "interference", "extremes"}),
     (SKIN, "terms.ageing.settling=0.2", SIMULATE),

@@ -111,14 +111,16 @@ def all_experiments(source: str = "simulated") -> dict:
         },
         "logs": {"rate_hz": 250.0, "accuracy_pct": 80.0, "mse_f_N2": 0.1},
         "compare": {"by_board": {}},
+        "interference": {"fields_uT": [1.0]},
         "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
     }  # fmt: skip
 
 
 def new_board(methods: tuple[str, ...] = ("shipped", "rig")) -> list[dict]:
-    """Return rows of experiment new_board for two boards: the methods with 0, 10 and 40 labels, and a constant force.
+    """Return rows of experiment new_board for two boards.
 
-    With the most labels, a constant force has rms errors of 1 N on board b0 and 3 N on board b1.
+    There are rows of the methods with 0, 10 and 40 labels, of a constant force, and of contact. With the most labels, a
+    constant force has rms errors of 1 N on board b0 and 3 N on board b1.
     """
     split = {"split": "checkerboard", "pokes_n": 65}
 
@@ -127,13 +129,25 @@ def new_board(methods: tuple[str, ...] = ("shipped", "rig")) -> list[dict]:
 
     rows = [
         {"method": method, **split, "labels_n": labels_n, "accuracy_pct": of_boards(40.0 + 20 * i + labels_n, 1.0)}
-        | {"mse_xy_mm2": of_boards(0.6, 0.1), "mse_f_N2": of_boards(2.5, 1.5), "rms_f_N": of_boards(1.5, 0.5)}
+        | {
+            "median_mm": of_boards(0.8, 0.1),
+            "mse_xy_mm2": of_boards(0.6, 0.1),
+            "mse_f_N2": of_boards(2.5, 1.5),
+            "rms_f_N": of_boards(1.5, 0.5),
+        }
         | {"r2_f": of_boards(0.1 + labels_n / 100, 0.05)}
         for i, method in enumerate(methods)
         for labels_n in (0, 10, 40)
     ]
     constant = {"method": "constant", **split, "rms_f_N": of_boards(2.0, 1.0)}
-    return [*rows, *(constant | {"labels_n": labels_n} for labels_n in (10, 40))]
+    contact = {
+        "method": "contact",
+        "split": "each",
+        "false_pct": of_boards(1.0, 1.0),
+        "missed_pct": of_boards(0.5, 0.5),
+    }
+    contact |= {"force_min_N": of_boards(0.3, 0.1), "force_max_N": of_boards(4.0, 1.0)}
+    return [*rows, *(constant | {"labels_n": labels_n} for labels_n in (10, 40)), contact]
 
 
 SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]
