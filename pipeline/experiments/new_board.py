@@ -1,18 +1,20 @@
 """New board: place and force on a board that was not in training, with few labels or none (recorded or simulated).
 
-Each board of a scene is held out in turn. A method may use the board's no-load field, unlabelled presses, and a few
-*labels*, which are presses with a known place and force; it is then tested on the readings of other presses. Presses
-are drawn at random, several times. The results depend on where the labels are, so there are three splits:
+Each board of a scene is held out in turn. A method may use the board's no-load field, unlabelled presses anywhere on
+the skin, and a few *labels*, which are presses with a known place and force; it is then tested on the readings of other
+presses. Presses are drawn at random, several times. All readings are relative to the no-load reading before the same
+press, so the scores are for a no-load reading that is always fresh. The results depend on where the labels are. There
+are three splits:
 
 - `checkerboard`: places are coloured like the squares of a checkerboard. Labels have one colour, tests the other.
 - `halves`: labels are on one half of the skin, tests on the other.
-- `grid`: unlabelled presses are one press at each place, labels are some of them, and tests are at the same places.
+- `grid`: unlabelled presses are at different places, labels are some of them, and tests are at the same places.
 
 The experiment also scores contact, by the age of the no-load reading, if recordings contain readings without contact.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +30,7 @@ from pipeline.formatting import TITLES
 from pipeline.plot import COLOURS, MARKERS, drawing, svg
 from pipeline.scores import COUNTS, make_table, metrics_of, write_scores
 from pipeline.settings import Adaptations, Settings, Training
+from pipeline.stage import say
 from pipeline.statistics import tally
 from pipeline.training.jobs import SceneData, collapse_record, read_data, read_pretrained, select_pretrained, train_jobs
 from pipeline.training.methods import (
@@ -36,8 +39,8 @@ from pipeline.training.methods import (
     Method,
     PaperNetwork,
     Prediction,
-    Presses,
     Registered,
+    Samples,
     constant,
     gaussian_process,
     kernel_ridge,
@@ -99,8 +102,8 @@ class Board:
     board: str
     skin: str
     noload_uT: Float[np.ndarray, " ch"]
-    presses: Presses
-    readings: Presses
+    presses: Samples
+    readings: Samples
     press_i: Int64[np.ndarray, " f"]
     rows: Int64[np.ndarray, " f"]
     middle_mm: tuple[float, float]
@@ -113,7 +116,7 @@ class Board:
         """Return 1 for presses that may be labels, -1 for tests, and 0 for neither; draws exchange the parts."""
         place_mm = self.presses.place_mm - self.middle_mm
         if split == CHECKERBOARD:
-            colour = np.rint(place_mm / SPACING_MM).astype(int).sum(axis=1) % 2
+            colour = np.floor(place_mm / SPACING_MM + 0.5).astype(int).sum(axis=1) % 2
             return np.array((-1) ** (colour + draw_i))
         along_mm = place_mm[:, draw_i // 2 % 2] * (-1) ** draw_i
         return np.where(np.abs(along_mm) < SPACING_MM / 2, 0, np.sign(along_mm)).astype(int)
@@ -132,24 +135,24 @@ class Draw:
 
 
 def read_boards(data: SceneData, captures: Sequence[Any], middle_mm: tuple[float, float]) -> list[Board]:
-    """Collect the presses of each skin of a scene; presses without force are left out."""
+    """Collect the presses of each skin of a scene; readings whose force is known and not above 0 are left out."""
     rows, boards = data.rows, []
     for skin in np.unique(rows.skin):
         own = np.flatnonzero((rows.skin == skin) & ~(rows.target[:, 2] <= 0))
         noload = [readings.noload_uT for readings in captures if readings.skin == skin]
         noload_uT = np.concatenate(noload).mean(axis=0, dtype=float)
         target = rows.target[own].astype(float)
-        readings = Presses(target[:, :2], target[:, 2], noload_uT + rows.db_uT[own].astype(float))
+        readings = Samples(target[:, :2], target[:, 2], noload_uT + rows.db_uT[own].astype(float))
         _, press_i = np.unique(rows.indentation[own], return_inverse=True)
         means = pd.DataFrame(np.column_stack([target, readings.b_uT])).groupby(press_i).mean().to_numpy()
-        presses = Presses(means[:, :2], means[:, 2], means[:, 3:])
+        presses = Samples(means[:, :2], means[:, 2], means[:, 3:])
         board = str(rows.board[own[0]])
         boards.append(Board(board, str(skin), noload_uT, presses, readings, press_i, own, middle_mm))
     return boards
 
 
 def draw_presses(board: Board, split: str, presses_n: int, seed: int, draw_i: int) -> Draw:
-    """Draw the presses of one draw; raise `SchemaError` if none is left for labels or for tests."""
+    """Draw the presses of one draw; raise `SchemaError` if there are too few presses."""
     rng, every = rng_for(seed, "new_board", board.skin, split, draw_i), np.arange(len(board.presses))
     off_mm = np.abs(board.presses.place_mm - board.middle_mm).max(axis=1)
     near = off_mm < MIDDLE_MM
@@ -157,63 +160,65 @@ def draw_presses(board: Board, split: str, presses_n: int, seed: int, draw_i: in
     if split == GRID:
         shuffled = rng.permutation(every)
         _, first = np.unique(np.rint(board.presses.place_mm[shuffled] / PLACE_MM), axis=0, return_index=True)
-        unlabelled = labels = rng.permutation(shuffled[first])
+        unlabelled = labels = rng.permutation(shuffled[first])[:presses_n]
         tested = np.setdiff1d(every, [*unlabelled, *middle])
     else:
         part, unlabelled = board.part(split, draw_i), rng.permutation(every)[:presses_n]
         labels = rng.permutation(np.flatnonzero(part == 1))
         tested = np.setdiff1d(np.flatnonzero((part == -1) & ~near), [*unlabelled, *middle])
-    if not len(tested) or not len(labels):
-        what = f"board {board.board} has only {len(every)} presses: none is left for labels or for tests"
+    if len(unlabelled) < presses_n or not len(tested) or not len(labels):
+        what = f"skin {board.skin} has only {len(every)} presses: too few for labels, tests and {presses_n} others"
         raise SchemaError(f"new_board, split {split}: {what}. Reduce new_board.presses_n, or add recordings.")
     return Draw(split, draw_i, unlabelled, labels, middle, tested)
 
 
-def splits_of(board: Board) -> list[str]:
-    """Return the splits that are possible: `grid` needs places that were pressed at least twice."""
-    places_n = len(np.unique(np.rint(board.presses.place_mm / PLACE_MM), axis=0))
-    return [CHECKERBOARD, HALVES, *[GRID] * (2 * places_n <= len(board.presses))]
+def splits_of(board: Board, presses_n: int) -> list[str]:
+    """Return the splits that are possible: `grid` needs `presses_n` places, pressed twice or more on average."""
+    places_n = count_places(board.presses)
+    return [CHECKERBOARD, HALVES, *[GRID] * (presses_n <= places_n <= len(board.presses) // 2)]
+
+
+def count_places(presses: Samples) -> int:
+    """Return the number of different places."""
+    return len(np.unique(np.rint(presses.place_mm / PLACE_MM), axis=0))
 
 
 # --- Methods ---
 
 
-def methods_of(board: Board, section: NewBoard, compare: Compare, models: Path, *, rig: bool) -> dict[str, Method]:
-    """Return the methods for a held-out board, by name."""
+Methods = Mapping[str, Sequence[Method]]  # by name; the paper's networks are there once for each seed
+
+
+def methods_of(board: Board, section: NewBoard, compare: Compare, models: Path, *, rig: bool) -> Methods:
+    """Return the methods for a held-out board. None but `shipped` is made without recordings of the other boards."""
     turned = compare.labels_mirrored, compare.labels_middle_mm
-    networks = {
-        name: networks_by_fold(models / stage, experiment)[board.board]
-        for name, (stage, experiment) in NETWORKS.items()
-    }
-    methods: dict[str, Method] = {}
+    methods: dict[str, Sequence[Method]] = {}
     if section.model is not None:
-        methods[SHIPPED] = InContext(Path(section.model), *turned)
+        methods[SHIPPED] = [InContext(Path(section.model), *turned)]
     if rig:
-        methods["rig"] = InContext(models / "rig" / f"{board.board}.safetensors", *turned)
-    methods |= {name: PaperNetwork(each) for name, each in networks.items()}
-    methods |= {"registration": Registered(methods["multi"]), "kernel_ridge": kernel_ridge}
-    return methods | {"gaussian_process": gaussian_process, "constant": constant}
+        methods["rig"] = [InContext(models / "rig" / f"{board.board}.safetensors", *turned)]
+    for name, (stage, experiment) in NETWORKS.items():
+        methods[name] = [PaperNetwork(each) for each in networks_by_fold(models / stage, experiment)[board.board]]
+    methods |= {"registration": [Registered(network) for network in methods["multi"]], "kernel_ridge": [kernel_ridge]}
+    return methods | {"gaussian_process": [gaussian_process], "constant": [constant]}
 
 
 # --- Scores ---
 
 
-def score_draw(
-    board: Board, draw: Draw, section: NewBoard, methods: Mapping[str, Method], others: Presses
-) -> list[dict[str, Any]]:
+def score_draw(board: Board, draw: Draw, section: NewBoard, methods: Methods, others: Samples) -> list[dict[str, Any]]:
     """Score every method on one draw, for each number of unlabelled presses and of labels."""
     readings = board.readings[board.of_presses(draw.tested)]
-    case = Case(
-        board.noload_uT, board.presses.b_uT[draw.unlabelled], board.presses[draw.labels[:0]], draw.split == GRID,
-        others, readings.b_uT,
-    )  # fmt: skip
+    even = draw.split == GRID and len(draw.unlabelled) == count_places(board.presses)
     keys, rows = _keys(board, draw, len(readings)), []
-    for name, method in methods.items():
+    for name, versions in methods.items():
         for presses_n, labels_n in _settings(name, draw, section):
-            labels = draw.middle if labels_n == 1 else draw.labels[:labels_n]
-            own = replace(case, presses_uT=case.presses_uT[:presses_n], labels=board.presses[labels])
-            scores = score_prediction(readings, method(own))
-            rows.append(keys | {"method": name, "pokes_n": presses_n, "labels_n": labels_n} | scores)
+            presses_uT = board.presses.b_uT[draw.unlabelled[:presses_n]]
+            labels = board.presses[draw.middle if labels_n == 1 else draw.labels[:labels_n]]
+            case = Case(board.noload_uT, presses_uT, labels, even, others, readings.b_uT)
+            for seed_i, method in enumerate(versions):
+                row = {"method": name, "seed": seed_i, "pokes_n": presses_n, "labels_n": labels_n}
+                rows.append(keys | row | score_prediction(readings, method(case)))
     return rows
 
 
@@ -223,7 +228,10 @@ def _keys(board: Board, draw: Draw, rows_n: int) -> dict[str, Any]:
 
 
 def _settings(method: str, draw: Draw, section: NewBoard) -> list[tuple[int, int]]:
-    """Return the numbers of unlabelled presses and of labels with which a method is scored."""
+    """Return the numbers of unlabelled presses and of labels with which a method is scored.
+
+    Methods that do not use unlabelled presses have the same number as the others, so that rows can be compared.
+    """
     most_n, labels_n = len(draw.unlabelled), [n for n in section.labels_n if n <= len(draw.labels)]
     if method in NETWORKS:
         return [(most_n, 0)]
@@ -286,8 +294,9 @@ def _change_since(
     is compared with the other readings before the same press (`each`), and not with itself. With an older no-load
     reading, the first press is left out, because no press is before it.
     """
-    n = np.bincount(quiet_i)
-    mean_uT = np.stack([np.bincount(quiet_i, column) for column in quiet_uT.T], axis=1) / n[:, None]
+    n = np.bincount(quiet_i, minlength=press_i.max() + 1)
+    sums_uT = np.stack([np.bincount(quiet_i, column, len(n)) for column in quiet_uT.T], axis=1)
+    mean_uT = sums_uT / np.maximum(n, 1)[:, None]
     if age == "each":
         noload_uT = (quiet_uT - mean_uT[quiet_i]) * (n / np.maximum(n - 1, 1))[quiet_i, None]
         kept, pressed, since_uT = n[quiet_i] > 1, np.ones(len(press_i), bool), mean_uT
@@ -323,7 +332,7 @@ def new_board(
     drawn = {
         board.skin: [
             draw_presses(board, split, max(section.presses_n), settings.seed, draw_i)
-            for split in splits_of(board)
+            for split in splits_of(board, max(section.presses_n))
             for draw_i in range(section.draws_n)
         ]
         for board in boards
@@ -337,7 +346,11 @@ def new_board(
             for others in [_others(board, boards)]
             for draw in drawn[board.skin]
         ]
-        rows = [row for task in tasks for row in task.result()]
+        rows = []
+        for i, task in enumerate(tasks, start=1):
+            rows += task.result()
+            if i % 10 == 0:
+                say(f"{settings.scene} new_board: {i} of {len(tasks)} draws scored")
     adapted, trainings = score_adapted(data, boards, drawn, models)
     policy = settings.shared_section(FaultPolicy, "faults")
     contact = score_contact(read_contact(captures, raw, policy))
@@ -377,11 +390,11 @@ def score_adapted(
     return rows, tally(map(collapse_record, trained))
 
 
-def _others(board: Board, boards: Sequence[Board]) -> Presses:
+def _others(board: Board, boards: Sequence[Board]) -> Samples:
     """Return the presses of the other boards, as changes of field."""
     parts = [(other.presses, other.presses.b_uT - other.noload_uT) for other in boards if other.board != board.board]
     places, forces = (np.concatenate([getattr(own, name) for own, _ in parts]) for name in ("place_mm", "force_N"))
-    return Presses(places, forces, np.concatenate([change_uT for _, change_uT in parts]))
+    return Samples(places, forces, np.concatenate([change_uT for _, change_uT in parts]))
 
 
 # --- Views of the scores ---
@@ -423,8 +436,8 @@ def _summary(rows: pd.DataFrame, values: pd.Series) -> dict[str, Any]:
 def figures(numbers: Sequence[Mapping[str, Any]], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Plot place and force against the number of labels, with one panel for each metric (split `checkerboard`)."""
     panels = {"accuracy_pct": "within 1 mm in x and y / %", "rms_f_N": "force error (rms) / N"}
-    most_n = max(row["pokes_n"] for row in numbers if "pokes_n" in row)
-    rows = [row for row in numbers if row["split"] == CHECKERBOARD and row["pokes_n"] == most_n]
+    rows = [row for row in numbers if row["split"] == CHECKERBOARD]
+    rows = [row for row in rows if row["pokes_n"] == max(other["pokes_n"] for other in rows)]
     with drawing(9.0, 3.6) as figure:
         for axes, (metric, title) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
             for i, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
@@ -435,6 +448,8 @@ def figures(numbers: Sequence[Mapping[str, Any]], drawn: Mapping[str, Any], sour
                 if points:
                     axes.plot(*zip(*sorted(points), strict=True), label=TITLES[method], **style)
             axes.set(xlabel="labels on the new board", ylabel=title)
-        figure.legend(loc="outside right center", frameon=False, fontsize=8)
+        figure.legend(
+            *figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=8
+        )
         figure.suptitle(f"Boards that were not in training ({source})", x=0.01, ha="left", fontsize=11)
         return {"new_board.svg": svg(figure)}

@@ -4,7 +4,7 @@ Each method is called with a `Case`, and returns a `Prediction`. Models are used
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ OWN_WEIGHT = 10.0
 
 
 @dataclass(frozen=True)
-class Presses:
+class Samples:
     """Presses or readings: places and forces in the coordinates of the labels, and fields along the chips' axes."""
 
     place_mm: Float[np.ndarray, "m 2"]
@@ -31,8 +31,8 @@ class Presses:
     def __len__(self) -> int:
         return len(self.force_N)
 
-    def __getitem__(self, chosen: Int64[np.ndarray, " k"]) -> "Presses":
-        return Presses(self.place_mm[chosen], self.force_N[chosen], self.b_uT[chosen])
+    def __getitem__(self, chosen: Int64[np.ndarray, " k"]) -> "Samples":
+        return Samples(self.place_mm[chosen], self.force_N[chosen], self.b_uT[chosen])
 
     @property
     def target(self) -> Float[np.ndarray, "m 3"]:
@@ -45,16 +45,17 @@ class Case:
     """What a method knows about a new board, and the readings that it must estimate.
 
     - noload_uT: no-load field; presses_uT: unlabelled presses; labels: labelled presses.
-    - even: whether the unlabelled presses are one press at each place. Otherwise, they are at random places.
+    - even: whether the unlabelled presses are one press at each place of a grid. Otherwise, they are at random places
+      all over the skin.
     - others: presses of the other boards, as changes of field.
     - tested_uT: the readings.
     """
 
     noload_uT: Float[np.ndarray, " ch"]
     presses_uT: Float[np.ndarray, "n ch"]
-    labels: Presses
+    labels: Samples
     even: bool
-    others: Presses
+    others: Samples
     tested_uT: Float[np.ndarray, "t ch"]
 
 
@@ -96,13 +97,12 @@ class InContext:
 
 @dataclass(frozen=True)
 class PaperNetwork:
-    """The paper's network, trained without this board: the mean of the networks of all seeds."""
+    """The paper's network, trained on other boards; it uses nothing of the new board but its no-load field."""
 
-    networks: Sequence[Network]
+    network: Network
 
     def __call__(self, case: Case) -> Prediction:
-        change_uT = (case.tested_uT - case.noload_uT).astype(np.float32)
-        return Prediction(np.mean([network(change_uT) for network in self.networks], axis=0, dtype=float))
+        return Prediction(self.network((case.tested_uT - case.noload_uT).astype(np.float32)).astype(float))
 
 
 @dataclass(frozen=True)
@@ -132,17 +132,17 @@ def gaussian_process(case: Case) -> Prediction:
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
     known, tested = (features(b_uT - case.noload_uT) for b_uT in (case.labels.b_uT, case.tested_uT))
-    means, sds = [], []
+    target, sd = np.full((2, len(tested), 3), np.nan)  # unknown forces are not estimated
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a hyperparameter at its bound
-        for target in (case.labels.place_mm, case.labels.force_N[:, None]):
-            kernel = ConstantKernel(1.0) * RBF(1.0) + WhiteKernel(0.1)
-            model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0).fit(known, target)
-            mean, sd = model.predict(tested, return_std=True)
-            means.append(mean.reshape(len(tested), -1))
-            sds.append(sd.reshape(len(tested), -1))
-    target, half = np.hstack(means), NORMAL_90 * np.hstack(sds)
-    return Prediction(target, target - half, target + half)
+        for columns in ([0, 1], [2]):
+            labels = case.labels.target[:, columns]
+            if not np.isnan(labels).any():
+                kernel = ConstantKernel(1.0) * RBF(1.0) + WhiteKernel(0.1)
+                model = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0).fit(known, labels)
+                found = model.predict(tested, return_std=True)
+                target[:, columns], sd[:, columns] = (part.reshape(len(tested), -1) for part in found)
+    return Prediction(target, target - NORMAL_90 * sd, target + NORMAL_90 * sd)
 
 
 def kernel_ridge(case: Case) -> Prediction:
@@ -155,10 +155,12 @@ def kernel_ridge(case: Case) -> Prediction:
     scaler = StandardScaler().fit(inputs)
     weight = np.repeat([1.0, OWN_WEIGHT], [len(case.others), len(own)])
     target = np.vstack([case.others.target, case.labels.target])
-    shift = target.mean(axis=0)
+    shift, columns = target.mean(axis=0), ~np.isnan(target).any(axis=0)
+    predicted = np.full((len(tested), 3), np.nan)
     model = KernelRidge(kernel="rbf", alpha=0.1, gamma=0.1)
-    model.fit(scaler.transform(inputs), target - shift, sample_weight=weight)
-    return Prediction(model.predict(scaler.transform(tested)) + shift)
+    model.fit(scaler.transform(inputs), (target - shift)[:, columns], sample_weight=weight)
+    predicted[:, columns] = model.predict(scaler.transform(tested)) + shift[columns]
+    return Prediction(predicted)
 
 
 def constant(case: Case) -> Prediction:
@@ -166,7 +168,7 @@ def constant(case: Case) -> Prediction:
     return Prediction(np.tile(case.labels.target.mean(axis=0), (len(case.tested_uT), 1)))
 
 
-def score_prediction(readings: Presses, prediction: Prediction) -> dict[str, float]:
+def score_prediction(readings: Samples, prediction: Prediction) -> dict[str, float]:
     """Score a prediction of readings; intervals are scored by the percentage of true values that they contain."""
     true, found = readings.target, prediction
     scores = score(true, found.target) | {"median_mm": median_error_mm(true[:, :2], found.target[:, :2])}

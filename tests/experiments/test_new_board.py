@@ -30,8 +30,8 @@ from pipeline.training.methods import (
     Case,
     InContext,
     Prediction,
-    Presses,
     Registered,
+    Samples,
     constant,
     gaussian_process,
     kernel_ridge,
@@ -57,7 +57,7 @@ def make_board(seed: int = 1) -> Board:
     )
     noload_uT = before_uT.mean(axis=0, dtype=float)
     presses, press_i = (
-        Presses(place_mm, force_N, noload_uT + pressed_uT - before_uT),
+        Samples(place_mm, force_N, noload_uT + pressed_uT - before_uT),
         np.repeat(np.arange(len(place_mm)), 2),
     )
     return Board(f"b{seed}", f"b{seed}_s0", noload_uT, presses, presses[press_i], press_i, press_i, MIDDLE_MM)
@@ -76,7 +76,7 @@ def test_tested_presses_are_used_for_nothing_else(split, draw_i):
     assert not {*draw.tested} & {*draw.unlabelled, *draw.labels, *draw.middle}
     off_mm = board.presses.place_mm - MIDDLE_MM
     if split == GRID:
-        assert len(np.unique(board.presses.place_mm[draw.unlabelled], axis=0)) == len(draw.unlabelled) == 65
+        assert len(np.unique(board.presses.place_mm[draw.unlabelled], axis=0)) == len(draw.unlabelled) == 12
         assert {*draw.labels} == {*draw.unlabelled}
     elif split == HALVES:
         axis = draw_i // 2 % 2
@@ -98,8 +98,8 @@ def test_board_with_too_few_presses_is_refused():
     small = replace(board, presses=board.presses[few])
     with pytest.raises(SchemaError, match="has only 4 presses"):
         draw_presses(small, CHECKERBOARD, 12, 0, 0)
-    assert splits_of(board) == [CHECKERBOARD, HALVES, GRID]
-    assert splits_of(replace(board, presses=board.presses[np.arange(0, 130, 2)])) == [CHECKERBOARD, HALVES]
+    assert splits_of(board, 65) == [CHECKERBOARD, HALVES, GRID]
+    assert splits_of(replace(board, presses=board.presses[np.arange(0, 130, 2)]), 65) == [CHECKERBOARD, HALVES]
 
 
 @FEW
@@ -148,7 +148,7 @@ def test_mirrored_labels_give_mirrored_estimates():
 def test_a_row_is_reproduced_by_the_public_interface_from_a_saved_draw():
     board = make_board()
     draw = draw_presses(board, CHECKERBOARD, 12, 0, 0)
-    rows = score_draw(board, draw, SECTION, {SHIPPED: InContext(FILE, False, MIDDLE_MM)}, board.presses)
+    rows = score_draw(board, draw, SECTION, {SHIPPED: [InContext(FILE, False, MIDDLE_MM)]}, board.presses)
     saved = tabulate_draws(board, [draw])
     part = {name: group.sort_values("order")["press"].to_numpy() for name, group in saved.groupby("part")}
     model = reskin.load_universal().zero(board.noload_uT).see(board.presses.b_uT[part["unlabelled"]], area=True)
@@ -162,7 +162,7 @@ def test_a_row_is_reproduced_by_the_public_interface_from_a_saved_draw():
 
 
 def test_coverage_is_the_percentage_of_true_values_inside_the_intervals():
-    readings = Presses(np.zeros((4, 2)), np.array([1.0, 2.0, 3.0, 4.0]), np.zeros((4, 15)))
+    readings = Samples(np.zeros((4, 2)), np.array([1.0, 2.0, 3.0, 4.0]), np.zeros((4, 15)))
     low = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 9]], float)
     scores = score_prediction(readings, Prediction(np.zeros((4, 3)), low, low + 2))
     assert (scores["coverage_pct"], scores["coverage_f_pct"]) == (100 * 6 / 8, 100 * 2 / 4)
