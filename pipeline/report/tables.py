@@ -644,6 +644,7 @@ def extremes_table(numbers: Numbers, source: str) -> pd.DataFrame:
     """List laws of physics and stiff, extreme and broken cases with the error, the allowed error and its reason."""
     lines = [
         {title: _with_unit(row[name], row["unit"]) for name, title in CASES.items()}
+        | ({"error": row["message"]} if row["message"] else {})
         | {"holds": "yes" if row["holds"] else "NO", "source": source}
         for row in numbers["cases"]
     ]
@@ -655,7 +656,7 @@ def accuracy_and_cost_table(numbers: Numbers, source: str) -> pd.DataFrame:
     timed = any("seconds" in row for row in numbers["rows"])
     lines = [
         {name: row[name] for name in ("study", "method", "setting")}
-        | {"error": "failed" if row["error"] is None else _with_unit(row["error"], row["unit"])}
+        | {"error": _with_unit(row["error"], row["unit"])}
         | ({"run time, s": f"{row['seconds']:.2g}" if "seconds" in row else "–"} if timed else {})
         | {"source": source}
         for row in numbers["rows"]
@@ -663,9 +664,9 @@ def accuracy_and_cost_table(numbers: Numbers, source: str) -> pd.DataFrame:
     return tabulate(lines)
 
 
-def _with_unit(value: str | float, unit: str) -> str:
-    if isinstance(value, str):
-        return value
+def _with_unit(value: str | float | None, unit: str) -> str:
+    if value is None or isinstance(value, str):
+        return value or "failed"
     return f"{value:.2g}" if unit == "1" else f"{value:.2g} {unit}"
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.experiments.extremes import serial
+from pipeline.experiments.extremes import chips
 from reskin.physics.board import Board
 from reskin.physics.chip import (
     CONVERSION_S,
@@ -24,7 +24,7 @@ from reskin.seeds import rng_for
 from tests.laws import LIMITS
 
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-QUIET = serial.quiet(7)
+QUIET = chips.quiet(7)
 LOUD = ChipDesign(gain_sel=7, noise_xy_uT=3.3, noise_z_uT=5.0, noise_temperature_degC=0.1)
 
 
@@ -40,10 +40,10 @@ def read(b_T, of=None, design=QUIET):
 
 @given(st.integers(0, 7), st.integers(0, 10**6))
 def test_step_and_range_of_readings_follow_the_data_sheet(gain_sel, seed):
-    sheet_uT = np.array(serial.SHEET_uT) * serial.SHEET_GAINS[gain_sel]
+    sheet_uT = np.array(chips.SHEET_uT) * chips.SHEET_GAINS[gain_sel]
     np.testing.assert_allclose(steps_uT(gain_sel), sheet_uT, rtol=LIMITS["steps"])
     share = rng_for(seed, "sensor").uniform(-0.99, 0.99, (200, 3))
-    assert serial.conversion((share * 2**15 * sheet_uT).clip(-49e3, 49e3), gain_sel) <= LIMITS["range"]
+    assert chips.conversion((share * 2**15 * sheet_uT).clip(-49e3, 49e3), gain_sel) <= LIMITS["range"]
 
 
 def test_readings_within_range_are_neither_wrapped_nor_clipped():
@@ -64,9 +64,9 @@ def test_readings_out_of_range_wrap_around_or_are_clipped(b_uT, wrapped_n, clipp
 
     In a field far above this range, the sensor itself saturates, and readings are clipped.
     """
-    _, overruns = serial.read_bare(np.array([b_uT]), serial.quiet(7), rng_for(0, "chip"))
+    _, overruns = chips.read_bare(np.array([b_uT]), chips.quiet(7), rng_for(0, "chip"))
     assert overruns == Overruns(clipped_n=clipped_n, wrapped_n=wrapped_n)
-    assert serial.conversion(np.array([b_uT]), 7) <= LIMITS["range"]
+    assert chips.conversion(np.array([b_uT]), 7) <= LIMITS["range"]
 
 
 def test_rotated_chip_reads_the_field_along_its_own_axes():
@@ -93,8 +93,8 @@ def test_chip_saturates_by_the_field_without_its_offset():
 
 
 def test_readings_have_the_given_noise_and_temperature_resolution():
-    assert serial.noise(LOUD, 0) <= LIMITS["noise"]
-    assert serial.temperature(0) <= LIMITS["temperature"]
+    assert chips.noise(LOUD, 0) <= LIMITS["noise"]
+    assert chips.temperature(0) <= LIMITS["temperature"]
     b_uT, _ = read(np.zeros((40_000, 3)), design=LOUD)
     # The tolerance is four standard errors of the mean, 5 uT / sqrt(n) each.
     np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)

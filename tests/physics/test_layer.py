@@ -18,7 +18,7 @@ from tests.laws import LIMITS
 PRESS = IndentedLayer(2e-3, 3e-3, "bonded")
 SKIN = asdict(PRESS)
 DEPTHS_M = np.arange(1, 7) * 0.2e-3
-waves_kh = st.floats(1e-3, 300)
+waves_kh = st.floats(0.01, 30)
 thicknesses_m = st.floats(1e-3, 5e-3)
 tips_m = st.floats(2e-3, 4e-3)
 
@@ -31,9 +31,10 @@ def field(r_m, z_m, depth_m=1.2e-3):
     return layer.displacement(np.array(r_m), np.array(z_m), layer.waves(PRESS.contact(depth_m), 2e-3, "bonded"))
 
 
+@settings(max_examples=20, deadline=None)
 @given(waves_kh)
-def test_compliance_equals_50_digit_arithmetic(kh):
-    assert laws.bonded_compliance(np.array([kh])) <= LIMITS["bonded_compliance"]
+def test_compliance_equals_a_50_digit_solution(kh):
+    assert laws.compliance(np.array([kh]), "bonded") <= LIMITS["compliance_bonded"]
 
 
 def test_compliance_has_the_limits_of_long_and_short_waves():
@@ -71,16 +72,6 @@ def test_base_does_not_move_and_surface_has_no_shear_stress():
     assert np.isfinite(top).all()
 
 
-@settings(max_examples=30)  # Hypothesis tries fewer examples than usual, because each example takes 50 ms.
-@given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
-def test_force_of_small_tips_equals_the_series_of_dimitriadis(thickness_m, tip_radius_m, relative_depth):
-    # The published series in chi = sqrt(R d) / h is wrong from its term in chi^2 on. The force is too low by 8 % at chi
-    # = 0.5, and by 16 % at chi = 1. The solution with pressure rings confirms this error.
-    depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
-    press = IndentedLayer(thickness_m, tip_radius_m, "bonded")
-    assert laws.dimitriadis(np.array([depth_m]), press) <= LIMITS["dimitriadis"]
-
-
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
 def test_forces_on_thick_and_thin_layers_equal_published_solutions(tip_m):
     press = IndentedLayer(2e-3, tip_m, "bonded")
@@ -112,8 +103,15 @@ def test_force_equals_that_of_a_solution_with_pressure_rings(base):
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
 def test_small_step_of_depth_conserves_volume_and_follows_the_tip(base, depth_m):
     press = IndentedLayer(2e-3, 3e-3, base)
-    assert laws.linear_step(press, depth_m) <= LIMITS["linear_step_bonded"]
-    assert laws.linear_surface(press, depth_m) <= LIMITS["linear_surface_bonded"]
+    contact = press.contact(depth_m)
+    waves = layer.waves(contact, 2e-3, base)
+    r_m, z_m = (of.ravel() for of in np.meshgrid(np.linspace(0.07e-3, 5e-3, 17), np.linspace(0.06e-3, 1.94e-3, 9)))
+    u = layer.displacement(r_m, z_m, waves)
+    np.testing.assert_allclose(u.r_r + u.hoop + u.z_z, 0, atol=1e-13)
+    top_m = 0.95 * contact.radius_m * np.linspace(0, 1, 30)
+    found_m = layer.displacement(top_m, np.full(30, 2e-3), waves).z_m
+    # Waves shorter than 1/6 of the thickness are omitted.
+    np.testing.assert_allclose(found_m, 3e-3 - np.sqrt(3e-3**2 - top_m**2) - depth_m, atol=0.01 * depth_m)
 
 
 def test_hoop_strain_is_continuous_at_the_axis():

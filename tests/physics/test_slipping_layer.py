@@ -18,13 +18,13 @@ waves_kh = st.floats(0.01, 30)
 @given(waves_kh, st.floats(0.05, 0.95))
 def test_profile_and_compliance_equal_a_50_digit_solution(kh, share):
     with mpmath.workdps(50):
-        w, z = laws.sliding_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
+        w, z = laws.profile(mpmath.mpf(kh), "slipping"), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
     # The tolerance is 1e-10: for long waves, the profile is a difference of numbers that are larger by the factor 1 /
     # (kh)^2, so digits are lost.
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
-    assert laws.sliding_compliance(np.array([kh])) <= LIMITS["sliding_compliance"]
+    assert laws.compliance(np.array([kh]), "slipping") <= LIMITS["compliance_slipping"]
 
 
 @given(st.floats(1e-3, 300))

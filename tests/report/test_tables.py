@@ -370,17 +370,18 @@ def test_table_compares_simulated_skins_with_recorded_ones():
 
 CASE = {
     "area": "chip", "case": "steps", "what": "field per count", "reference": "data sheet", "error": 3.33e-05,
-    "unit": "uT", "limit": 5e-5, "reason": "four decimals", "holds": True,
+    "message": "", "unit": "uT", "limit": 5e-5, "reason": "four decimals", "holds": True,
 }  # fmt: skip
 
 
 def test_table_of_extremes_has_errors_limits_and_failed_cases():
     cases = [CASE, CASE | {"unit": "1", "error": 1.5e-3, "holds": False}]
+    cases.append(CASE | {"error": None, "message": "ValueError: no chip", "holds": False})
     table = extremes_table({"cases": cases}, "simulated")
-    assert table["error"].tolist() == ["3.3e-05 uT", "0.0015"]
-    assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
-    assert table["holds"].tolist() == ["yes", "NO"]
-    assert table["source"].tolist() == ["simulated"] * 2
+    assert table["error"].tolist() == ["3.3e-05 uT", "0.0015", "ValueError: no chip"]
+    assert table["allowed"].tolist() == ["5e-05 uT", "5e-05", "5e-05 uT"]
+    assert table["holds"].tolist() == ["yes", "NO", "NO"]
+    assert table["source"].tolist() == ["simulated"] * 3
 
 
 def test_table_of_accuracy_has_run_times_only_if_they_were_measured():

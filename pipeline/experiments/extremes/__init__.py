@@ -7,7 +7,7 @@ of the project (tests/experiments/test_extremes.py) measure the same list.
 
 from pathlib import Path
 
-from pipeline.experiments.extremes import learning, physics, serial
+from pipeline.experiments.extremes import chips, learning, physics, serial
 from pipeline.experiments.extremes.cases import Case, World
 from pipeline.experiments.results import write_results
 from pipeline.settings import Settings
@@ -15,7 +15,7 @@ from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from reskin.config import Strict
 
-CASES: tuple[Case, ...] = (*physics.CASES, *serial.CASES, *learning.CASES)
+CASES: tuple[Case, ...] = (*physics.CASES, *chips.CASES, *serial.CASES, *learning.CASES)
 
 
 class Extremes(Strict):
@@ -31,6 +31,6 @@ def extremes(settings: Settings, section: Extremes, results: Path) -> None:
     write_results(results, {"cases": rows}, {})
     for row in rows:
         if not row["holds"]:
-            error = f"error {row['error']:.3g}, limit {row['limit']:.3g}"
-            say(f"warning: {settings.scene}: {row['case']} ({row['what']}): {error}")
+            found = row["message"] or f"error {row['error']:.3g}, limit {row['limit']:.3g}"
+            say(f"warning: {settings.scene}: {row['case']} ({row['what']}): {found}")
     say(f"{settings.scene}: {sum(bool(row['holds']) for row in rows)} of {len(rows)} cases hold")

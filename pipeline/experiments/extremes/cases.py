@@ -31,7 +31,7 @@ class World:
         return self.simulation.skin
 
     @property
-    def press(self) -> IndentedLayer:
+    def indented(self) -> IndentedLayer:
         """The layer and the tip of the scene."""
         return IndentedLayer(self.design.thickness_mm * milli, self.design.tip_radius_mm * milli, self.design.base)
 
@@ -53,12 +53,11 @@ class World:
     def skin(self) -> Skin:
         return self.draw()
 
-    @cached_property
-    def held_skin(self) -> Skin:
-        """The skin, or if it does not slide on its base, a skin with the nominal base."""
-        if self.design.hold is not None:
-            return self.skin
-        return self.draw(base="slipping", hold=HoldDesign.model_validate(nominal("skin")["hold"]))
+    def draw_held(self, **changes: object) -> Skin:
+        """Return the skin with some properties changed; if it does not slide on its base, with the nominal base."""
+        if self.design.hold is None:
+            changes |= {"base": "slipping", "hold": HoldDesign.model_validate(nominal("skin")["hold"])}
+        return self.draw(**changes)
 
 
 @dataclass(frozen=True)
@@ -85,10 +84,20 @@ class Case:
     full: bool = False
 
     def row(self, world: World) -> dict[str, object]:
-        """Measure the error; it does not hold if it is NaN."""
-        error = float(self.measure(world))
+        """Measure the error. If this raises an exception, or the error is not finite, `message` says so."""
+        try:
+            error = float(self.measure(world))
+            message = "" if np.isfinite(error) else f"error is {error}"
+        except Exception as raised:  # The other cases must still be measured.
+            error, message = np.nan, f"{type(raised).__name__}: {raised}"
         described = {name: getattr(self, name) for name in ("area", "what", "reference", "unit", "limit", "reason")}
-        return {"case": self.name, "error": error, "holds": bool(error <= self.limit)} | described
+        outcome = {"error": None if message else error, "message": message, "holds": bool(error <= self.limit)}
+        return {"case": self.name} | outcome | described
+
+
+def largest(*errors: float) -> float:
+    """Return the largest error, or NaN if any error is NaN, which Python's `max` can drop."""
+    return float(np.max(errors))
 
 
 def max_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"] | float) -> float:

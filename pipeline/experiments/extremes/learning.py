@@ -7,7 +7,7 @@ from functools import cache, partial
 import numpy as np
 from jaxtyping import Float32
 
-from pipeline.experiments.extremes.cases import Case, World
+from pipeline.experiments.extremes.cases import Case, World, largest
 from reskin.metrics import METRICS, score
 from reskin.models.job import FineTuning, Pretrained, TrainingData, TrainingJob, TrainingResult, curve_steps
 from reskin.models.recipe import FineTuningRecipe, Recipe
@@ -71,7 +71,7 @@ def label_scale(world: World, power: int) -> float:
     true = rows.target[job.test]
     (usual,), (scaled,) = (train([job], replace(rows, target=_times(rows.target, 2.0**p))) for p in (0, power))
     first, other = score(true, usual.predicted), score(true, _times(scaled.predicted, 2.0**-power))
-    return max(abs(other[name] / first[name] - 1) for name in METRICS)
+    return largest(*(abs(other[name] / first[name] - 1) for name in METRICS))
 
 
 def identical_readings(world: World) -> float:
@@ -120,7 +120,7 @@ def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarr
 
 
 def _distance(weights: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> float:
-    return max(float(np.abs(others[name] - weights[name]).max()) for name in others)
+    return largest(*(float(np.abs(others[name] - weights[name]).max()) for name in others))
 
 
 def _is_sound(trained: TrainingResult) -> bool:
@@ -135,7 +135,7 @@ CASES: tuple[Case, ...] = (
     *(_case(f"label_scale_{power}", f"scores with labels multiplied by 2^{power}",
             "the same scores after scaling back", partial(label_scale, power=power), 0.0,
             "Powers of two cause no rounding errors.", full=True)
-      for power in (-20, -10, 10, 20)),
+      for power in (-20, 20)),
     _case("identical_readings", "weights after training with a triplet weight of 1000 on identical readings",
           "weights without triplet loss: its gradient is 0", identical_readings, 0.0, "Exact.", full=True),
     _case("exploding", "kept weights after a divergence (bottleneck times 1e3, learning rate 1e10)",

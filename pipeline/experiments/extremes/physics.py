@@ -4,7 +4,6 @@ References are magpylib, closed forms, published fits, rings of pressure, centra
 steps, 50-digit arithmetic and symmetries. The functions compute errors, so that tests can call them with other inputs.
 """
 
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import lru_cache, partial
@@ -21,6 +20,7 @@ from scipy.special import j0, j1
 from pipeline.experiments.extremes.cases import (
     Case,
     World,
+    largest,
     max_error,
     norm_error,
     relative_error,
@@ -45,11 +45,11 @@ TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter t
 
 
 def box_places_m(seed: int, side_m: float) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "m 3"]]:
-    """Return random places outside a cube, from 0.6 to 50 sides from its centre, and places inside it."""
+    """Return random places outside a cube, from 0.9 to 50 sides from its centre, and places inside it."""
     rng = rng_for(seed, "extremes", "box")
     directions = rng.standard_normal((2000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    outside_m = side_m * directions * np.geomspace(0.6, 50, len(directions))[:, None]
+    outside_m = side_m * directions * np.geomspace(0.9, 50, len(directions))[:, None]
     return outside_m, side_m * rng.uniform(-0.49, 0.49, (500, 3))
 
 
@@ -112,16 +112,14 @@ def dipoles(seed: int) -> tuple[float, float]:
 # Forces of an elastic layer ---------------------------------------------------------------------------------------
 
 HALF_SPACE_M = 100.0  # under a tip of a few millimetres, a layer of this thickness behaves as if infinitely thick
-# Dimitriadis et al. (2002) multiply Hertz's force by this power series in chi = sqrt(R d) / h.
-BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)
 # Number of rings of pressure, and largest value of wave number * outer radius. Waves down to the width of a ring must
 # be kept, because the pressures would otherwise alternate from ring to ring.
 RINGS_N, KEPT_WAVES = 60, 400.0
 
 
-def force_N(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> Float[np.ndarray, " n"]:
+def force_N(depth_m: Float[np.ndarray, " n"], indented: IndentedLayer) -> Float[np.ndarray, " n"]:
     """Return the simulator's force in N for a Young's modulus of 1 Pa."""
-    return layer.force(depth_m, **asdict(press), modulus_Pa=1.0)
+    return layer.force(depth_m, **asdict(indented), modulus_Pa=1.0)
 
 
 def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray, " n"]:
@@ -129,29 +127,28 @@ def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray,
     return 16 / 9 * np.sqrt(tip_m) * depth_m**1.5
 
 
-def bonded_compliance(kh: Float[np.ndarray, " w"]) -> float:
-    """Return the error of the compliance of a bonded layer for waves of k * thickness, from 50-digit arithmetic."""
+def compliance(kh: Float[np.ndarray, " w"], base: layer.Base) -> float:
+    """Return the error of the compliance for waves of wave number * thickness, from the boundary conditions."""
     with mpmath.workdps(50):
-        values = map(mpmath.mpf, kh.tolist())
-        truth = [float((mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1)) for a in values]
-    return relative_error(layer.bonded_compliance(kh), np.array(truth))
+        truth = [float(profile(mpmath.mpf(a), base)(mpmath.mpf(a))) for a in kh.tolist()]
+    return relative_error(simulated_compliance(kh, base), np.array(truth))
 
 
-def sliding_compliance(kh: Float[np.ndarray, " w"]) -> float:
-    """Return the error of the compliance of a sliding layer, from the boundary conditions with 50 digits."""
-    with mpmath.workdps(50):
-        truth = [float(sliding_profile(mpmath.mpf(a))(mpmath.mpf(a))) for a in kh.tolist()]
-    return relative_error(layer.slipping_compliance(kh), np.array(truth))
+def simulated_compliance(kh: Float[np.ndarray, "*any"], base: layer.Base) -> Float[np.ndarray, "*any"]:
+    return layer.bonded_compliance(kh) if base == "bonded" else layer.slipping_compliance(kh)
 
 
-def sliding_profile(kh: Any) -> Callable[[Any], Any]:
-    """Return W(z), the vertical displacement in a layer on a sliding base under a wave of pressure of amplitude 2 G k.
+def profile(kh: Any, base: layer.Base) -> Callable[[Any], Any]:
+    """Return W(z), the vertical displacement in a layer under a wave of pressure of amplitude 2 G k.
 
     k is the wave number and G the shear modulus; the height z is in units of 1 / k. W satisfies four conditions:
-    W'' + W = 0 on both faces, W = 0 on the base, and 3 W' - W''' = 2 on the surface.
+    W'' + W = 0 and 3 W' - W''' = 2 on the surface; W = 0 on the base, and also W' = 0 if it is bonded, or W'' + W = 0
+    if the layer slips on it.
     """
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
-    conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
+    no_shear = {2: 1, 0: 1}
+    held = {1: 1} if base == "bonded" else no_shear
+    conditions = (({0: 1}, 0), (held, 0), (no_shear, kh), ({1: 1.5, 3: -0.5}, kh))
     rows = [
         [sum(c * mpmath.diff(w, z, n) for n, c in derivatives.items()) for w in basis] for derivatives, z in conditions
     ]
@@ -174,51 +171,40 @@ def sneddon(tip_m: float, base: layer.Base) -> float:
     ]
     found_N = np.array([4 * np.pi / 3 * contact.weights_m2.sum() for contact in contacts])
     depth_m = np.array([contact.depth_m for contact in contacts])
-    return max(relative_error(found_N, truth_N), relative_error(depth_m, radii_m * log / 2))
+    return largest(relative_error(found_N, truth_N), relative_error(depth_m, radii_m * log / 2))
 
 
-def dimitriadis(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> float:
-    chi = np.sqrt(press.tip_radius_m * depth_m) / press.thickness_m
-    truth_N = hertz_N(depth_m, press.tip_radius_m) * np.polynomial.polynomial.polyval(chi, BONDED)
-    return relative_error(force_N(depth_m, press), truth_N)
-
-
-def long_2011(depth_m: Float[np.ndarray, " n"], press: IndentedLayer) -> float:
-    h_m, tip_m = press.thickness_m, press.tip_radius_m
+def long_2011(depth_m: Float[np.ndarray, " n"], indented: IndentedLayer) -> float:
+    h_m, tip_m = indented.thickness_m, indented.tip_radius_m
     omega, flat = (tip_m * depth_m / h_m**2) ** 1.5, h_m / tip_m
     alpha, beta = 10.05 - 0.63 * np.sqrt(flat) * (3.1 + flat**2), 4.8 - 4.23 * flat**2
     psi = (1 + 2.3 * omega) / (1 + 1.15 * np.cbrt(omega) + alpha * omega + beta * omega**2)
-    return relative_error(force_N(depth_m, press), hertz_N(depth_m, tip_m) / psi)
+    return relative_error(force_N(depth_m, indented), hertz_N(depth_m, tip_m) / psi)
 
 
-def rings(depth_m: float, press: IndentedLayer) -> float:
-    edges_m, pressure = ring_pressures(depth_m, press)
+def rings(depth_m: float, indented: IndentedLayer) -> float:
+    edges_m, pressure = ring_pressures(depth_m, indented)
     truth_N = float((pressure * np.pi * np.diff(edges_m**2)).sum())
-    return abs(float(force_N(np.array([depth_m]), press)[0]) / truth_N - 1)
+    return abs(float(force_N(np.array([depth_m]), indented)[0]) / truth_N - 1)
 
 
-def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
+def ring_pressures(depth_m: float, indented: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
     """Return edges in m and uniform pressures in Pa of rings under a sphere pressed into a layer with E = 1 Pa.
 
     Under each ring, either the surface touches the sphere or the pressure is zero. The deflection by a ring is the
-    Hankel integral of the ring's pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number *
-    thickness, the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
-    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
+    Hankel integral of the ring's pressure times the layer's compliance (Johnson 1985, 5.8). The compliance is the
+    simulator's, so this is a reference for the contact only; the cases `compliance_*` verify the compliance.
     """
-    reach_m = 1.15 * press.contact(depth_m).radius_m
+    reach_m = 1.15 * indented.contact(depth_m).radius_m
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2
     x, w = np.polynomial.legendre.leggauss(16 * RINGS_N)
     k_per_m, weights = KEPT_WAVES / reach_m * (x + 1) / 2, KEPT_WAVES / reach_m * w / 2
-    twice = np.minimum(2 * k_per_m * press.thickness_m, 600.0)
-    if press.base == "slipping":
-        compliance = (np.cosh(twice) - 1) / (np.sinh(twice) + twice)
-    else:
-        compliance = (np.sinh(twice) - twice) / (np.cosh(twice) + twice**2 / 2 + 1)
+    relative = simulated_compliance(k_per_m * indented.thickness_m, indented.base)
     disc = edges_m * j1(np.outer(k_per_m, edges_m))
     ring = np.diff(disc, axis=1) / k_per_m[:, None]  # Hankel transform of a ring of unit pressure
-    sinks_m = (j0(np.outer(middles_m, k_per_m)) * (weights * compliance)) @ ring * 3 / 2  # 1 / (2 G) with G = E / 3
-    sphere_m = depth_m - press.tip_radius_m + np.sqrt(press.tip_radius_m**2 - middles_m**2)
+    sinks_m = (j0(np.outer(middles_m, k_per_m)) * (weights * relative)) @ ring * 3 / 2  # 1 / (2 G) with G = E / 3
+    sphere_m = depth_m - indented.tip_radius_m + np.sqrt(indented.tip_radius_m**2 - middles_m**2)
     touching = np.ones(RINGS_N, dtype=bool)
     while True:
         pressure_Pa = np.zeros(RINGS_N)
@@ -260,64 +246,45 @@ def inside_m(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], F
     return r_m.ravel(), z_m.ravel()
 
 
-def linear_step(press: IndentedLayer, depth_m: float) -> float:
-    """Return the error of the gradient of the displacement in one linear step, or its divergence if that is larger."""
-    waves = layer.waves(press.contact(depth_m), press.thickness_m, press.base)
-    r_m, z_m = inside_m(press.thickness_m, 17, 9)
-    u = layer.displacement(r_m, z_m, waves)
-    right, left = (layer.displacement(r_m + side * STEP_M, z_m, waves) for side in (1, -1))
-    above, below = (layer.displacement(r_m, z_m + side * STEP_M, waves) for side in (1, -1))
-    slopes = [right.r_m - left.r_m, right.z_m - left.z_m, above.r_m - below.r_m, above.z_m - below.z_m]
-    numeric = np.stack([*(slope / (2 * STEP_M) for slope in slopes), u.r_m / r_m])
-    divergence = max_error(numeric[0] + numeric[3] + numeric[4], 0.0)
-    return max(divergence, max_error(np.stack([u.r_r, u.z_r, u.r_z, u.z_z, u.hoop]), numeric))
-
-
-def linear_surface(press: IndentedLayer, depth_m: float) -> float:
-    """Return how far the surface under the tip is from a sphere after one linear step, relative to the depth."""
-    contact = press.contact(depth_m)
-    r_m = 0.95 * contact.radius_m * np.linspace(0, 1, 30)
-    waves = layer.waves(contact, press.thickness_m, press.base)
-    found_m = layer.displacement(r_m, np.full(30, press.thickness_m), waves).z_m
-    sphere_m = press.tip_radius_m - np.sqrt(press.tip_radius_m**2 - r_m**2) - depth_m
-    return max_error(found_m, sphere_m) / depth_m
-
-
 @lru_cache(maxsize=4)
-def finite_steps(press: IndentedLayer, depth_m: float) -> tuple[float, float]:
+def finite_steps(indented: IndentedLayer, depth_m: float) -> tuple[float, float]:
     """Return the errors of the volume, and of the deformation gradient, after a press in several steps."""
-    r_m, z_m = inside_m(press.thickness_m, 16, 9)
+    r_m, z_m = inside_m(indented.thickness_m, 16, 9)
     shifts = [(0.0, 0.0), (STEP_M, 0.0), (-STEP_M, 0.0), (0.0, STEP_M), (0.0, -STEP_M)]
     all_r_m, all_z_m = (np.concatenate([of + shift[axis] for shift in shifts]) for axis, of in enumerate((r_m, z_m)))
-    end = deformation.follow(all_r_m, all_z_m, descent(depth_m), press=press)[-1]
+    end = deformation.follow(all_r_m, all_z_m, descent(depth_m), press=indented)[-1]
     _, right, left, above, below = np.split(np.stack([end.r_m, end.z_m]), 5, axis=1)
     # Axes: displaced coordinate (r, z); initial coordinate of the derivative (r, z); place.
     numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)
     f, hoop = end.f[: len(r_m)], end.hoop[: len(r_m)]
-    gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[: len(r_m)] / r_m))
+    gradient = largest(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[: len(r_m)] / r_m))
     return max_error(np.linalg.det(f) * hoop, 1.0), gradient
 
 
-def surface(press: IndentedLayer, depth_m: float) -> float:
+def surface(indented: IndentedLayer, depth_m: float) -> float:
     """Return how far the surface misses the tip in the contact, or enters it beside the contact, over the depth."""
-    h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
-    end = deformation.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=press)[-1]
+    h_m, tip_m, radius_m = indented.thickness_m, indented.tip_radius_m, indented.contact(depth_m).radius_m
+    end = deformation.follow(radius_m * np.linspace(0, 1.4, 40), np.full(40, h_m), descent(depth_m), press=indented)[-1]
     above_m = end.z_m - (h_m - depth_m + tip_m - np.sqrt(tip_m**2 - np.minimum(end.r_m, tip_m) ** 2))
-    return max(max_error(above_m[end.r_m < 0.95 * radius_m], 0.0), float(above_m.max())) / depth_m
+    return largest(max_error(above_m[end.r_m < 0.95 * radius_m], 0.0), float(above_m.max())) / depth_m
 
 
-def far_field(press: IndentedLayer, depth_m: float) -> float:
-    """Return how unevenly r^2 grows far from the tip (r: distance from its axis); the layer is incompressible."""
-    h_m = press.thickness_m
-    r_m, z_m = (grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
-    grown_m2 = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1].r_m ** 2 - r_m**2
-    return scaled_error(grown_m2, np.full_like(grown_m2, grown_m2.mean()))
+def far_field(indented: IndentedLayer, depth_m: float) -> float:
+    """Return the error of the growth of r^2 far from the tip, where r is the distance from the tip's axis.
+
+    The layer is incompressible: pi * thickness * growth is the volume between the initial and the deformed surface.
+    """
+    h_m, top_n = indented.thickness_m, 400
+    far_m = [grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7))]
+    r_m = np.append(np.linspace(0, 4 * h_m, top_n), far_m[0])
+    end = deformation.follow(r_m, np.append(np.full(top_n, h_m), far_m[1]), descent(depth_m), press=indented)[-1]
+    dent_m3 = np.pi * np.trapezoid(h_m - end.z_m[:top_n], end.r_m[:top_n] ** 2)
+    return max_error((end.r_m**2 - r_m**2)[top_n:] * np.pi * h_m / dent_m3, 1.0)
 
 
 # Presses on a skin ------------------------------------------------------------------------------------------------
 
 PLACE_M = np.array([2.3, -1.1]) * milli  # no node of the skin is on the axis of a tip at this place
-BYTES_POKES_N = 500  # memory per poke is measured with this number of pokes, and with four times as many
 
 
 def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
@@ -328,8 +295,8 @@ def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
-    press = IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
-    end = deformation.follow(r_m, skin.nodes_m[:, 2], depths_m, press=press)[-1]
+    indented = IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
+    end = deformation.follow(r_m, skin.nodes_m[:, 2], depths_m, press=indented)[-1]
     outward = np.column_stack([away_m / r_m[:, None], np.zeros_like(r_m)])
     places_m = np.column_stack([place_m + end.r_m[:, None] * outward[:, :2], end.z_m])
     u, _, vt = np.linalg.svd(end.f)
@@ -368,7 +335,7 @@ def symmetries(
     poke_m = np.append(place_m, 0.3 * skin.thickness_m)
     shifted = replace(skin, nodes_m=skin.nodes_m + shift_m, seat_m=skin.seat_m + shift_m[:2])
     here_T = change(chips_m, skin, poke_m)
-    return max(
+    return largest(
         scaled_error(change(chips_m @ TURN.T, skin, poke_m @ TURN.T), sign * here_T @ TURN.T),
         scaled_error(change(chips_m @ mirror, skin, poke_m @ mirror), sign * here_T @ mirror),
         scaled_error(change(chips_m + shift_m, shifted, poke_m + shift_m), here_T),
@@ -377,7 +344,7 @@ def symmetries(
 
 def near(world: World, gap_mm: float) -> float:
     """Return the error of dB of dipoles in cells of half the gap, from a magnetised box, if a uniform skin slides."""
-    side_m, thickness_m, slid_m = 20 * milli, world.press.thickness_m, 0.1 * milli
+    side_m, thickness_m, slid_m = 20 * milli, world.indented.thickness_m, 0.1 * milli
     j_T = np.array([0.6, -0.3, 1.0]) * world.design.saturation_T
     solid = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
     chips_m = np.array([[0.3, -0.2, -gap_mm], [7.1, 0.4, -gap_mm], [9.4, 9.1, -gap_mm]]) * milli
@@ -403,39 +370,21 @@ def scaled(board: Board, skin: Skin, thickness_m: float) -> float:
     _, change_T = changes_of_field(board, skin, poke_m)
     _, other_T = changes_of_field(replace(board, chips_m=board.chips_m * scale), other, scale * poke_m)
     force = relative_error(forces(other, scale * poke_m[:, 2]), scale**2 * forces(skin, poke_m[:, 2]))
-    return max(norm_error(other_T, change_T), force)
-
-
-def memory_per_poke_n(board: Board, skin: Skin) -> float:
-    """Return the peak memory in bytes that each further poke needs."""
-    rng, pokes_n = rng_for(0, "extremes", "memory"), 4 * BYTES_POKES_N
-    pokes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (pokes_n, 2)), np.full(pokes_n, 0.3 * skin.thickness_m)])
-    changes_of_field(board, skin, pokes_m[:1])  # fills caches, whose memory must not be counted
-    few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (BYTES_POKES_N, pokes_n))
-    return round((many_n - few_n) / (3 * BYTES_POKES_N))  # rounded, because the total varies by a few bytes
-
-
-def peak_bytes(work: Callable[[], object]) -> int:
-    """Return the peak memory in bytes that Python and NumPy allocate while `work` is called."""
-    tracemalloc.start()
-    try:
-        work()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    return largest(norm_error(other_T, change_T), force)
 
 
 def no_stiffness(world: World) -> float:
-    """Return the force in N of a skin with E = 0, plus the difference in T of its dB from a skin that is not held."""
-    soft, poke_m = world.draw(modulus_kPa=0.0), np.array([[*PLACE_M, 0.3 * world.press.thickness_m]])
+    """Return the difference in T of dB of a skin with E = 0 from a skin that is not held; inf if its force is not 0."""
+    soft, poke_m = world.draw_held(modulus_kPa=0.0), np.array([[*PLACE_M, 0.3 * world.indented.thickness_m]])
     soft_T, free_T = (changes_of_field(world.board, skin, poke_m)[1] for skin in (soft, replace(soft, hold=None)))
-    return float(forces(soft, poke_m[:, 2])[0]) + max_error(soft_T, free_T)
+    return max_error(soft_T, free_T) if forces(soft, poke_m[:, 2])[0] == 0 else np.inf
 
 
 def rigid(world: World) -> float:
     """Return the error of dB of a skin with E = 1 GPa, whose tip cannot slip; inf if its force is not clipped."""
-    hard, poke_m = world.draw(modulus_kPa=1e6), np.array([[*PLACE_M, 0.3 * world.press.thickness_m]])
-    stuck = hard if hard.hold is None else replace(hard, hold=replace(hard.hold, friction=1e12))
+    hard, poke_m = world.draw_held(modulus_kPa=1e6), np.array([[*PLACE_M, 0.3 * world.indented.thickness_m]])
+    assert hard.hold is not None
+    stuck = replace(hard, hold=replace(hard.hold, friction=1e12))
     hard_T, stuck_T = (changes_of_field(world.board, skin, poke_m)[1] for skin in (hard, stuck))
     pushed_N = np.array([[0.0, 0.0, forces(hard, poke_m[:, 2])[0]]])
     read_N, clipped_n = read_force(pushed_N, noise_N=0.0, rng=rng_for(0, "extremes"))
@@ -448,7 +397,8 @@ def rigid(world: World) -> float:
 def lifted_drag(board: Board, skin: Skin) -> float:
     """Return the error of the tangential force, over its first limit, of a tip that is lifted after a drag.
 
-    The layer and the springs of the base are in series, and limit the force together with the smallest friction so far.
+    The layer and the springs of the base are springs in series: 1 / stiffness = 1 / layer + 1 / springs. The force is
+    this stiffness times the stretch. The stretch is at most the drag, and at most what friction allowed at each stop.
     """
     assert skin.hold is not None
     held_m, depth, errors = 0.1 * milli, 0.35, []  # the drag; its depth / thickness, the largest of any scene
@@ -458,13 +408,13 @@ def lifted_drag(board: Board, skin: Skin) -> float:
         path_m = np.column_stack([way_m, np.zeros_like(way_m), share * skin.thickness_m])
         path_m[:, :2] += skin.seat_m
         found = drag_tip(board, skin, path_m[None], tilt=np.zeros((1, 2)), friction=Friction(coefficient=1.0))
-        limit_N, press = forces(skin, path_m[:, 2]), IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
-        tables_m = [shear.at_depth(depth_m, **asdict(press)).stiffness_m for depth_m in path_m[1:-1, 2]]
+        limit_N, indented = forces(skin, path_m[:, 2]), IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
+        tables_m = [shear.at_depth(depth_m, **asdict(indented)).stiffness_m for depth_m in path_m[1:-1, 2]]
         layers_N_per_m = shear_moduli_Pa(skin, path_m[1:-1, 2]) * tables_m
         give_m_per_N = 1 / layers_N_per_m + 1 / skin.hold.springs_N_per_m
         reach_m = np.minimum.accumulate(np.minimum(held_m, limit_N[1:-1] * give_m_per_N))
         errors.append(max_error(found.force_N[0, 1:, 0], np.append(reach_m / give_m_per_N, 0.0)) / limit_N[0])
-    return max(errors)
+    return largest(*errors)
 
 
 # Relaxation -------------------------------------------------------------------------------------------------------
@@ -489,7 +439,7 @@ def relaxation_step(dt_s: float, prony: Prony) -> float:
 
 
 def stiff_relaxation(ratios: tuple[float, ...], steps: tuple[float, ...]) -> float:
-    return max(relaxation_step(1e-3 * dt, stiff(ratio)) for ratio, dt in product(ratios, steps))
+    return largest(*(relaxation_step(1e-3 * dt, stiff(ratio)) for ratio, dt in product(ratios, steps)))
 
 
 # The list ---------------------------------------------------------------------------------------------------------
@@ -499,21 +449,21 @@ DEPTH_SHARES = np.arange(1, 7) / 10  # depths / thickness; the published fits en
 
 
 def _with_base(world: World, base: layer.Base) -> IndentedLayer:
-    return replace(world.press, base=base)
+    return replace(world.indented, base=base)
 
 
 def _with_tip(base: layer.Base, size: float) -> float:
     """Return the error of the force of a tip whose radius is `size` times the thickness."""
-    press = IndentedLayer(2 * milli, 2 * milli * size, base)
-    return rings(0.4 * min(press.thickness_m, press.tip_radius_m), press)
+    indented = IndentedLayer(2 * milli, 2 * milli * size, base)
+    return rings(0.4 * min(indented.thickness_m, indented.tip_radius_m), indented)
 
 
 def _deep(world: World, base: layer.Base) -> tuple[IndentedLayer, float]:
-    return _with_base(world, base), DEEP * world.press.thickness_m
+    return _with_base(world, base), DEEP * world.indented.thickness_m
 
 
 def _fit_depths_m(world: World) -> Float[np.ndarray, " n"]:
-    return DEPTH_SHARES * world.press.thickness_m
+    return DEPTH_SHARES * world.indented.thickness_m
 
 
 def _rigid_rig(world: World) -> Skin:
@@ -532,15 +482,11 @@ def _deformation(base: layer.Base) -> tuple[Case, ...]:
     case, pressed = partial(_law, full=base == "bonded"), f"{base} layer pressed to {DEEP:g} of its thickness"
     differences = "The error of central differences is (step / length)^2, the length over which strains change."
     return (
-        case(f"linear_step_{base}", f"{base} layer, one linear step: gradient of the displacement, and its divergence",
-             "central differences with steps of 0.1 um, and 0", deep(linear_step), 1e-6, differences),
-        case(f"linear_surface_{base}", f"{base} layer, one linear step: surface under the tip", "a sphere",
-             deep(linear_surface), 0.01, "Waves shorter than 1/6 of the thickness are omitted.", unit="of the depth"),
         case(f"volume_{base}", f"{pressed} in steps: volume", "det F = 1 (deformation gradient F)",
-             deep(lambda *press: finite_steps(*press)[0]), 0.02,
+             deep(lambda *of: finite_steps(*of)[0]), 0.02,
              "The error is of second order in the steps, and largest at the edge of the contact."),
         case(f"gradient_{base}", f"{pressed} in steps: F", "central differences with steps of 0.1 um",
-             deep(lambda *press: finite_steps(*press)[1]), 1e-5, differences),
+             deep(lambda *of: finite_steps(*of)[1]), 1e-5, differences),
         case(f"surface_{base}", f"{pressed}: surface at the tip", "a sphere, which the surface does not enter",
              deep(surface), 0.02, "In each step, the pressure is a sum of only six basis pressures.",
              unit="of the depth"),
@@ -548,42 +494,37 @@ def _deformation(base: layer.Base) -> tuple[Case, ...]:
 
 
 CASES: tuple[Case, ...] = (
-    _law("box_outside", "field of a box, 0.6 to 50 sides from its centre", "magpylib Cuboid",
-         lambda w: box(box_places_m(w.seed, 0.5 * milli)[0]), 1e-8,
-         "The contributions of the box's corners almost cancel at a distance r, because the field decreases as "
-         "(side / r)^3. This increases relative rounding errors 1e5-fold up to 50 sides."),
+    _law("box_outside", "field of a box, 0.9 to 50 sides from its centre", "magpylib Cuboid",
+         lambda w: box(box_places_m(w.seed, 0.5 * milli)[0]), 2e-9,
+         "The terms of the eight corners are about 1 and sum to 8e-6 at 50 sides. Each of both programs makes rounding "
+         "errors of a few 1e-15 in this sum."),
     _law("box_inside", "field inside a box", "magpylib Cuboid",
-         lambda w: box(box_places_m(w.seed, 0.5 * milli)[1]), 1e-11,
-         "Near an edge, logarithms almost cancel, which increases rounding errors 2e4-fold."),
+         lambda w: box(box_places_m(w.seed, 0.5 * milli)[1]), 1e-12,
+         "In magpylib's logarithms near an edge, almost equal numbers are subtracted: rounding errors grow 2e4-fold."),
     _law("array", "field of the magnets that magnetise the skin", "32 magpylib Cuboids",
-         lambda w: array(place_nodes(w.press.thickness_m, Quadrature(1.5e-3, 3)).nodes_m, w.press.thickness_m,
+         lambda w: array(place_nodes(w.indented.thickness_m, Quadrature(1.5e-3, 3)).nodes_m, w.indented.thickness_m,
                          w.design.polarity), 1e-12,
          "Rounding errors are increased where cubes meet, because their contributions almost cancel there."),
     _law("maxwell", "div B = 0 and curl B = 0 in the skin", "central differences",
-         lambda w: maxwell(w.press.thickness_m, w.design.polarity, w.seed), 1e-4,
+         lambda w: maxwell(w.indented.thickness_m, w.design.polarity, w.seed), 1e-4,
          "Central differences have a relative error of (step / distance to a magnet)^2, at most (1/250)^2."),
     _law("dipoles", "field of dipoles", "magpylib Dipole", lambda w: dipoles(w.seed)[0], 1e-8, MU_0),
     _law("dipoles_moved", "change of the field if dipoles move and turn", "magpylib Dipole, field after minus before",
          lambda w: dipoles(w.seed)[1], 1e-7, f"{MU_0} The change is a tenth of the fields."),
-    _law("bonded_compliance", "bonded layer: compliance for wave number * thickness from 1e-3 to 300",
-         "the same formula with 50 digits (mpmath)", lambda _: bonded_compliance(np.geomspace(1e-3, 300, 60)), 3e-12,
-         "Just above 1/4, almost equal numbers are subtracted, so that 3 of 16 digits are lost."),
-    _law("sliding_compliance", "sliding layer: compliance for wave number * thickness from 0.01 to 30",
-         "the four boundary conditions with 50 digits (mpmath)",
-         lambda _: sliding_compliance(np.geomspace(0.01, 30, 12)), 1e-12,
-         "For long waves, almost equal numbers are subtracted."),
+    *(_law(f"compliance_{base}", f"{base} layer: compliance for wave number * thickness from 0.01 to 30",
+           "the four boundary conditions with 50 digits (mpmath)",
+           partial(lambda base, _: compliance(np.geomspace(0.01, 30, 12), base), base), limit,
+           reason)
+      for base, limit, reason in (
+          ("bonded", 3e-12, "Just above 1/4, almost equal numbers are subtracted, so that 3 of 16 digits are lost."),
+          ("slipping", 1e-12, "For long waves, almost equal numbers are subtracted."))),
     *(_law(f"hertz_{base}", f"force of a thick {base} layer at depths up to 1e-5 of the tip radius",
-           "16/9 E sqrt(R) d^1.5 (Hertz 1882)", partial(lambda base, w: hertz(w.press.tip_radius_m, base), base), 1e-4,
-           "Hertz takes the sphere as a paraboloid (d / R = 1e-5); the force is interpolated by a spline.")
+           "16/9 E sqrt(R) d^1.5 (Hertz 1882)", partial(lambda base, w: hertz(w.indented.tip_radius_m, base), base),
+           1e-4, "Hertz takes the sphere as a paraboloid (d / R = 1e-5); the force is interpolated by a spline.")
       for base in BASES),
     _law("sneddon", "force and depth of a sphere in a thick layer, contact radius up to 0.7 of the tip radius",
-         "Sneddon 1965", lambda w: sneddon(w.press.tip_radius_m, "bonded"), 1e-4,
+         "Sneddon 1965", lambda w: sneddon(w.indented.tip_radius_m, "bonded"), 1e-4,
          "The finite thickness h changes the result by contact radius / h, which is below 2e-5."),
-    _law("dimitriadis", "force of a bonded layer, depths up to 0.6 of the thickness", "Dimitriadis et al. 2002",
-         lambda w: dimitriadis(np.minimum(_fit_depths_m(w), 0.25 * w.press.thickness_m**2 / w.press.tip_radius_m),
-                               _with_base(w, "bonded")), 0.10,
-         "Terms of the published series from chi^2 on are too small: by 8 % at chi = sqrt(R d) / h = 0.5, as rings of "
-         "pressure confirm. Depths are therefore limited to chi = 0.5."),
     _law("long_2011", "force of a bonded layer, depths up to 0.6 of the thickness", "Long et al. 2011",
          lambda w: long_2011(_fit_depths_m(w), _with_base(w, "bonded")), 0.05,
          "The reference is a fit to finite-element simulations of large deformations."),
@@ -593,16 +534,17 @@ CASES: tuple[Case, ...] = (
            full=(base, size) != ("slipping", 1.0))
       for base, size in product(BASES, (0.1, 1.0, 10.0))),
     _law("sticking", "tangential stiffness of a thick layer under a tip that sticks",
-         "16/3 * shear modulus * contact radius (Mindlin 1949)", lambda w: sticking(0.1 * w.press.tip_radius_m), 1e-3,
-         "The integral over the contact is computed as a sum."),
+         "16/3 * shear modulus * contact radius (Mindlin 1949)", lambda w: sticking(0.1 * w.indented.tip_radius_m),
+         1e-3, "The integral over the contact is computed as a sum."),
     _law("sliding", "tangential stiffness of a thick layer under a tip that slides",
          "40/9 * shear modulus * contact radius (Cerruti, Hertz's pressure)",
-         lambda w: sliding(0.1 * w.press.tip_radius_m, w.press.tip_radius_m, w.press.base), 2e-3,
+         lambda w: sliding(0.1 * w.indented.tip_radius_m, w.indented.tip_radius_m, w.indented.base), 2e-3,
          "Hertz takes the sphere as a paraboloid, which changes the pressure a little."),
     *_deformation("slipping"), *_deformation("bonded"),
-    _law("far_field", "sliding layer, far from the tip: growth of the squared distance r^2",
-         "the same growth at all heights and distances", lambda w: far_field(*_deep(w, "slipping")), 0.03,
-         "Waves that decay as exp(-pi r / h) disturb this rule near the contact."),
+    _law("far_field", "slipping layer, far from the tip: growth of the squared distance r^2",
+         "volume of the dent / (pi * thickness), at all heights and distances",
+         lambda w: far_field(*_deep(w, "slipping")), 0.01,
+         "The volume is not conserved exactly near the edge of the contact, as in case volume_slipping."),
     *(_law(f"depth_{share:g}", f"dB of a press to {share:g} of the thickness",
            "dB in finer steps, without tables, rotations by SVD",
            partial(lambda share, w: in_fine_steps(w.board, w.skin, share, round(40 * share)), share), 0.02,
@@ -620,15 +562,13 @@ CASES: tuple[Case, ...] = (
            partial(lambda size_mm, w: scaled(w.board, w.skin, size_mm * milli), size_mm), 1e-6,
            "The contact radius is the result of a root search.")
       for size_mm in (0.2, 20.0)),
-    _law("memory", "memory of a press", "bytes per further press", lambda w: memory_per_poke_n(w.board, w.skin), 1000.0,
-         "1 GB for a million presses; the results alone need 120 bytes each.", unit="bytes", full=True),
     _law("no_stiffness", "force and dB of a skin with E = 0", "no force, dB only from the layer's deformation",
-         no_stiffness, 0.0, "Exact.", unit="N + T"),
+         no_stiffness, 0.0, "Exact.", unit="T"),
     _law("rigid", "dB of a skin with E = 1 GPa, whose force is clipped to the sensor's range",
          "dB as if the tip cannot slip", rigid, 0.0, "Exact.", unit="T"),
     _law("lifted_drag", "tangential force of a tip that drags the skin and is lifted in 3 and in 12 stops",
          "limited by the springs and by the smallest friction limit so far; 0 at the end",
-         lambda w: lifted_drag(w.board, w.held_skin), 1e-9, ROUNDING),
+         lambda w: lifted_drag(w.board, w.draw_held()), 1e-9, ROUNDING),
     _law("stiff_relaxation", "one time step of the relaxation, tau_max / tau_min 1e8, dt / tau_min 1e-16 to 1e8",
          "the same formula with 50 digits (mpmath)",
          lambda _: stiff_relaxation((1e3, 1e8), (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)), 1e-14,
