@@ -101,7 +101,6 @@ FAULTS = {
     "compliance_slipping": (layer, "slipping_compliance", lambda original: lambda kh: original(1.5 * kh)),
     "sneddon": (layer, "contact_of_radius", unknown_depth),  # The first of its two errors is not NaN.
     "rings_slipping_1": (layer, "_kernel", lambda original: lambda *args: 1.1 * original(*args)),
-    "volume_slipping": (deformation, "displacement", stretched),
     "far_field": (deformation, "displacement", stretched),
     "depth_0.72": (deformation, "move_dipoles", without_rotation),
     "thickness_20mm": (slide, "stiffening", lambda _: lambda depth_m, thickness_m: 1 + np.maximum(depth_m, 0) / 1e-3),

@@ -57,7 +57,7 @@ class World:
         """Return the skin with some properties changed; if it does not slide on its base, with the nominal base."""
         if self.design.hold is None:
             changes |= {"base": "slipping", "hold": HoldDesign.model_validate(nominal("skin")["hold"])}
-        return self.draw(**changes)
+        return self.draw(COARSE, **changes)
 
 
 @dataclass(frozen=True)
