@@ -130,3 +130,11 @@ def test_noise_that_differs_from_recorded_noise_is_reported():
     simulation = WORLD.simulation
     quiet = simulation.model_copy(update={"chip": simulation.chip.model_copy(update={"noise_xy_uT": 1.0})})
     assert not BY_NAME["recorded_noise"].row(World(quiet, 2021))["holds"]
+
+
+@pytest.mark.parametrize("name", ["no_stiffness", "rigid", "lifted_drag"])
+def test_cases_of_a_held_skin_are_measured_in_a_scene_whose_skin_is_bonded(name):
+    skin = WORLD.simulation.skin.model_copy(update={"hold": None, "base": "bonded"})
+    bonded = World(WORLD.simulation.model_copy(update={"skin": skin}), 2021)
+    assert bonded.draw_held().hold is not None
+    assert BY_NAME[name].measure(bonded) <= BY_NAME[name].limit

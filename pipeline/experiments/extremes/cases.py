@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
 
+from reskin.config import parse
 from reskin.physics.board import Board, Spreads, draw_board
 from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Quadrature
@@ -56,7 +57,7 @@ class World:
     def draw_held(self, **changes: object) -> Skin:
         """Return the skin with some properties changed; if it does not slide on its base, with the nominal base."""
         if self.design.hold is None:
-            changes |= {"base": "slipping", "hold": HoldDesign.model_validate(nominal("skin")["hold"])}
+            changes |= {"base": "slipping", "hold": parse(HoldDesign, nominal("skin")["hold"], "hold")}
         return self.draw(COARSE, **changes)
 
 
