@@ -65,6 +65,7 @@ SPACING_MM = 2.0  # the squares of the checkerboard, and the width of the strip 
 MIDDLE_MM = 1.0  # a press in the middle of the skin has |x| and |y| below this, relative to the middle
 PLACE_MM = 0.1  # presses closer than this are at the same place
 KNOWN_N = 5  # presses at known places for the rigid registration, as in the published procedure (MagTouch-RA)
+READINGS_N = 5  # at most so many readings of each press are tested, evenly spaced; the paper has 5 readings a press
 SHIPPED = "shipped"
 NETWORKS = {"multi": ("train_multi", "lobo"), "triplet": ("train_triplet", "triplet")}  # stage and experiment
 AGES = ("each", "previous", "initial")  # the no-load reading: before each press, before the press before, at the start
@@ -93,7 +94,8 @@ class Board:
     """The presses of one skin on a board, with their no-load drift removed.
 
     - presses: one row per press, averaged over its readings. Its number is its rank by capture and indentation.
-    - readings, press_i: all readings, and the number of the press of each; rows: their row numbers in the scene's data.
+    - readings, press_i: the readings that may be tested, and the number of the press of each.
+    - rows, row_press_i: the row numbers of all readings in the scene's data, and the number of the press of each.
     - noload_uT: mean no-load field. It has been added to the change of field of each reading since the no-load reading
       before the same press, so that one no-load reading serves all presses.
     - middle_mm: the middle of the skin in the coordinates of the labels.
@@ -105,12 +107,17 @@ class Board:
     presses: Samples
     readings: Samples
     press_i: Int64[np.ndarray, " f"]
-    rows: Int64[np.ndarray, " f"]
+    rows: Int64[np.ndarray, " r"]
+    row_press_i: Int64[np.ndarray, " r"]
     middle_mm: tuple[float, float]
 
-    def of_presses(self, presses: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " r"]:
-        """Return the numbers of the readings of these presses."""
-        return np.flatnonzero(np.isin(self.press_i, presses))
+    def readings_of(self, presses: Int64[np.ndarray, " k"]) -> Samples:
+        """Return the tested readings of these presses."""
+        return self.readings[np.flatnonzero(np.isin(self.press_i, presses))]
+
+    def rows_of(self, presses: Int64[np.ndarray, " k"]) -> Int64[np.ndarray, " q"]:
+        """Return the row numbers of all readings of these presses in the scene's data."""
+        return self.rows[np.isin(self.row_press_i, presses)]
 
     def part(self, split: str, draw_i: int) -> Int64[np.ndarray, " m"]:
         """Return 1 for presses that may be labels, -1 for tests, and 0 for neither; draws exchange the parts."""
@@ -146,9 +153,18 @@ def read_boards(data: SceneData, captures: Sequence[Any], middle_mm: tuple[float
         _, press_i = np.unique(rows.indentation[own], return_inverse=True)
         means = pd.DataFrame(np.column_stack([target, readings.b_uT])).groupby(press_i).mean().to_numpy()
         presses = Samples(means[:, :2], means[:, 2], means[:, 3:])
-        board = str(rows.board[own[0]])
-        boards.append(Board(board, str(skin), noload_uT, presses, readings, press_i, own, middle_mm))
+        board, kept = str(rows.board[own[0]]), spaced(press_i, READINGS_N)
+        tested = readings[kept], press_i[kept]
+        boards.append(Board(board, str(skin), noload_uT, presses, *tested, own, press_i, middle_mm))
     return boards
+
+
+def spaced(press_i: Int64[np.ndarray, " f"], most_n: int) -> Int64[np.ndarray, " k"]:
+    """Return the numbers of at most `most_n` evenly spaced readings of each press."""
+    parts = [np.flatnonzero(press_i == press) for press in np.unique(press_i)]
+    return np.concatenate(
+        [part[np.linspace(0, len(part) - 1, min(most_n, len(part))).round().astype(int)] for part in parts]
+    )
 
 
 def draw_presses(board: Board, split: str, presses_n: int, seed: int, draw_i: int) -> Draw:
@@ -208,7 +224,7 @@ def methods_of(board: Board, section: NewBoard, compare: Compare, models: Path, 
 
 def score_draw(board: Board, draw: Draw, section: NewBoard, methods: Methods, others: Samples) -> list[dict[str, Any]]:
     """Score every method on one draw, for each number of unlabelled presses and of labels."""
-    readings = board.readings[board.of_presses(draw.tested)]
+    readings = board.readings_of(draw.tested)
     even = draw.split == GRID and len(draw.unlabelled) == count_places(board.presses)
     keys, rows = _keys(board, draw, len(readings)), []
     for name, versions in methods.items():
@@ -376,15 +392,16 @@ def score_adapted(
         fold = folds[board.board]
         start = select_pretrained(pretrained, recipe.base, fold)[0]
         for draw in drawn[board.skin]:
-            unlabelled, tested = (board.rows[board.of_presses(press)] for press in (draw.unlabelled, draw.tested))
+            unlabelled, tested = board.rows_of(draw.unlabelled), board.rows_of(draw.tested)
             tuning, what = Adaptation(start, recipe, grid_lines(data.rows, unlabelled)), f"{draw.split}{draw.draw_i}"
             names, seeds = ("new_board", HEADLINE, base, fold.name), (data.settings.seed, 0)
             jobs.append(TrainingJob(*names, *seeds, fold.train, tested, tuning, board.skin, what))
             pairs.append((board, draw))
     trained, rows = train_jobs(data, jobs, "new_board"), []
     for (board, draw), result in zip(pairs, trained, strict=True):
-        readings = board.readings[board.of_presses(draw.tested)]
-        scores = score_prediction(readings, Prediction(result.predicted.astype(float)))
+        kept = spaced(board.row_press_i[np.isin(board.row_press_i, draw.tested)], READINGS_N)
+        readings = board.readings_of(draw.tested)
+        scores = score_prediction(readings, Prediction(result.predicted[kept].astype(float)))
         keys = _keys(board, draw, len(readings)) | {"method": "adapted", "pokes_n": len(draw.unlabelled)}
         rows.append(keys | {"labels_n": 0} | scores)
     return rows, tally(map(collapse_record, trained))

@@ -21,6 +21,7 @@ from pipeline.experiments.new_board import (
     draw_presses,
     score_contact,
     score_draw,
+    spaced,
     splits_of,
     summarise,
     tabulate_draws,
@@ -60,7 +61,7 @@ def make_board(seed: int = 1) -> Board:
         Samples(place_mm, force_N, noload_uT + pressed_uT - before_uT),
         np.repeat(np.arange(len(place_mm)), 2),
     )
-    return Board(f"b{seed}", f"b{seed}_s0", noload_uT, presses, presses[press_i], press_i, press_i, MIDDLE_MM)
+    return Board(f"b{seed}", f"b{seed}_s0", noload_uT, presses, presses[press_i], press_i, press_i, press_i, MIDDLE_MM)
 
 
 def case_of(board: Board, labels: np.ndarray, tested: np.ndarray) -> Case:
@@ -154,11 +155,16 @@ def test_a_row_is_reproduced_by_the_public_interface_from_a_saved_draw():
     model = reskin.load_universal().zero(board.noload_uT).see(board.presses.b_uT[part["unlabelled"]], area=True)
     labels = board.presses[part["labels"][:10]]
     model.label(labels.place_mm, labels.force_N, labels.b_uT)
-    readings = board.readings[np.flatnonzero(np.isin(board.press_i, part["tested"]))]
+    readings = board.readings_of(part["tested"])
     (row,) = [row for row in rows if row["labels_n"] == 10]
     expected = score(readings.target, model.predict(readings.b_uT))
     assert {name: row[name] for name in expected} == expected
     assert {row["labels_n"] for row in rows} == {0, 1, 10}
+
+
+def test_tested_readings_are_evenly_spaced_over_their_press():
+    press_i = np.array([0] * 9 + [1] * 2 + [2] * 3)
+    assert spaced(press_i, 3).tolist() == [0, 4, 8, 9, 10, 11, 12, 13]
 
 
 def test_coverage_is_the_percentage_of_true_values_inside_the_intervals():
