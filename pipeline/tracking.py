@@ -511,7 +511,7 @@ class Publisher:
             self.log(run_id, [*rows, (TRAIN_S, seconds, 0)], span, params=params, tags=about)
             self.end(run_id, span)
         tested_on = (
-            f"The metrics are scores on recorded boards of scene lab, after calibration to {scores[0]['presses_n']} "
+            f"The metrics are scores on recorded boards of scene lab, after calibration to {scores[0]['pokes_n']} "
             f"unlabelled presses and {max(by_labels)} labels. Metrics whose names end in _0_labels are scores without "
             "labels."
             if by_labels

@@ -71,7 +71,7 @@ def scene(*experiments: str, **changes: object) -> Scene:
         ("adapt", ("lobo", "triplet")),
         ("pokes", ADAPTED),
         ("sensors", ADAPTED),
-        ("labels", ("lobo",)),
+        ("new_board", ("lobo", "triplet")),
         ("audit", ("lobo",)),
         ("choice", ADAPTED),
     ],
@@ -151,21 +151,19 @@ def test_error_lists_all_missing_experiments():
         scene("lobo", "choice")
 
 
-ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "audit", "choice")
+ALL = (*ADAPTED, "transfer", "pokes", "sensors", "new_board", "audit", "choice")
 
 
 def test_scene_with_all_experiments_runs_all_their_stages():
     checked = scene(*ALL)
     assert set(stages(checked.experiments, *LEARNING)) == {
-        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "few_labels",
+        "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "new_board",
         "audit",
     }  # fmt: skip
     assert checked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
-    assert checked.curves == {
-        "pokes": "sweep_pokes", "sensors": "sweep_sensors", "labels": "few_labels"
-    }  # fmt: skip
+    assert checked.curves == {"pokes": "sweep_pokes", "sensors": "sweep_sensors"}
     # These experiments have folds.
-    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}
+    assert set(checked.with_folds) == {"lobo", "transfer", "sensors"}
 
 
 def test_scene_with_one_experiment_runs_only_its_stage():

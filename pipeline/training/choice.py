@@ -120,7 +120,7 @@ def _has_collapsed(card: Card) -> bool:
 def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Average the error over budgets, by recipe; recipes that differ only in their budget get the same value."""
     settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
-    errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
+    errors = {candidate["recipe_name"]: candidate[BY].mean for candidate in candidates}
 
     def over_budgets(key: Mapping[str, Any]) -> float:
         by_budget = {budget: errors[name] for name, (other, budget) in settings.items() if other == key}

@@ -106,7 +106,7 @@ def test_stage_table2_writes_the_same_table_as_the_report(story, numbers):
 def test_dvc_metrics_equal_the_numbers_of_the_report(story, numbers):
     shown = json.loads(run(story, "dvc", "metrics", "show", "--json").stdout)
     scores = shown[""]["data"]["reports/ci/scores.json"]["data"]
-    assert set(scores) == {"table2", "single_sensor", "drift_end", "shear"}
+    assert set(scores) == {"table2", "single_sensor", "drift_end", "shear", "interference"}
     assert set(scores["table2"]) == {"single", "multi", "triplet", "adapted", "control"}
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
 
@@ -173,7 +173,9 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert all("mean" in numbers[experiment][part]["accuracy_pct"] for part in parts)
     assert {"by_indentation", "by_pass"} <= set(numbers["single_sensor"])
     tables = story / "reports/ci/tables"
-    assert {file.stem for file in tables.glob("*.md")} >= EXPERIMENTS_OF_CI | {"table1", "checklist", "single_sensor"}
+    named = {file.stem for file in tables.glob("*.md")}
+    assert named >= EXPERIMENTS_OF_CI - {"interference"} | {"table1", "checklist", "single_sensor"}
+    assert named >= {"interference_contacts", "interference_places"}
     for file in {*tables.glob("*.csv")} - {tables / "table1.csv", tables / "scores.csv"}:
         assert set(pd.read_csv(file)["source"]) == {"simulated"}, file
     assert NOT_RUN not in (tables / "checklist.md").read_text()
@@ -202,7 +204,8 @@ def test_only_provenance_and_runtime_files_depend_on_commit_machine_and_times(st
     for arguments in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
         subprocess.run(["git", *arguments], cwd=again, check=True)
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
-             "--models", "data/models/ci", "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--models", "data/models/ci", "--scores", "data/scores/ci", "--results", "data/results/ci",
+             "--reports", "reports/ci"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
     on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
     run(again, "python", "-c", on_one_core, "report", *arguments)
@@ -383,7 +386,8 @@ def test_dvc_status_lists_an_edited_report(story):
 def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
     models = story / "data/models/killed"
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci",
-             "--folds", "data/models/ci/folds.json", "--models", str(models)]  # fmt: skip
+             "--folds", "data/models/ci/folds.json", "--models", str(models),
+             "--scores", str(models.with_suffix(".parquet"))]  # fmt: skip
     command = [sys.executable, "-m", "pipeline", "train_triplet", *arguments]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     trials = story / ".reskin/cells"
@@ -411,7 +415,7 @@ def test_stage_that_was_killed_does_not_repeat_finished_training_runs(story):
 def test_missing_tracking_server_is_reported_quickly(story):
     start_s = time.monotonic()
     arguments = ["--scene", "ci", "--indentations", "data/indentations/ci", "--models", "data/models/ci",
-             "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
+             "--scores", "data/scores/ci", "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *arguments, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 100  # without the project's time limit, MLflow would retry for minutes

@@ -44,10 +44,10 @@ def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.0))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
-    table = score_before_contact(
+    scored = score_before_contact(
         SceneData("test", Settings("test", "test.yaml", SCENE, {}), rows, folds), folder, ["c0"], {}
     )
-    return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
+    return {row["method"]: row["accuracy_pct"] for row in scored}
 
 
 def test_field_memory_of_the_previous_press_reveals_the_place_in_a_snake_scan(tmp_path):
@@ -89,8 +89,8 @@ def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float
     rows = gather([one], Selection(force_min_N=0.1))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
     data = SceneData("test", Settings("test", "test.yaml", SCENE, {}), rows, folds)
-    table = score_before_contact(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
-    return {row["told_by"]: row for row in table.to_pylist()}
+    scored = score_before_contact(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
+    return {row["method"]: row for row in scored}
 
 
 def test_hovering_tip_is_located_only_if_it_is_magnetic(tmp_path):

@@ -75,7 +75,7 @@ def test_choice_does_not_depend_on_the_order_of_model_cards(cards):
 
 def test_all_candidates_are_listed_with_scores():
     scores = {
-        stage: {one["recipe_name"]: one["mse_xy_mm2"]["mean"] for one in chosen["candidates"]}
+        stage: {one["recipe_name"]: one["mse_xy_mm2"].mean for one in chosen["candidates"]}
         for stage, chosen in choose(CARDS).items()
     }
     assert scores == {
@@ -96,7 +96,7 @@ def test_settings_are_compared_by_the_mean_over_boards():
         card("lobo", "even", 0.95, "b1", seed_i=1),
     ]
     chosen = choose([one for one in CARDS if one["question"] != "lobo"] + boards)["train_multi"]
-    scores = {one["recipe_name"]: one["mse_xy_mm2"]["mean"] for one in chosen["candidates"]}
+    scores = {one["recipe_name"]: one["mse_xy_mm2"].mean for one in chosen["candidates"]}
     assert scores == {"fast": pytest.approx(0.695), "even": pytest.approx(0.65)}
     assert chosen["recipe_name"] == "even"
 
@@ -110,7 +110,7 @@ def test_scores_of_adapted_skins_are_averaged_over_boards():
     ]
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
     scores = chosen["candidates"][0]["mse_xy_mm2"]
-    assert scores["mean"] == pytest.approx(0.6)
+    assert scores.mean == pytest.approx(0.6)
     assert "sd_seeds" not in scores  # The spread over skins is not a spread over seeds.
 
 
