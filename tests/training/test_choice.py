@@ -111,7 +111,7 @@ def test_scores_of_adapted_skins_are_averaged_over_boards():
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
     scores = chosen["candidates"][0]["mse_xy_mm2"]
     assert scores.mean == pytest.approx(0.6)
-    assert "sd_seeds" not in scores  # The spread over skins is not a spread over seeds.
+    assert scores.sd_seeds is None  # The spread over skins is not a spread over seeds.
 
 
 SHAPED = {"inputs": "shape"}
