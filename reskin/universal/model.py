@@ -88,8 +88,8 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # correlated. It is not fitted to any board.
 MAP_POWER = 0.6
 # Power of the map's probabilities of forces if the map alone estimates forces. It is below 1, because the map
-# underestimates the uncertainty of forces. The value is the best of four values on simulated skins
-# (tests/benchmarks/test_force_benchmark.py).
+# underestimates the uncertainty of forces. The value was the best of four values on simulated skins
+# (docs/learning.md).
 FORCE_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # smallest standard deviations of the networks' estimates
 # `network_offsets_mm` corrects the places of the networks twice. The first correction, from unlabelled presses, loses
