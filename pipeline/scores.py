@@ -38,12 +38,12 @@ Row = dict[str, Any]
 
 
 def make_table(rows: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """Make the table from its rows: columns `KEYS`, then metrics.
+    """Make the table from its rows: columns `KEYS`, then metrics, and the mean and variance of the true forces.
 
     A name that a row lacks is "", and a count or a metric that it lacks is NaN.
     """
     rows = list(rows)
-    metrics = dict.fromkeys([*METRICS, *(name for row in rows for name in row if name not in (*KEYS, *TRUTH))])
+    metrics = dict.fromkeys([*METRICS, *(name for row in rows for name in row if name not in KEYS)])
     table = pd.DataFrame([dict.fromkeys(NAMES, "") | dict(row) for row in rows], columns=[*KEYS, *metrics])
     return table.astype(dict.fromkeys((*COUNTS, *metrics), float))
 
@@ -126,7 +126,7 @@ def _pool(rows: Sequence[Row]) -> Row:
 
 def metrics_of(rows: pd.DataFrame) -> list[str]:
     """Return the columns of metrics that have a value in these rows."""
-    return [str(name) for name in rows if name not in KEYS and rows[name].notna().any()]
+    return [str(name) for name in rows if name not in (*KEYS, *TRUTH) and rows[name].notna().any()]
 
 
 def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:

@@ -23,7 +23,7 @@ from pipeline.statistics import statistic, tally
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
-from reskin.metrics import METRICS, score
+from reskin.metrics import METRICS, TRUTH, score
 from reskin.models.inputs import VIEW
 from reskin.models.job import TrainingJob
 from reskin.models.neighbours import fit_neighbours
@@ -193,7 +193,7 @@ def summarise(scores: pd.DataFrame, measured: Mapping[str, Any]) -> dict[str, An
     tested = measured["tested"]
     by_method: dict[str, dict[str, Any]] = {}
     for method, rows in scores.groupby("method", sort=False):
-        stats = {name: statistic(rows[name]) for name in (*METRICS, *PLACES) if rows[name].notna().all()}
+        stats = {name: statistic(rows[name]) for name in (*METRICS, *TRUTH, *PLACES) if rows[name].notna().all()}
         for part, tested_n in tested.items():
             if tested_n:
                 median = {"median_error_mm": statistic(rows[f"median_error_{part}_mm"])}

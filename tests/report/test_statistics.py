@@ -47,7 +47,7 @@ from pipeline.statistics import (
 )
 from reskin.data.splits import Split, draw_folds
 from reskin.errors import SchemaError
-from reskin.metrics import METRICS, score_groups
+from reskin.metrics import METRICS, TRUTH, score_groups
 from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
 from tests.report.synthetic import SKINS, adapted_cards, card
@@ -138,7 +138,7 @@ def test_table_is_equal_after_it_was_written_and_read(tmp_path):
     cards = rows_of_cards([card_with_offset("b0", 1), *adapted_cards()])
     # The parts are joint rows as labelled and registered, and one row per skin.
     assert len(cards) == (2 + 3) + (2 * 6 + 12)
-    assert list(cards.columns) == [*KEYS, *METRICS]
+    assert list(cards.columns) == [*KEYS, *METRICS, *TRUTH]
     swept = make_table([{"experiment": "pokes", "board": "b0", "pokes_n": 65, "accuracy_pct": 80.0, "bias_f_N": 0.5}])
     for name, part in (("a", cards), ("b", swept)):
         write_scores(tmp_path / name, part)
