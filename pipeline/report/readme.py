@@ -64,7 +64,7 @@ RECORDED_METRICS = {
 RECORDED_MEANING = (
     "Scene `{scene}`, code {code}. Cells have the mean of both boards (board 1; board 2), over draws of "
     "presses and labels. In all columns, the model is first calibrated to {presses_n} presses without labels. {halves} "
-    "The mean force as estimate would give an R² of 0 and an error of {constant} N."
+    "The mean force as estimate would give an R² of 0 and an error of {constant} N.\n\n{touch}"
 )
 FIGURE = "docs/img/headline.svg"  # shows the shipped model, and a model that was trained with recordings
 Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
