@@ -28,6 +28,8 @@ VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|within interval|significant difference|"
     r"not judged \([^)]*\))(?![\w ])"
 )
+# Files of a report that are compared. The files in folder runtime are not: they hold run times, which always differ.
+COMPARED = re.compile(r"[^/]+\.json|tables/[^/]+\.csv")
 MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance that may explain a difference
 EXPECTED = (
     "Values are equal on every x86-64 processor with AVX2 if the code, the settings and the versions of packages "
@@ -230,15 +232,15 @@ def read_folder(path: Path, scene: str) -> Report:
     if folder is None:
         remedy = "Give the path of folder reports/<scene> in another checkout."
         raise SchemaError(f"{path}: this folder contains no {scene}/numbers.json. {remedy}")
-    files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
-    return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
+    files = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("*.*"))}
+    return _parse(f"in {folder}", {name: files[name].read_text("utf-8") for name in files if COMPARED.fullmatch(name)})
 
 
 def read_revision(root: Path, scene: str, revision: str) -> Report:
     """Read the report of a scene from a git revision."""
     folder = f"./reports/{scene}"
     listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else ""
-    names = [name for name in listed.splitlines() if name.endswith((".json", ".csv"))]
+    names = [name for name in listed.splitlines() if COMPARED.fullmatch(name.removeprefix(f"reports/{scene}/"))]
     if f"reports/{scene}/numbers.json" not in names:
         remedy = (
             f"Commit reports/{scene} first, or name another revision or a folder: reskin compare {scene} --against ..."
