@@ -5,16 +5,12 @@ of package `pipeline.stages` by module. In addition, each experiment in `pipelin
 function with the name of the experiment, in the module of the same name.
 """
 
-from collections.abc import Mapping
-from functools import cache
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Literal
 
-from reskin.config import Strict, parse, read_yaml
+from reskin.config import Strict
 
-FOLDER = Path(__file__).parent / "experiments"
 STAGES = {
     "simulate": ("simulate",),
     "ingest": ("ingest", "ingest_many", "ingest_simulated", "describe", "split"),
@@ -65,28 +61,6 @@ class Experiment(Strict):
     alone: bool = False
 
 
-class ExperimentFile(Strict):
-    """Content of `pipeline/experiments/<name>.yaml`: the experiment, its report section and its checklist rows."""
-
-    experiment: dict[str, Any]  # fields of `Experiment`
-    section: dict[str, Any] | None = None
-    checklist: tuple[dict[str, Any], ...] = ()
-
-
-@cache
-def experiment_files() -> Mapping[str, ExperimentFile]:
-    """Read the YAML files of all experiments; return their contents by experiment name."""
-    return {file.stem: parse(ExperimentFile, read_yaml(file), str(file)) for file in sorted(FOLDER.glob("*.yaml"))}
-
-
-def read_experiments() -> list[Experiment]:
-    """Read the catalogue entries of the experiments in `pipeline/experiments`."""
-    return [
-        parse(Experiment, {"name": name, "stage": name, "key": name} | file.experiment, f"{FOLDER / name}.yaml")
-        for name, file in experiment_files().items()
-    ]
-
-
 def _learning(
     name: str, kind: Kind, stage: str, *, needs: tuple[str, ...] = (), folds: tuple[str, ...] | None = None,
     settings: bool = True, reads: tuple[str, ...] = (), file: str | None = None,
@@ -126,9 +100,43 @@ LEARNING = (
 )  # fmt: skip
 
 
+def _analysis(
+    name: str, *, needs: tuple[str, ...] = (), protocol: str | None = None, settings: bool = True,
+    reads: tuple[str, ...] = (), file: str | None = None, recorded: bool = False, scores: bool = False,
+    without_contact: bool = False, alone: bool = False,
+) -> Experiment:  # fmt: skip
+    return Experiment(
+        name=name, stage=name, key=name, needs=needs, protocol=protocol, settings=settings, reads=reads, file=file,
+        recorded=recorded, scores=scores, without_contact=without_contact, alone=alone,
+    )  # fmt: skip
+
+
+ANALYSED = (
+    _analysis("accuracy_and_cost", needs=("adapt",)),
+    _analysis("audit", needs=("lobo",), recorded=True),
+    _analysis("compare", recorded=True),
+    _analysis("drift", protocol="wear", recorded=True, scores=True),
+    _analysis("extremes"),
+    _analysis("flexible", needs=("adapt",), protocol="flexible", settings=False, scores=True),
+    _analysis("gripper", needs=("lobo",), protocol="grip"),
+    _analysis("interference", recorded=True, scores=True, without_contact=True, alone=True),
+    _analysis("logs", needs=("lobo",), protocol="log", settings=False),
+    _analysis("manual", needs=("adapt",), protocol="hand", settings=False, scores=True),
+    _analysis(
+        "new_board", needs=("lobo", "triplet"), reads=("compare", "adapt"), file="model", recorded=True, scores=True
+    ),
+    _analysis("sensitivity", protocol="glass", settings=False),
+    _analysis("shear", protocol="drag", scores=True),
+    _analysis("sleeve", protocol="sleeve", scores=True),
+    _analysis("variation", protocol="wear"),
+)
+EXPERIMENTS = {experiment.name: experiment for experiment in (*LEARNING, *ANALYSED)}
+ANALYSES = tuple(experiment.name for experiment in ANALYSED)
+
+
 def is_stage(name: str) -> bool:
     """Return whether a stage or an experiment has this name."""
-    return name in MODULES or name in experiment_files()
+    return name in MODULES or name in ANALYSES
 
 
 def module_name(stage: str) -> str:

@@ -9,9 +9,10 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from pipeline import PLAN, SCENES
+from pipeline.catalogue import ANALYSES, EXPERIMENTS
 from pipeline.manage.registry import Registry, read_registry
 from pipeline.manage.running import DVC_FILES, require_idle
-from pipeline.scenes import ANALYSES, EXPERIMENTS, MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
+from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
 from reskin.errors import ParamsError, did_you_mean
 from reskin.recordings.header import NAME, NAME_RULE

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from pipeline import PARAMS
-from pipeline.catalogue import LEARNING, Experiment, Kind, module_of, read_experiments
+from pipeline.catalogue import EXPERIMENTS, Experiment, Kind, module_of
 from pipeline.settings import Seed, Settings, read_settings, section_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
@@ -32,8 +32,6 @@ REPLACED = {
 }
 KEPT = {"pool_passes_n"}  # settings that have an effect even if the scene does not run the experiment that needs them
 
-EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
-ANALYSES = tuple(experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "analysis")
 SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experiment.settings}
 
 

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
+from pipeline.catalogue import EXPERIMENTS
 from pipeline.manage.new import scene_text
-from pipeline.scenes import EXPERIMENTS, check_scene
+from pipeline.scenes import check_scene
 from pipeline.scores import KEYS
 from pipeline.settings import Settings, read_shared_files
 from reskin import io

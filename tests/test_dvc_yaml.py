@@ -8,7 +8,7 @@ import pytest
 from dvc.repo import Repo
 from ruamel.yaml import YAML
 
-from pipeline.scenes import ANALYSES
+from pipeline.catalogue import ANALYSES
 from pipeline.stages.code import all_stages, digests_of
 from reskin import code
 from reskin.code import file_of, files_of

@@ -5,10 +5,11 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
+from pipeline.catalogue import ANALYSES
 from pipeline.manage.new import SHIPPED, scene_text
 from pipeline.manage.registry import Entry, Registry
 from pipeline.plan import make_plan
-from pipeline.scenes import ANALYSES, Plan, Scene, parse_scene
+from pipeline.scenes import Plan, Scene, parse_scene
 from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from pipeline import PARAMS, PLAN, plan
+from pipeline.catalogue import EXPERIMENTS
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
 from pipeline.manage.running import require_idle
-from pipeline.scenes import EXPERIMENTS, Scene, read_plan, read_scene, read_shared
+from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
 from reskin import config, io

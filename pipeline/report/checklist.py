@@ -1,7 +1,6 @@
 """The checklist, which compares each result of the paper with ours and gives a verdict on each claim.
 
-Its rows are read from `checklist.yaml` and from the entry `checklist` of each experiment's YAML file. The paper's
-numbers are constants of `pipeline.paper`.
+Its rows are read from `checklist.yaml`. The paper's numbers are constants of `pipeline.paper`.
 """
 
 import re
@@ -14,7 +13,6 @@ import pandas as pd
 
 from pipeline import paper, statistics
 from pipeline.formatting import FEW_POINTS, gain, reworded, show, show_difference
-from pipeline.report.experiments import add_rows
 from pipeline.report.table_2 import is_pooled
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS, Stat
 from reskin.config import Strict, parse, read_yaml
@@ -136,7 +134,7 @@ class Judgement:
 
 def read_rows() -> list[Row]:
     """Read the rows of the checklist, in the paper's order."""
-    entries = add_rows(read_yaml(FILE))
+    entries = read_yaml(FILE)
     return [parse(Row, row, f"checklist, row {row['id']}") for entry in entries for row in _by_metric(entry)]
 
 

@@ -1,19 +1,17 @@
-"""Tables, figures, page sections and checklist rows that experiments add to a report.
+"""Numbers, tables and figures that experiments add to a report.
 
-An experiment's module makes its figures, and `pipeline.report.experiment_tables` makes its tables. Its YAML file
-contains its section and its checklist rows.
+An experiment's module makes its figures, and `pipeline.report.experiment_tables` makes its tables.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 import pandas as pd
 
-from pipeline.catalogue import experiment_files, module_name
+from pipeline.catalogue import ANALYSES, EXPERIMENTS, module_name
 from pipeline.report.experiment_tables import TABLES
-from pipeline.scenes import ANALYSES, EXPERIMENTS
 from pipeline.scores import select
 
 
@@ -55,20 +53,3 @@ def _modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
     """Import the module of each experiment with results in numbers.json, by its key there."""
     keys = {name: EXPERIMENTS[name].key for name in ANALYSES}
     return {key: import_module(module_name(name)) for name, key in keys.items() if key in numbers}
-
-
-def add_sections(order: Iterable[Any]) -> list[dict[str, Any]]:
-    """Replace each experiment's name in `order` with its section of the page; sections that are not named come last."""
-    files = experiment_files().items()
-    return _replace({name: {"key": name} | file.section for name, file in files if file.section is not None}, order)
-
-
-def add_rows(order: Iterable[Any]) -> list[dict[str, Any]]:
-    """Replace each id in `order` with that row of an experiment's YAML file; rows that are not named come last."""
-    rows = [row | {"stage": name} for name, file in experiment_files().items() for row in file.checklist]
-    return _replace({row["id"]: row for row in rows}, order)
-
-
-def _replace(entries: dict[str, dict[str, Any]], order: Iterable[Any]) -> list[dict[str, Any]]:
-    listed = [entries.pop(entry) if isinstance(entry, str) else entry for entry in order]
-    return [*listed, *entries.values()]

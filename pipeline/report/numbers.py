@@ -7,9 +7,10 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.catalogue import EXPERIMENTS
 from pipeline.paper import PLATEAU_POKES_N
 from pipeline.report.table_2 import control_of
-from pipeline.scenes import EXPERIMENTS, TABLE_2
+from pipeline.scenes import TABLE_2
 from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
 from pipeline.statistics import (
     as_json,

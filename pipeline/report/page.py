@@ -18,7 +18,6 @@ from pipeline.catalogue import is_stage, module_name
 from pipeline.formatting import notes
 from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
 from pipeline.report.checklist import CLAIM, ONE_SKIN
-from pipeline.report.experiments import add_sections
 from pipeline.report.figures import HEADLINE
 from pipeline.report.protocol import Protocol, protocols
 from pipeline.report.sentences import sentences
@@ -314,7 +313,7 @@ def unbroken(text: str) -> str:
 
 def read_sections() -> list[Section]:
     """Read the sections of the page, in order."""
-    return [parse(Section, entry, f"page, section {entry['key']}") for entry in add_sections(read_yaml(PAGE_FILE))]
+    return [parse(Section, entry, f"page, section {entry['key']}") for entry in read_yaml(PAGE_FILE)]
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:

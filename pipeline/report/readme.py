@@ -12,13 +12,12 @@ from typing import Any
 import pandas as pd
 
 from pipeline import FLOW
-from pipeline.catalogue import module_name
+from pipeline.catalogue import ANALYSES, module_name
 from pipeline.formatting import tabulate, to_markdown
 from pipeline.paper import TABLE_2, TABLE_2_ROWS
 from pipeline.report.figures import constant_force, unseen_boards, unseen_rows
 from pipeline.report.numbers import join
 from pipeline.report.tables import NOLOAD_AGES, make_tables, skins_table
-from pipeline.scenes import ANALYSES
 from pipeline.statistics import Stat
 from reskin import io
 from reskin.code import ROOT, file_of

@@ -11,7 +11,7 @@ included only in the files of stages that show results.
 import gc
 from pathlib import Path
 
-from pipeline.catalogue import EXPERIMENTS_PACKAGE, MODULES, experiment_files, module_name
+from pipeline.catalogue import ANALYSES, EXPERIMENTS_PACKAGE, MODULES, module_name
 from reskin import io
 from reskin.code import digest, imported
 
@@ -24,14 +24,14 @@ PRESENTATION = "pipeline.report.experiments"
 
 def all_stages() -> list[str]:
     """List all stages except this one."""
-    return list(dict.fromkeys([*MODULES, *experiment_files()]))
+    return list(dict.fromkeys([*MODULES, *ANALYSES]))
 
 
 def digests_of(stage: str) -> dict[str, str]:
     """Return the digests of all modules that affect the outputs of a stage, by the name of the module."""
     names = imported(module_name(stage))
     if PRESENTATION in names:
-        return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_files()))}
+        return {name: digest(name) for name in imported(module_name(stage), *map(module_name, ANALYSES))}
     computing = [name for name in names if not name.startswith(SHOWING)]
     return {name: digest(name, data=not name.startswith(EXPERIMENTS_PACKAGE)) for name in computing}
 

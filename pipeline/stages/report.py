@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import PLAN, SCENES
+from pipeline.catalogue import EXPERIMENTS
 from pipeline.executors import make_executor
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded, to_markdown
@@ -40,7 +41,7 @@ from pipeline.report.numbers import (
 from pipeline.report.page import about_scene, index, page, run_page
 from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
-from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
+from pipeline.scenes import TABLE_2, Scene, parse_scene, stages
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say

@@ -10,6 +10,7 @@ from ruamel.yaml import YAML
 from scipy.stats import t
 
 from pipeline import paper
+from pipeline.catalogue import ANALYSES
 from pipeline.formatting import INCONCLUSIVE
 from pipeline.report.checklist import (
     AGREES,
@@ -32,7 +33,6 @@ from pipeline.report.checklist import (
     read_rows,
     resolve,
 )
-from pipeline.scenes import ANALYSES
 from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED
 from reskin.errors import SchemaError
 from tests.report.synthetic import all_experiments, over_boards, stat

@@ -7,9 +7,9 @@ import json
 
 import pytest
 
+from pipeline.catalogue import ANALYSES
 from pipeline.manage.compare import leaves
 from pipeline.report.numbers import headline_scores, join, split, timed_rows
-from pipeline.scenes import ANALYSES
 from reskin.io import read_json
 from reskin.metrics import METRICS
 from tests.report.synthetic import all_experiments, cost, scores, stat

@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from pipeline.catalogue import experiment_files
+from pipeline.catalogue import ANALYSES
 from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
@@ -36,7 +36,6 @@ from pipeline.report.page import (
     unbroken,
 )
 from pipeline.report.tables import make_tables
-from pipeline.scenes import ANALYSES
 from reskin.errors import SchemaError
 from tests.report.synthetic import all_experiments, cost
 
@@ -302,12 +301,6 @@ def test_page_shows_and_escapes_tables_that_belong_to_no_section(read):
 def test_table_without_rows_is_not_shown():
     assert 'id="surprise-table"' in render(surprise=pd.DataFrame({"a": ["1"]}))
     assert "surprise" not in render(surprise=pd.DataFrame({"a": []}))
-
-
-def test_results_of_experiments_come_before_checks_and_captures():
-    keys = [section.key for section in read_sections()]
-    experiments = [name for name, file in experiment_files().items() if file.section is not None]
-    assert all(keys.index(name) < keys.index("checks") for name in experiments)
 
 
 def test_missing_experiment_has_no_section_on_the_page():

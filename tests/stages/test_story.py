@@ -25,13 +25,13 @@ import pytest
 from ruamel.yaml import YAML
 
 import reskin
+from pipeline.catalogue import ANALYSES
 from pipeline.formatting import to_markdown
 from pipeline.pyfunc import channel_names
 from pipeline.report.checklist import NOT_REACHED, NOT_RUN, read_rows, resolve
 from pipeline.report.figures import table2_figure
 from pipeline.report.numbers import join, timed_rows
 from pipeline.report.tables import table_2_summary
-from pipeline.scenes import ANALYSES
 from reskin import io
 from reskin.models.inputs import Scaler
 from tests.benchmarks import FULL
