@@ -371,11 +371,11 @@ def readme(
     """Write the generated parts of README.md and docs, and the figure of README.md, from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
-    changed, scenes_shown = fill_pages(ROOT, write=not check)
+    changed = fill_pages(ROOT, write=not check)
     if check and changed:
         typer.echo(f"out of date: {', '.join(changed)}; to write them again: reskin readme", err=True)
         sys.exit(1)
-    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(scenes_shown)}")
+    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}")
 
 
 @scenes.command("list")
