@@ -70,8 +70,8 @@ class Page:
         except (TemplateError, KeyError, TypeError) as error:
             line = _line_of(error, template)
             raise SchemaError(
-                f"pipeline/report/pages/{template}{line}: {type(error).__name__}: {error}. Correct the template; it can "
-                "use what numbers.json of the scene has."
+                f"pipeline/report/pages/{template}{line}: {type(error).__name__}: {error}. Correct the "
+                "template; it can use what numbers.json of the scene has."
             ) from error
 
     def html_of(self, template: str, title: str, **context: Any) -> str:
@@ -157,7 +157,7 @@ def scene_page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], f
 
 
 def run_page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of one run (commit, machine, versions, times); numbers: numbers.json joined with provenance.json."""
+    """Render the page of one run: commit, machine, versions, times; numbers: joined with provenance.json."""
     scene = numbers["provenance"]["scene"]
     named = {name.removesuffix(".svg"): svg for name, svg in figures.items()}
     return Page(numbers, tables, named).html_of("run.md", f"ReSkin: run of scene {scene}", scene=scene)

@@ -1,4 +1,4 @@
-"""Tests of the report pages: every committed scene renders, pages are whole, and templates cannot name what is missing."""
+"""Tests of the report pages: every committed scene renders, pages are whole, missing names are errors."""
 
 import re
 import shutil
@@ -15,7 +15,8 @@ from reskin.code import ROOT
 from reskin.errors import SchemaError
 from tests.report.synthetic import all_experiments
 
-SVG = '<?xml version="1.0"?>\n<svg viewBox="0 0 1 1"><defs><path id="p"/></defs><use href="#p" clip-path="url(#p)"/></svg>'
+SVG = """<?xml version="1.0"?>
+<svg viewBox="0 0 1 1"><defs><path id="p"/></defs><use href="#p" clip-path="url(#p)"/></svg>"""
 SCENES = sorted(file.parent.name for file in (ROOT / "reports").glob("*/numbers.json"))
 
 
