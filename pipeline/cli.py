@@ -82,11 +82,13 @@ def new(
     Each board is held out in turn: networks are trained on the other boards and tested on this one.
     """
     from pipeline.manage import new as creating
+    from pipeline.manage.lock import changing
 
     names = [name.strip() for name in boards.split(",") if name.strip()]
     source: Source = "simulated" if simulated else "recorded"
-    for step in creating.new(ROOT, scene, names, presses_n, passes_n, layout, source)[1]:
-        typer.echo(step)
+    with changing(ROOT):
+        steps = creating.new(ROOT, scene, names, presses_n, passes_n, layout, source)[1]
+    typer.echo("\n".join(steps))
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -170,6 +172,7 @@ def add(
     """
     from pipeline import plan
     from pipeline.manage import add as adding
+    from pipeline.manage.lock import changing
     from pipeline.scenes import read_plan
     from reskin.recordings import preparing
 
@@ -185,7 +188,7 @@ def add(
     _check_number(recordings, {"--name": name, "--skin": skin, "--probe": probe, "--mark": mark or None})
     marks, planned = preparing.parse_marks(mark or []), read_plan(ROOT / PLAN).scenes
     added: list[str] = []
-    with plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
+    with changing(ROOT), plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
         for recording in recordings:
             names = adding.names_of(ROOT, scene, recording, preparing.CaptureNames(board or "", skin or "", name))
             with preparing.suggesting_layout(recording, layout):
@@ -252,11 +255,13 @@ def fetch(
 ) -> None:
     """Fetch public recordings, check that the files are complete and unchanged, and add them to a scene."""
     from pipeline.manage import fetch as fetching
+    from pipeline.manage.lock import changing
 
     def agree(question: str) -> bool:
         return yes or (sys.stdin.isatty() and typer.confirm(question))
 
-    fetching.fetch(ROOT, source, origin, scene, agree=agree, say=typer.echo)
+    with changing(ROOT):
+        fetching.fetch(ROOT, source, origin, scene, agree=agree, say=typer.echo)
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -266,20 +271,11 @@ def remove(
 ) -> None:
     """Remove a recording from a scene, and delete its files from the checkout."""
     from pipeline.manage import add as adding
+    from pipeline.manage.lock import changing
 
-    adding.remove(ROOT, scene, capture)
+    with changing(ROOT):
+        adding.remove(ROOT, scene, capture)
     typer.echo(f"removed {scene}/{capture}; next: dvc repro")
-
-
-@app.command(rich_help_panel=MAINTENANCE)
-def merge() -> None:
-    """Resolve the git conflicts that arise when a branch with other recordings is merged.
-
-    The conflicts are in the files that commands write: data/captures.yaml, pipeline/plan.yaml, dvc.lock and reports.
-    """
-    from pipeline.manage import merge as merging
-
-    typer.echo(merging.merge(ROOT))
 
 
 @app.command(rich_help_panel=MAINTENANCE)
@@ -310,56 +306,19 @@ def publish() -> None:
 
 
 @app.command(rich_help_panel=PIPELINE)
-def compare(
-    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
-    against: Annotated[str, Option(help="Compare with the reports of this git revision or folder.")] = "HEAD",
-) -> None:
-    """Compare the reports in reports/ with the committed reports. The exit status is 1 if any value differs."""
-    from pipeline.manage.compare import compare_scene
-
-    names = [scene] if scene else checked_plan().scenes
-    sys.exit(max((compare_scene(ROOT, name, against, typer.echo) for name in names), default=0))
-
-
-@app.command(rich_help_panel=PIPELINE)
-def summary(
-    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
-) -> None:
-    """Print the main scores, say whether they equal the committed scores, and name pages and commands to go on with."""
-    from pipeline.manage.summary import print_summary
-
-    print_summary(ROOT, [scene] if scene else list(checked_plan().scenes), typer.echo)
-
-
-@app.command(rich_help_panel=PIPELINE)
-def verify_reports(
+def verify(
     names: Annotated[
         list[str] | None,
         Argument(metavar="[SCENE]...", help="Names of scenes. Default: all scenes that `dvc repro` runs."),
     ] = None,
-    against: Annotated[
-        Path | None,
-        Option(
-            help="Folder with reports of scenes that were run again before. If this option is given, the scenes are "
-            "not run, and these reports are compared."
-        ),
-    ] = None,
 ) -> None:
-    """Run scenes again in a fresh clone of the last commit, and compare their reports with the committed reports.
+    """Run scenes again in a fresh clone of the last commit, and compare their numbers with the committed ones.
 
     The exit status is 1 if any value differs.
     """
-    from pipeline.manage.verify import verify
+    from pipeline.manage import verify as verifying
 
-    sys.exit(verify(ROOT, names or list(checked_plan().scenes), against, typer.echo))
-
-
-@app.command(rich_help_panel=MAINTENANCE)
-def check_cache() -> None:
-    """Look for damaged files in DVC's cache, move them out of the cache, and print how to restore them."""
-    from pipeline.manage import cache
-
-    sys.exit(cache.check(ROOT, typer.echo))
+    sys.exit(verifying.verify(ROOT, names or list(checked_plan().scenes), typer.echo))
 
 
 @app.command(rich_help_panel=MAINTENANCE)
@@ -396,29 +355,13 @@ def use(
 ) -> None:
     """Choose the scenes that `dvc repro` runs."""
     from pipeline import plan
-    from pipeline.manage import tidy as tidying
+    from pipeline.manage.lock import changing
 
-    plan.use(ROOT, names)
+    with changing(ROOT):
+        plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
     for sentence in plan.unused_settings(ROOT, names):
         typer.echo(f"note: {sentence}")
-    if stale := tidying.stale_outputs(ROOT, checked_plan()):
-        typer.echo(
-            f"There are still results of stages that no longer run: {', '.join(stale)}. To delete them: reskin scenes "
-            "tidy"
-        )
-
-
-@scenes.command()
-def tidy() -> None:
-    """Delete the results of experiments that the scenes in the plan no longer run."""
-    from pipeline.manage import tidy as tidying
-
-    stale = tidying.tidy(ROOT, checked_plan())
-    for stage, paths in stale.items():
-        typer.echo(f"removed {stage}: {', '.join(map(str, paths)) or 'no files, because other stages use them'}")
-    if not stale:
-        typer.echo("nothing to remove")
 
 
 @scenes.command()

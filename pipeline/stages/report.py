@@ -39,7 +39,6 @@ from pipeline.report.numbers import (
     timed_rows,
 )
 from pipeline.report.page import about_scene, index, page, run_page
-from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
 from pipeline.scenes import TABLE_2, Scene, parse_scene, stages
 from pipeline.scores import read_scores, to_csv
@@ -109,11 +108,13 @@ def report(
     io.write_texts(reports / "runtime", of_run | {"index.html": run_page(numbers, timed)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     write_index(reports.parent)
-    for line in (
-        *summarise(numbers),
-        f"{name}: open {reports}/index.html in a browser; numbers and tables are beside it",
-    ):
-        say(line)
+    say(f"{name}: {accuracies(numbers)}open {reports}/index.html in a browser; training runs: make ui")
+
+
+def accuracies(numbers: Mapping[str, Any]) -> str:
+    """Return the accuracies of table 2 as words for a message; an empty string if the scene does not have the table."""
+    means = [f"{name} {row['accuracy_pct']['mean']:.0f} %" for name, row in numbers.get("table2", {}).items()]
+    return f"places within 1 mm on boards not seen in training: {', '.join(means)}; " if means else ""
 
 
 @dataclass(frozen=True)
