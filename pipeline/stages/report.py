@@ -1,6 +1,6 @@
 """Stages that present results: table2, report (numbers, tables, figures, pages) and publish (MLflow)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
