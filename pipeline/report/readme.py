@@ -40,7 +40,8 @@ COSTS_MEANING = (
     "another. By default, two training runs run at the same time, so less time passes. Column collapsed counts the "
     "training runs whose network had a nearly constant output; they were repeated."
 )
-TIMES = "reports/time.json"  # written by `make time-repro`
+TIMER = "tests/benchmarks/time_repro.py"
+TIMES = "reports/time.json"  # written by TIMER
 FULL_SIZE, HEADLINE = "paper", "quick"  # simulated scenes on the pages; README.md shows only HEADLINE
 SHIPPED_SCENE, SHIPPED_FILE = "lab", "reskin/universal/universal.safetensors"  # scene that tests the shipped model
 MEASURED = "reskin/universal/measured.json"  # results of this model that the live page shows
@@ -179,7 +180,7 @@ def blocks_of(
         "headline": _simulated(list(reversed(results))),
         "recorded": "\n\n".join(_recorded(numbers) for numbers in recorded if "new_board" in numbers) or NONE_YET,
         "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
-        "time": "Not timed yet. Run `make time-repro`." if times is None else _time(times),
+        "time": f"Not timed yet. Run `python3 {TIMER} --times 3`." if times is None else _time(times),
         "costs": to_markdown(costs_table([*results, *recorded])),
         "new_board": "\n\n".join(_tables(each, NEW_BOARD) for each in recorded if "new_board" in each) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
@@ -301,7 +302,7 @@ def _time(times: Numbers) -> str:
         f"This takes {environment_min:.1f} min for the environment, {stages_min:.1f} min for the stages "
         f"({cpu_min:.1f} CPU min), and needs {all_GB:.1f} GB ({environment_GB:.1f} GB for the environment, with "
         f"PyTorch's CPU build). Medians of {len(runs)} fresh clones on {times['machine']} "
-        f"(`make time-repro`, code {times['git']})."
+        f"(`{TIMER}`, code {times['git']})."
     )
 
 
