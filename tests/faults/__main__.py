@@ -80,7 +80,7 @@ INTRODUCTION = """\
 # Faults and recovery
 
 This page lists what happens when a process, disk, file or server fails while `dvc repro` runs, and what is lost.
-`python -m tests.faults` injects each fault into a finished run of a part of scene `ci`, and then runs `dvc repro`. A row
+`python -m tests.faults` injects each fault into a finished part of scene `ci`, and then runs `dvc repro` again. A row
 is green if four conditions are met: a command that fails prints a message and no traceback; no command takes more than
 ten minutes; no finished stage or training run is computed again; and all outputs equal those of the undisturbed run.
 
