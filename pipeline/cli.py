@@ -5,7 +5,6 @@ commands, so that `reskin --help` starts quickly.
 """
 
 import sys
-from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -173,65 +172,28 @@ def add(
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.manage.lock import changing
+    from pipeline.manage.options import Options
     from pipeline.scenes import read_plan
-    from reskin.recordings import preparing
+    from reskin.recordings.preparing import CaptureNames, suggesting_layout
 
-    serial, native = {"serial-binary", "serial-text"}, {"capture", "serial-binary", "serial-text"}
-    _check_options(
-        layout,
-        {
-            "--probe": (probe, native), "--mark": (mark, native), "--chips": (chips_n, serial),
-            "--rate-hz": (rate_hz, serial), "--wire": (wire, serial), "--rows-late": (rows_late, {"ini"}),
-            "--force-axis": (force_axis, {"eflesh"}), "--pad": (pad, {"leaphand"}),
-        },
-    )  # fmt: skip
-    _check_number(recordings, {"--name": name, "--skin": skin, "--probe": probe, "--mark": mark or None})
-    marks, planned = preparing.parse_marks(mark or []), read_plan(ROOT / PLAN).scenes
+    options = Options(probe, mark, chips_n, rate_hz, wire, rows_late, force_axis, pad)
+    options.check(layout)
+    for option, value in (("--name", name), ("--skin", skin), ("--probe", probe), ("--mark", mark)):
+        if value is not None and len(recordings) > 1:
+            n = len(recordings)
+            raise ParamsError(f"{option} is for one recording, but there are {n}. Add each with a command of its own.")
     added: list[str] = []
     with changing(ROOT), plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
+        planned = read_plan(ROOT / PLAN).scenes
         for recording in recordings:
-            names = adding.names_of(ROOT, scene, recording, preparing.CaptureNames(board or "", skin or "", name))
-            with preparing.suggesting_layout(recording, layout):
-                if layout == "capture":
-                    prepared = preparing.native(recording, names, probe, marks)
-                elif layout == "serial-binary" or layout == "serial-text":
-                    default_wire: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-                    dump_options = preparing.Dump(
-                        wire or default_wire, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks
-                    )
-                    prepared = preparing.dump(recording, names, dump_options)
-                else:
-                    options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
-                    options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
-                    options |= {"pad": str(pad)} if layout == "leaphand" and pad is not None else {}
-                    prepared = preparing.foreign(recording, layout, names, options)
-                header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
+            names = adding.names_of(ROOT, scene, recording, CaptureNames(board or "", skin or "", name))
+            with suggesting_layout(recording, layout):
+                header = adding.add(ROOT, scene, options.prepare(recording, layout, names), allow_copy=allow_copy)
             added.append(header.capture)
             typer.echo(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
     typer.echo(f"next: dvc repro report@{scene}")
     if scene not in planned:
         typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(planned) or 'none'})")
-
-
-def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None:
-    """Raise `ParamsError` if an option that names or describes one recording is given with several recordings."""
-    given = [option for option, value in options.items() if value is not None]
-    if len(recordings) > 1 and given:
-        raise ParamsError(
-            f"{given[0]} is for one recording, but there are {len(recordings)}. Add each recording with a command of "
-            "its own."
-        )
-
-
-def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
-    """Raise `ParamsError` if an option is given that the layout does not use.
-
-    options: for each option, its value and the layouts that use it.
-    """
-    for option, (value, layouts) in options.items():
-        if value not in (None, []) and layout not in layouts:
-            used = " and ".join(sorted(layouts))
-            raise ParamsError(f"{option} is only for --layout {used}, not {layout}. Omit {option}.")
 
 
 @app.command(rich_help_panel=RECORDINGS)

@@ -9,7 +9,7 @@ from filelock import FileLock
 
 from reskin.errors import ParamsError
 
-LOCK = ".reskin/lock"
+LOCK = ".dvc/tmp/reskin.lock"
 
 
 @contextmanager
@@ -23,7 +23,7 @@ def changing(root: Path) -> Iterator[None]:
     from dvc.repo import Repo
     from dvc.rwlock import rwlock
 
-    (root / LOCK).parent.mkdir(exist_ok=True)
+    (root / LOCK).parent.mkdir(parents=True, exist_ok=True)
     with FileLock(root / LOCK, is_singleton=True), ExitStack() as held:
         try:
             # DVC holds the lock of its repository between stages. While a stage runs, DVC holds read and write locks of

@@ -142,9 +142,9 @@ def _damage(file: Path) -> None:
     file.chmod(mode)
 
 
-CACHED = {  # name: (output folder, damaged file, stage that writes the output, stage that reads it)
-    "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", TRIPLET, address("adapt")),
-    "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("ingest_simulated"), address("split")),
+CACHED = {  # name: (output folder, damaged file, stage that reads it)
+    "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", address("adapt")),
+    "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("split")),
 }
 
 
@@ -165,7 +165,7 @@ def _damage_cached(checkout: Checkout, out: str, pattern: str) -> tuple[Path, by
     return file, content
 
 
-def add_cache_damage(what: str, folder: str, pattern: str, writer: str, reader: str) -> None:
+def add_cache_damage(what: str, folder: str, pattern: str, reader: str) -> None:
     """Add a fault: DVC restores a damaged file from its cache, and the stage `reader` reads this file."""
 
     @fault(
@@ -179,7 +179,8 @@ def add_cache_damage(what: str, folder: str, pattern: str, writer: str, reader: 
         first, cells = checkout.run("dvc", "repro"), checkout.trainings()
         io.remove(checkout.folder / folder)
         io.remove(checkout.folder / ".dvc/cache/files")
-        row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
+        # All stages run again, because their outputs are no longer in the cache. No training run is repeated.
+        row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[*checkout.lock()], finished=cells)
         row.faults += [] if ".dvc/cache/files" in row.message else ["the message does not say what to delete"]
         row.faults += [] if file.read_bytes() == content else ["the changed file is in use"]
         return row
