@@ -1,6 +1,6 @@
 """Stages that present results: table2, report (numbers, tables, figures, pages) and publish (MLflow)."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,13 @@ def report(
     timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, scene.source)
     io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers), timed))
     write_index(reports.parent)
-    say(f"{name}: open {reports}/index.html in a browser; numbers.json and tables/ are beside it")
+    say(f"{name}: {accuracies(numbers)}open {reports}/index.html in a browser; training runs: make ui")
+
+
+def accuracies(numbers: Mapping[str, Any]) -> str:
+    """Return the accuracies of table 2 as words for a message; an empty string if the scene does not have the table."""
+    means = [f"{name} {row['accuracy_pct']['mean']:.0f} %" for name, row in numbers.get("table2", {}).items()]
+    return f"places within 1 mm on boards not seen in training: {', '.join(means)}; " if means else ""
 
 
 def draw(numbers: dict[str, Any], plot_data: dict[str, Any], predictions: list[Any]) -> dict[str, str]:
