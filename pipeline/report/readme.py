@@ -15,7 +15,7 @@ from pipeline import FLOW
 from pipeline.catalogue import ANALYSES, module_name
 from pipeline.formatting import tabulate, to_markdown
 from pipeline.paper import TABLE_2, TABLE_2_ROWS
-from pipeline.report.figures import constant_force, unseen_boards, unseen_rows
+from pipeline.report.figures import constant_force, score_figures, unseen_rows
 from pipeline.report.numbers import join
 from pipeline.report.tables import NOLOAD_AGES, make_tables, skins_table
 from pipeline.statistics import Stat
@@ -103,7 +103,7 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
             changed.append(str(file))
             if write:
                 io.write_json(file, measured)
-        file, figure = root / FIGURE, unseen_boards(shipped, shipped["provenance"]["source"], large=True)
+        file, figure = root / FIGURE, score_figures(shipped, shipped["provenance"]["source"])["headline.svg"]
         if not file.exists() or file.read_text(encoding="utf-8") != figure:
             changed.append(str(file))
             if write:

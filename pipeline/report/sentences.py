@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.formatting import TITLES
 from pipeline.paper import TABLE_2
-from pipeline.report.figures import FORCE, HEADLINE, IN_CONTEXT, unseen_rows
+from pipeline.report.figures import HEADLINE, IN_CONTEXT, unseen_rows
 
 Numbers = Mapping[str, Any]  # numbers.json of one scene
 # Places where no line break is allowed: between a number and its unit.
@@ -54,31 +54,19 @@ def _table2(numbers: Numbers) -> dict[str, str]:
         f"{TITLES[name]} {row['accuracy_pct']['mean']:.0f} % (paper: {TABLE_2[name]['accuracy_pct'][0]:.0f} %)"
         for name, row in ours.items()
     ]
-    errors = [
-        f"{TITLES[name]} {row['mse_f_N2']['mean'] ** 0.5:.1f} N (paper: {TABLE_2[name]['mse_f_N2'][0] ** 0.5:.1f} N)"
-        for name, row in ours.items()
-        if "mse_f_N2" in row
-    ]
-    return {HEADLINE: f"Share of readings within 1 mm: {'; '.join(parts)}."} | (
-        {FORCE: f"Rms error of the force (square root of the mean MSE_F): {'; '.join(errors)}."} if errors else {}
-    )
+    return {HEADLINE: f"Share of readings within 1 mm: {'; '.join(parts)}."}
 
 
 def _unseen(numbers: Numbers) -> dict[str, str]:
     rows = sorted((row for row in unseen_rows(numbers) if row["labels_n"] != 1), key=lambda row: row["labels_n"])
-    written = {}
-    for file, metric, digits, unit in ((HEADLINE, "accuracy_pct", 0, "%"), (FORCE, "rms_f_N", 1, "N")):
-        parts = []
-        for method, name in IN_CONTEXT.items():
-            swept = [row for row in rows if row["method"] == method and metric in row]
-            if swept:
-                first, last = (row[metric]["mean"] for row in (swept[0], swept[-1]))
-                ends = f"{first:.{digits}f} {unit} with {swept[0]['labels_n']} labels"
-                parts.append(f"{name}: {ends}, {last:.{digits}f} {unit} with {swept[-1]['labels_n']}")
-        if parts:
-            what = "Share of readings within 1 mm" if metric == "accuracy_pct" else "Rms error of the force"
-            written[file] = f"{what}, mean over the boards: {'; '.join(parts)}."
-    return written
+    parts = []
+    for method, name in IN_CONTEXT.items():
+        swept = [row for row in rows if row["method"] == method]
+        if swept:
+            first, last = (row["accuracy_pct"]["mean"] for row in (swept[0], swept[-1]))
+            ends = f"{first:.0f} % with {swept[0]['labels_n']} labels"
+            parts.append(f"{name}: {ends}, {last:.0f} % with {swept[-1]['labels_n']}")
+    return {HEADLINE: f"Share of readings within 1 mm, mean over the boards: {'; '.join(parts)}."} if parts else {}
 
 
 def _pokes(numbers: Numbers) -> dict[str, str]:

@@ -25,7 +25,7 @@ from pipeline.provenance import (
 )
 from pipeline.report.experiments import experiment_figures, experiment_numbers
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
-from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
+from pipeline.report.figures import Outline, error_grids, score_figures
 from pipeline.report.numbers import (
     add_up,
     before_touch_numbers,
@@ -69,7 +69,7 @@ def table2(settings: Settings, scores: Path, tables: Path) -> None:
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
     numbers = rounded(numbers)
     text = to_markdown(table_2_summary(numbers))
-    io.write_texts(tables, {"table2.md": text, **headline_figures(numbers, source)})
+    io.write_texts(tables, {"table2.md": text, **score_figures(numbers, source)})
     say(f"{name} ({source})\n{text}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
@@ -99,8 +99,8 @@ def report(
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
         of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
         outline = None if of_layout is None else Outline(**of_layout)
-        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
-        figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
+        figures = dict(error_grids(predictions, HEADLINE, source, outline))
+        figures |= score_figures(numbers, source)
         figures |= figures_future.result()
     io.write_texts(reports / "figures", figures)
     # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
