@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.report.figures import unseen_boards, unseen_rows
+from pipeline.report.figures import score_figures, unseen_rows
 from pipeline.report.numbers import join
 from pipeline.report.page import Page, pick
 from reskin import io
@@ -46,7 +46,7 @@ def texts_of(root: Path) -> dict[str, str]:
     times = io.read_json(root / TIMES)
     texts = {name: fill_blocks(name, _read(root / name), scenes, times) for name in BLOCKS}
     lab = scenes["lab"]
-    figure = unseen_boards(lab, lab["provenance"]["source"], large=True)
+    figure = score_figures(lab, lab["provenance"]["source"])["headline.svg"]
     measured = json.dumps(measured_of(lab, io.sha256(root / SHIPPED_FILE)), indent=2, allow_nan=False)
     return texts | {FIGURE: figure, MEASURED: measured + "\n"}
 

@@ -23,7 +23,7 @@ from pipeline.provenance import (
     versions,
 )
 from pipeline.report.experiments import experiment_figures, experiment_numbers
-from pipeline.report.figures import Outline, error_grids, headline_figures, learning_figures
+from pipeline.report.figures import Outline, error_grids, score_figures
 from pipeline.report.numbers import (
     add_up,
     before_touch_numbers,
@@ -66,7 +66,7 @@ def table2(settings: Settings, scores: Path, tables: Path) -> None:
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(table, headline=HEADLINE)}
     numbers = rounded(numbers)
     text = to_markdown(table_2_summary(numbers))
-    io.write_texts(tables, {"table2.md": text, **headline_figures(numbers, source)})
+    io.write_texts(tables, {"table2.md": text, **score_figures(numbers, source)})
     say(f"{name} ({source})\n{text}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
@@ -112,12 +112,11 @@ def draw(numbers: dict[str, Any], plot_data: dict[str, Any], predictions: list[A
 
     plot_data: data that only figures need, by key of numbers.json. predictions: predictions of networks, by stage.
     """
-    name, source = numbers["provenance"]["scene"], numbers["provenance"]["source"]
+    source = numbers["provenance"]["source"]
     of_layout = plot_data.get("compare", {}).get("outline")  # None unless the scene has the layout of its boards
     outline = None if of_layout is None else Outline(**of_layout)
-    figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})", outline))
-    figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
-    return figures | experiment_figures(numbers, plot_data, source)
+    figures = dict(error_grids(predictions, HEADLINE, source, outline))
+    return figures | score_figures(numbers, source) | experiment_figures(numbers, plot_data, source)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from pipeline.catalogue import ANALYSES
 from pipeline.formatting import to_markdown
 from pipeline.pyfunc import channel_names
 from pipeline.report.checklist import NOT_REACHED, NOT_RUN, read_rows, resolve
-from pipeline.report.figures import table2_figure
+from pipeline.report.figures import headline
 from pipeline.report.numbers import join, timed_rows
 from pipeline.report.tables import table_2_summary
 from reskin import io
@@ -90,7 +90,7 @@ def test_report_contains_provenance_scores_and_byte_counts(story, numbers):
 
 
 def test_stage_table2_writes_the_same_table_as_the_report(story, numbers):
-    assert (story / "data/table2/ci/headline.svg").read_text() == table2_figure(numbers, "simulated")
+    assert (story / "data/table2/ci/headline.svg").read_text() == headline(numbers, "simulated")
     table = (story / "data/table2/ci/table2.md").read_text()
     assert table == to_markdown(table_2_summary(numbers))
     assert table in (story / OUTPUT).read_text()
