@@ -19,6 +19,7 @@ from reskin.errors import ReskinError, explaining
 
 WATCH_s, CLEAN_UP_MAX_s = 0.2, 5.0
 
+
 def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
     """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`."""
     end_with_dvc()

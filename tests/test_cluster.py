@@ -97,7 +97,7 @@ def fake_client(properties: dict[str, str]) -> SimpleNamespace:
 
 @pytest.mark.timeout(300)
 def test_sweep_with_a_killed_worker_gives_the_bytes_of_a_local_sweep(cluster, tmp_path, monkeypatch):
-    selected = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=300) for seed_i in range(8)]
+    selected = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=20) for seed_i in range(6)]
     cache = tmp_path / "cluster"
 
     def kill_worker() -> None:
