@@ -207,7 +207,7 @@ def fetch(
     ] = None,
     origin: Annotated[
         str | None,
-        Option("--from", help="Git mirror or folder from which the files are taken, instead of their public address."),
+        Option("--from", help="Folder, or address of a mirror, from which the files are taken."),
     ] = None,
     scene: Annotated[
         str | None,

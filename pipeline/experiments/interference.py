@@ -24,6 +24,7 @@ import pandas as pd
 from jaxtyping import Float, Float64, Int64
 from pydantic import Field, model_validator
 from scipy.constants import micro, milli
+from tqdm import tqdm
 
 import reskin
 from pipeline import statistics
@@ -31,7 +32,6 @@ from pipeline.experiments.results import read_captures, write_results
 from pipeline.plot import drawing, svg
 from pipeline.scores import make_table, write_scores
 from pipeline.settings import Settings
-from pipeline.stage import say
 from reskin.config import Strict, parse
 from reskin.data.contact import contact_threshold_uT, magnitudes_uT, noise_uT
 from reskin.data.grid import CENTRE_MM, points_mm
@@ -175,9 +175,8 @@ def run(settings: Settings, section: Interference, raw: Path, indentations: Path
             rng = rng_for(settings.seed, "interference", "touches", sensor.skin)
             rows += contact_rows(sensor, presses, models, rng)
         pooled = pool_changes(sensors)
-        for skin in presses:
+        for skin in tqdm(presses, unit="skin"):
             rows += place_rows(skin, pooled, models, section, settings.seed)
-            say(f"{settings.scene} interference: {skin.skin} scored")
     return make_table({"experiment": "interference"} | row for row in rows)
 
 

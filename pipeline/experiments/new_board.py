@@ -23,6 +23,7 @@ import pandas as pd
 import pyarrow as pa
 from jaxtyping import Bool, Float, Int64
 from pydantic import Field
+from tqdm import tqdm
 
 from pipeline.executors import make_executor
 from pipeline.experiments.results import NO_LOSSES, read_captures, write_results
@@ -30,7 +31,6 @@ from pipeline.formatting import TITLES
 from pipeline.plot import drawing, svg
 from pipeline.scores import COUNTS, make_table, metrics_of, write_scores
 from pipeline.settings import Adaptations, Settings, Training
-from pipeline.stage import say
 from pipeline.statistics import tally
 from pipeline.training.jobs import SceneData, collapse_record, read_data, read_pretrained, select_pretrained, train_jobs
 from pipeline.training.methods import (
@@ -363,10 +363,8 @@ def new_board(
             for draw in drawn[board.skin]
         ]
         rows = []
-        for i, task in enumerate(tasks, start=1):
+        for task in tqdm(tasks, unit="draw"):
             rows += task.result()
-            if i % 10 == 0:
-                say(f"{settings.scene} new_board: {i} of {len(tasks)} draws scored")
     adapted, trainings = score_adapted(data, boards, drawn, models)
     policy = settings.shared_section(FaultPolicy, "faults")
     contact = score_contact(read_contact(captures, raw, policy))
