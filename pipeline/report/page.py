@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -14,29 +13,20 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from pydantic import Field
 
-from pipeline.catalogue import is_stage, module_name
 from pipeline.formatting import notes
 from pipeline.report.answers import IN_BRACKETS, LEVELS, Answers, answers
-from pipeline.report.checklist import CLAIM, ONE_SKIN
 from pipeline.report.figures import HEADLINE
-from pipeline.report.protocol import Protocol, protocols
 from pipeline.report.sentences import sentences
 from pipeline.report.tables import run_tables
-from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
 Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
 PLACES_FILE = Path(__file__).with_name("page.places.yaml")
-SEEN = re.compile(r"see (?P<kind>table|figure) (?P<name>\w+)")  # a cell that names the table or figure of a result
-SHOWN_IN = "shown in"  # column of the checklist that names tables and figures
-SEE = "see "  # prefix of a cell of the checklist that names a table or figure instead of a number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
 # Tables that are unfolded when the page loads; all other tables are folded.
 OPEN = {"table1", "table2", "claims", "final_model"}
-WHOLE = ("verdicts", "checklist")  # sections that show the whole list of claims or of results
-BESIDE_N = 4  # a section compares at most this many results with the paper; the checklist contains all results
 EFFORTS = "Scores on new skins, by model and by the data that the model needs from the new skin"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated, so no number on this page was measured on hardware.",
@@ -150,8 +140,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
     source, ids = numbers["provenance"]["source"], ids_of([*tables, *figures])
     drawings = {name: measure(f"figures/{name}", text, ids[name]) for name, text in figures.items()}
     drawings = describe(drawings, sentences(numbers))
-    checklist = tables.get("checklist", pd.DataFrame())
-    answered, ran = answers(numbers), protocols(numbers)
+    answered = answers(numbers)
     sections = arrange(tables, drawings)
     return template("page.html").render(
         scene=numbers["provenance"]["scene"],
@@ -162,15 +151,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
         levels=LEVELS,
         brackets=IN_BRACKETS,
         places=[place_on_page(place, ids) for place in read_places()],
-        sections=[
-            _fill(section, tables, drawings, source, ids)
-            | {
-                "beside": beside_paper(section, checklist, ids),
-                "stages": stages_of(section, checklist),
-                "ran": _ran(section, ran),
-            }
-            for section in sections
-        ],
+        sections=[_fill(section, tables, drawings, source, ids) for section in sections],
         saved=[*tables],
         opened=OPEN,
     )
@@ -195,10 +176,6 @@ def ids_of(names: Iterable[str]) -> dict[str, str]:
 def place_on_page(place: Place, ids: Mapping[str, str]) -> dict[str, Any]:
     """Return a table or figure of the paper, and whether the page shows it."""
     return {"id": place.id, "name": place.name, "what": place.what, "here": place.id in ids.values()}
-
-
-def _ran(section: Section, ran: Sequence[Protocol]) -> list[Protocol]:
-    return [protocol for protocol in ran if protocol.section == section.key]
 
 
 def efforts_table(name: str, answered: Answers) -> Table | None:
@@ -343,35 +320,6 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
     return f"Main captures: {captures_n:,}, with {listed}."
 
 
-def beside_paper(section: Section, checklist: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table | None:
-    """Tabulate the checklist rows of a section that contain a number of this scene; rows with verdicts come first."""
-    rows = [row for row in _rows_of(section, checklist) if _has_number(row["ours"]) and row["note"] != ONE_SKIN]
-    if not rows:
-        return None
-    rows.sort(key=lambda row: (not row["result"].startswith(CLAIM), row["verdict"] in NO_VALUE))
-    columns = ["result", "ours", "paper", "verdict", "note"]
-    return lay_out(f"beside-{section.key}", "Comparison with the paper", pd.DataFrame(rows[:BESIDE_N])[columns], ids)
-
-
-def _has_number(cell: str) -> bool:
-    return cell not in NO_VALUE and not cell.startswith(SEE)
-
-
-def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
-    """List the stages whose results a section shows, each with the file that contains the code of the stage."""
-    stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
-    return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
-
-
-def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
-    """Select the checklist rows whose tables or figures the section shows."""
-    if section.key in WHOLE or checklist.empty:
-        return []
-    cells = checklist.astype(str)
-    rows = (dict(zip(cells.columns, row, strict=True)) for row in cells.itertuples(index=False))
-    return [row for row in rows if section.captions.keys() & set(row["shown in"].split(", "))]
-
-
 def measure(file: str, svg: str, id: str) -> Drawing:
     """Read the size of a figure from its SVG text, and compute the smallest legible width, in CSS pixels."""
     size = SVG_SIZE_PT.search(svg)
@@ -398,60 +346,18 @@ def describe(drawings: Mapping[str, Drawing], by_name: Mapping[str, str]) -> dic
 def lay_out(name: str, caption: str, table: pd.DataFrame, ids: Mapping[str, str] | None = None) -> Table:
     """Prepare a table for the page: how its columns look, its cells as text, its notes and its width.
 
-    If column `source` has a single value, the value is moved to the caption. In tables with verdicts, the columns that
-    explain the verdict are joined. `ids` contains the ids of the tables and figures on the page, to which cells link.
+    If column `source` has a single value, the value is moved to the caption.
     """
     cells = table.fillna("")
     if "source" in cells and cells["source"].nunique() == 1:
         caption = f"{caption} ({cells['source'].iloc[0]})"
         cells = cells.drop(columns="source")
-    if "criterion" in cells:
-        cells = _explain_verdicts(cells)
     cells = cells.astype(str)
-    shown_in = [cell.split(", ")[0] for cell in cells.pop(SHOWN_IN)] if SHOWN_IN in cells else [""] * len(cells)
     looks = [_look(cells[title]) for title in cells.columns]
     rows = [*cells.itertuples(index=False, name=None)]
     columns = [*map(str, cells.columns)]
     width_rem = _width_rem(columns, rows)
-    if "ours" in columns:
-        i, ids = columns.index("ours"), ids or {}
-        rows = [(*row[:i], link(row[i], shown, ids), *row[i + 1 :]) for row, shown in zip(rows, shown_in, strict=True)]
     return Table((ids or {}).get(name, name), name, caption, columns, looks, rows, notes(table), width_rem)
-
-
-def link(result: str, shown_in: str, ids: Mapping[str, str]) -> str:
-    """Link a result of the checklist to the table or figure of the page that shows it, if the page has it."""
-    seen = SEEN.fullmatch(result)
-    name = seen["name"] + ".svg" * (seen["kind"] == "figure") if seen else shown_in
-    if name not in ids or result in NO_VALUE:
-        return result
-    text = f"{SEE}{_in_words(name)}" if seen else unbroken(result)
-    return Markup(f'<a href="#{ids[name]}">{escape(text)}</a>')
-
-
-@cache
-def _in_words(name: str) -> str:
-    """Name a table or figure in a sentence: as the paper does, if it shows one of the paper's, or by its caption."""
-    for place in read_places():
-        if name in place.shown and place.id.startswith(("table-", "figure-")):
-            return place.id.replace("-", " ")
-    captions = {key: text for section in read_sections() for key, text in section.captions.items()}
-    caption = re.split("[:,] ", captions.get(name, _title(name)))[0]
-    return caption[:1].lower() + caption[1:]
-
-
-def _explain_verdicts(cells: pd.DataFrame) -> pd.DataFrame:
-    """Join the columns that explain a verdict: criterion, whether our mean meets it, p-value and notes."""
-    parts = {"criterion": "{criterion}: {met}", "p (Holm)": "p = {p (Holm)} (Holm)", "note": "{note}"}
-    why = [
-        "; ".join(text.format_map(row) for name, text in parts.items() if row.get(name, "–") not in NO_VALUE) or "–"
-        for row in cells.to_dict("records")
-    ]
-    shown = cells.drop(columns=[*parts, "met", "paper in our interval", "stage"], errors="ignore")
-    position = list(shown.columns).index("verdict") + 1
-    shown.insert(position, "criterion and notes", why)
-    first = next(title for title in ("claim", "result") if title in shown)
-    return shown[[first, *(title for title in shown if title != first)]]
 
 
 def _width_rem(columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> int:

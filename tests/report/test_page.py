@@ -15,17 +15,14 @@ import pandas as pd
 import pytest
 
 from pipeline.catalogue import ANALYSES
-from pipeline.report.checklist import ONE_SKIN, checklist
 from pipeline.report.numbers import split
 from pipeline.report.page import (
-    BESIDE_N,
     EFFORTS,
     LEGIBLE_PX,
     STEPS_REM,
     about,
     about_scene,
     arrange,
-    beside_paper,
     index,
     lay_out,
     measure,
@@ -81,7 +78,7 @@ def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     # These experiments are omitted, because the synthetic numbers lack values that their tables need.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
-    tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
+    tables = make_tables(plain) | {"drift": drift} | more
     figures = {"drift.svg": SVG.format(300), "sweep_pokes.svg": SVG.format(600), "unheard_of.svg": SVG.format(300)}
     return page(split(numbers)[0], tables, figures)
 
@@ -152,7 +149,7 @@ def test_each_table_and_figure_of_the_paper_is_linked_from_the_top():
     places = read_places()
     shown = {name: SVG.format(300) for place in places for name in place.shown if name.endswith(".svg")}
     tables = {name: pd.DataFrame({"a": ["1"]}) for place in places for name in place.shown if name not in shown}
-    text = page(split(all_experiments())[0], tables | {"checklist": checklist(all_experiments())}, shown)
+    text = page(split(all_experiments())[0], tables, shown)
     read, bar = Reader(text), text[text.index('<nav class="places"') :].partition("</nav>")[0]
     assert text.index(bar) < text.index("<main>")
     links = dict(re.findall(r'<a href="#([^"]+)"><b>([^<]+)</b>', bar))
@@ -182,28 +179,6 @@ def test_no_level_of_headings_is_skipped(read):
     assert all(after <= before + 1 for before, after in pairwise(levels))
 
 
-def test_results_link_to_the_table_or_figure_that_shows_them():
-    rows = {"result": ["a", "b", "c", "d"], "ours": ["see table sweep_pokes", "see figure gone", "90 %"]}
-    rows["ours"].append("see figure sweep_sensors")
-    shown = ["sweep_pokes", "gone.svg", "drift.svg, drift", "sweep_sensors.svg"]
-    rows |= {"criterion": ["–"] * 4, "verdict": ["–"] * 4, "shown in": shown}
-    ids = {"sweep_pokes": "sweep-pokes", "drift.svg": "figure-5a", "sweep_sensors.svg": "figure-6b"}
-    table = lay_out("checklist", "C", pd.DataFrame(rows), ids)
-    ours = [row[table.columns.index("ours")] for row in table.rows]
-    assert ours == [
-        '<a href="#sweep-pokes">see scores by number of unlabelled pokes</a>',
-        "see figure gone",
-        '<a href="#figure-5a">90\u00a0%</a>',
-        '<a href="#figure-6b">see figure 6b</a>',
-    ]
-
-
-def test_page_shows_our_protocol_beside_that_of_the_paper():
-    text = render()
-    single = text[text.index('<section id="single"') :].partition("</section>")[0]
-    assert single.index("45,000 for training") < single.index("7,020 readings") < single.index("<details")
-
-
 def test_figures_have_texts_for_screen_readers(read):
     objects, images = read.all("object"), read.all("img")
     assert len(objects) == len(images) == 3
@@ -213,9 +188,9 @@ def test_figures_have_texts_for_screen_readers(read):
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_section_shows_figures_then_the_comparison_with_the_paper_then_tables():
+def test_section_shows_figures_then_tables():
     for part in render().split("<section id=")[1:]:
-        places = [part.index(mark) for mark in ("<figure", "Comparison with the paper", "<details") if mark in part]
+        places = [part.index(mark) for mark in ("<figure", "<details") if mark in part]
         assert places == sorted(places)
 
 
@@ -259,24 +234,6 @@ def test_section_about_the_scene_lists_counts():
     counts.clear()
     counts.update(captures_n=1, readings_n=2000, indentations_n=0)
     assert about(numbers).endswith("Main captures: 1, with 2,000 readings.")
-
-
-def test_results_with_a_verdict_come_first_in_the_comparison_with_the_paper():
-    table, section = checklist(all_experiments()), next(one for one in read_sections() if one.key == "skins")
-    shown = beside_paper(section, table)
-    assert 0 < len(shown.rows) <= BESIDE_N
-    assert {row[0] for row in shown.rows} <= set(table["result"])
-    judged = [row[3] != "–" for row in shown.rows]
-    assert judged == sorted(judged, reverse=True)
-
-
-def test_comparison_with_the_paper_omits_results_that_cannot_be_compared():
-    section = next(one for one in read_sections() if one.key == "drift")
-    row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
-    (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "smaller than the paper's: 8,000 contacts"}])).rows
-    assert shown == ("r", "92 %", "90 %", "yes", "smaller than the paper's: 8,000 contacts")
-    assert beside_paper(section, pd.DataFrame([row | {"note": ONE_SKIN}])) is None
-    assert beside_paper(section, pd.DataFrame([row | {"note": "–", "ours": "see table drift"}])) is None
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
@@ -337,13 +294,6 @@ def test_equal_results_give_an_equal_page():
 def test_numbers_without_deviations_are_right_aligned():
     table = pd.DataFrame({"a": ["x"], "b": ["1.5 ± 0.2"], "c": ["–"], "d": ["3 of 4"], "e": ["-0.1 mm²"]})
     assert lay_out("t", "T", table).looks == ["text", "text", "text", "text", "number"]
-
-
-def test_explanation_of_a_verdict_says_whether_our_mean_meets_the_criterion():
-    row = {"claim": "x", "ours": "5", "verdict": "not judged", "criterion": "above 9", "met": "no", "note": "few"}
-    table = lay_out("t", "T", pd.DataFrame([row]))
-    assert table.columns == ["claim", "ours", "verdict", "criterion and notes"]
-    assert table.rows == [("x", "5", "not judged", "above 9: no; few")]
 
 
 def test_text_between_backquotes_is_code_in_cells_and_notes():
