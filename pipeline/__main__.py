@@ -32,7 +32,11 @@ def main() -> None:
         from pipeline.manage.remaining import announce
 
         announce()
-        run(getattr(module_of(name), name), sys.argv[2:])
+        scene = run(getattr(module_of(name), name), sys.argv[2:])
+        # Imported here and not by a stage, so that changes of the tracking rerun no stage.
+        from pipeline.tracking import after_stage
+
+        after_stage(name, scene)
     else:
         from reskin.cli import main as command
 

@@ -14,8 +14,11 @@ from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
 
-def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`."""
+def run(function: Callable[..., None], arguments: Sequence[str]) -> str:
+    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`.
+
+    Returns the name of the scene.
+    """
     stage = function.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=function.__doc__)
     parser.add_argument("--scene", required=True)
@@ -41,6 +44,7 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
+    return str(scene)
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
