@@ -11,7 +11,6 @@ from ruamel.yaml import YAML
 from pipeline import PLAN, SCENES
 from pipeline.catalogue import ANALYSES, EXPERIMENTS
 from pipeline.manage.registry import Registry, read_registry
-from pipeline.manage.running import DVC_FILES, require_idle
 from pipeline.scenes import MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
 from reskin.errors import ParamsError, did_you_mean
@@ -137,8 +136,7 @@ def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Write the plan for exactly these scenes; raise an error if `dvc repro` runs, because its stages read the plan."""
-    require_idle(root)
+    """Write the plan for exactly these scenes."""
     yaml = YAML()
     yaml.width = 120
     document = {key: _in_flow_style(value) for key, value in plan_of(root, names).items()}
@@ -154,7 +152,7 @@ def _keep_outputs(root: Path) -> None:
     DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete listed
     outputs that no stage of the current plan writes. This function therefore empties the list.
     """
-    if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
+    if not (root / ".dvc/tmp").is_dir():  # DVC has not run in this checkout
         return
     from dvc.exceptions import DvcException  # imported here, because the import takes a second
     from dvc.repo import Repo

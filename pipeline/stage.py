@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
-from pipeline.progress import stage_position
 from pipeline.provenance import COSTS, clear_cost, record_cost
 from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
@@ -28,8 +27,6 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> str:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     options = vars(parser.parse_args(arguments))
     scene = options.pop("scene")
-    if position := stage_position():
-        say(f"{stage}: {position}")
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):

@@ -168,14 +168,15 @@ def read_means(scene: str, trainings: list[Run]) -> Iterator[Run]:
     """
     file = Path(f"reports/{scene}/scores.json")
     scores = io.read_json(file) if file.exists() else {}
-    for method, metrics in reversed(scores.pop("table2", {}).items()):  # MLflow lists the newest run first
+    table2 = scores.pop("table2", {})
+    for experiment, values in scores.items():
+        yield _mean(experiment, {"method": experiment}, dict(_flatten(values)))
+    for method, metrics in reversed(table2.items()):  # MLflow lists the newest run first
         # A control has its own recipe instead of its own method.
         kinds = ((method, HEADLINE), ("adapted", method))
         cells = [set(run.params.items()) for run in trainings if (run.params["method"], run.params["recipe"]) in kinds]
         common = dict(set.intersection(*cells)) if cells else {}
         yield _mean(f"mean of {method}", common | {"method": method, "trainings_n": len(cells)}, metrics)
-    for experiment, values in scores.items():
-        yield _mean(experiment, {"method": experiment}, dict(_flatten(values)))
 
 
 def _mean(name: str, params: Mapping[str, Any], metrics: Mapping[str, float]) -> Run:

@@ -17,7 +17,6 @@ import numpy as np
 from pipeline import PARAMS, PLAN, plan
 from pipeline.catalogue import EXPERIMENTS
 from pipeline.manage.registry import REGISTRY, read_registry, with_capture, without_capture, write_registry
-from pipeline.manage.running import require_idle
 from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.settings import Settings, read_settings
 from pipeline.stage import say
@@ -41,7 +40,6 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 
     On failure, all of this is undone.
     """
-    require_idle(root)
     header, files = prepared
     remedy = (
         f"To create it, run reskin new {scene} --boards ..., or repeat the command with --like ini, which copies the "

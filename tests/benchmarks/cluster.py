@@ -1,6 +1,6 @@
 """Run one sweep of training runs on this machine and on a Dask cluster, also while parts of the cluster fail.
 
-Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root, because each machine of the cluster is a
+Run `python -m tests.benchmarks.cluster` as root, because each machine of the cluster is a
 network namespace, which only root can create. deploy/dask.sh starts the programs, as on SLURM and Kubernetes. The
 program writes docs/measured/cluster.md, scaling.md and scaling.svg.
 """
@@ -290,7 +290,7 @@ def main() -> None:
         measurements = run_steps(steps, folder.resolve())
     steps.write(
         arguments.out / "cluster.md",
-        f"`make cluster-test`: {TASKS_N} tasks of three training runs, {STEPS_N} steps each.",
+        f"`python -m tests.benchmarks.cluster`: {TASKS_N} tasks of three training runs, {STEPS_N} steps each.",
     )
     write_scaling(measurements, arguments.out)
 

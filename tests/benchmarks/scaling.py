@@ -111,7 +111,7 @@ def write_scaling(measured: Measurements, folder: Path) -> None:
         f"| {n} | " + " | ".join(f"{faster[name][i]:.1f}" for name in cases) + " |" for i, n in enumerate(WORKERS_N)
     ]
     text = [
-        "Speed-up over one worker, simulated from times and sizes measured by `make cluster-test`.", "",
+        "Speed-up over one worker, simulated from times and sizes of `python -m tests.benchmarks.cluster`.", "",
         "| workers | " + " | ".join(cases) + " |", "|---" * (len(cases) + 1) + "|", *rows, "",
         *explain(measured, paper, rest_s, largest, cost), "", "![Speed-up against workers](scaling.svg)", "",
     ]  # fmt: skip

@@ -1,6 +1,6 @@
 """Run a team's workflow on this machine: PostgreSQL, MLflow, DVC remotes, merging the recordings of two people.
 
-Run `make teams` or `python -m tests.benchmarks.teams`. The program starts servers on the loopback address and always
+Run `python -m tests.benchmarks.teams`. The program starts servers on the loopback address and always
 stops them, even after a failure; all files are in one temporary folder. A table of the steps and their seconds is
 written to docs/measured/teams.md.
 """
@@ -176,13 +176,14 @@ def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
             clone.commit(f"Add skin {skin_i}")
             clone.dvc("push")
     ana.git("push", "--quiet", "origin", "main")
-    with steps.step("Ben: `git pull`, `reskin merge`, `git commit`") as note:
+    with steps.step("Ben: `git pull`, `git checkout --theirs`, `reskin scenes use`, `git commit`") as note:
         ben.git("pull", "--quiet", "--no-rebase", "origin", "main", check=False)
         conflicts = ben.git("diff", "--name-only", "--diff-filter=U").split()
-        require({"dvc.lock", "data/captures.yaml", "pipeline/plan.yaml"} <= {*conflicts}, f"in conflict: {conflicts}")
-        note(f"{len(conflicts)} files in conflict before `reskin merge`, none after it")
-        ben.reskin("merge")
-        ben.git("commit", "--quiet", "-m", "Merge both skins")
+        require({"dvc.lock", "pipeline/plan.yaml"} <= {*conflicts}, f"in conflict: {conflicts}")
+        note(f"{len(conflicts)} files in conflict")
+        ben.git("checkout", "--theirs", "dvc.lock", "pipeline/plan.yaml", "reports")
+        ben.reskin("scenes", "use", SCENE)
+        ben.commit("Merge both skins")
     with steps.step("Ben: `dvc pull`, `dvc repro`, commit, push") as note:
         pulled = transfer_summary(ben.dvc("pull"))
         ran = ben.repro()
@@ -283,7 +284,10 @@ def main() -> None:
         folder = arguments.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
         folder.chmod(0o755)  # PostgreSQL runs as another user
         run_steps(steps, folder.resolve())
-    steps.write(arguments.out, "`make teams`: two people share runs and simulated recordings, on one machine.")
+    steps.write(
+        arguments.out,
+        "`python -m tests.benchmarks.teams`: two people share runs and recordings, on one machine.",
+    )
 
 
 if __name__ == "__main__":
