@@ -61,7 +61,7 @@ ui: $(STAMP)
 bench: $(STAMP)
 	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest -s -q -p no:xdist tests/benchmarks \
 		tests/stages tests/experiments tests/models tests/live/test_gripper.py \
-		tests/recordings/readers/test_lateness.py tests/test_numerics.py tests/test_pyfunc.py tests/test_tutorial.py
+		tests/recordings/readers/test_lateness.py tests/test_numerics.py tests/test_tracking.py tests/test_tutorial.py
 
 constraints: $(STAMP)
 	$(BIN)/python -m release.constraints

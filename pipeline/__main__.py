@@ -27,7 +27,11 @@ def main() -> None:
     except ModuleNotFoundError as error:
         sys.exit(f"error: package {error.name} is not installed for {sys.executable}. Try: . .venv/bin/activate")
     if is_stage(name):
-        run(getattr(module_of(name), name), sys.argv[2:])
+        scene = run(getattr(module_of(name), name), sys.argv[2:])
+        # Imported here and not by a stage, so that changes of the tracking rerun no stage.
+        from pipeline.tracking import after_stage
+
+        after_stage(name, scene)
     else:
         from reskin.cli import main as command
 

@@ -242,29 +242,14 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write to MLflow the training runs and reports that are missing there.
+    """Write to MLflow the training runs, scores and final models that it lacks, and print links to them.
 
-    They are missing, for example, if the MLflow server could not be reached when they were computed.
+    They are missing, for example, if DVC took the results from its cache, or if MLflow could not be reached.
     """
-    from pipeline.scenes import read_scene
-    from pipeline.stages.report import published_results, write_scene
+    from pipeline import tracking
 
     for name in checked_plan().scenes:
-        scene, results = read_scene(ROOT, name), ROOT / "data/results" / name
-        models = {stage: ROOT / "data/models" / name / stage for stage in scene.model_stages}
-        written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
-        missing = [path for path in (*models.values(), *written) if not path.exists()]
-        if missing:
-            path = missing[0].relative_to(ROOT)
-            typer.echo(
-                f"scene {name}: {path} is missing, so nothing is written to MLflow. To compute all results: dvc repro"
-            )
-            continue
-        folders = (
-            *(ROOT / "data" / kind / name for kind in ("indentations", "models", "scores", "results")),
-            ROOT / "reports" / name,
-        )
-        typer.echo(write_scene(published_results(scene, name, *folders), name, ROOT))
+        typer.echo(tracking.publish(name))
 
 
 @app.command(rich_help_panel=PIPELINE)

@@ -19,8 +19,11 @@ from reskin.errors import ReskinError, explaining
 WATCH_s, CLEAN_UP_MAX_s = 0.2, 5.0
 
 
-def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`."""
+def run(function: Callable[..., None], arguments: Sequence[str]) -> str:
+    """Run the function of a stage; its paths are options on the command line, and its scene is option `--scene`.
+
+    Returns the name of the scene.
+    """
     end_with_dvc()
     stage = function.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=function.__doc__)
@@ -45,6 +48,7 @@ def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)
+    return str(scene)
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:

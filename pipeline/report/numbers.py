@@ -13,7 +13,6 @@ from pipeline.report.table_2 import control_of
 from pipeline.scenes import TABLE_2
 from pipeline.scores import AS_LABELLED, REGISTERED, by_skin, select, whole
 from pipeline.statistics import (
-    as_json,
     differences,
     over_boards,
     over_folds,
@@ -44,8 +43,6 @@ PAPERS_SPLITS = (
 # Splits in which the readings of an indentation, or of a pass, are never divided between training and test.
 STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}
 SWEPT = ("multi", "triplet", "adapted")
-# For each experiment, the key of its sweep in numbers.json, and the key of the count on the x axis.
-AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
     "by_time": "single_temporal",
@@ -89,16 +86,6 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
     }
     numbers = {name: value for name, value in numbers.items() if value}
     return numbers | _sweeps(table) | {"variants": _variants(table)}
-
-
-def sweep_curves(table: pd.DataFrame) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
-    """Return the points of sweeps as curves, by experiment: (method, step on the axis, mean scores)."""
-    numbers = as_json(_sweeps(table))
-    return {
-        experiment: [(row.get("method", "adapted"), row[axis], _means(row)) for row in numbers[key]]
-        for experiment, (key, axis) in AXES.items()
-        if key in numbers
-    }
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
@@ -163,7 +150,7 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
     """Summarise the sweeps over pokes and over training skins."""
-    pokes, sensors = (select(table, experiment=name) for name in AXES)
+    pokes, sensors = (select(table, experiment=name) for name in ("pokes", "sensors"))
     numbers: dict[str, Any] = {}
     if len(pokes):
         numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _groups(pokes, "pokes_n")]

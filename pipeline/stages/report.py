@@ -1,4 +1,4 @@
-"""Stages that present results: table2, report (numbers, tables, figures, pages) and publish (MLflow)."""
+"""Stages that present results: table2, and report (numbers, tables, figures and pages)."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -15,8 +15,6 @@ from pipeline.provenance import (
     COSTS,
     SECONDS,
     code_version,
-    home,
-    is_experiment,
     machine,
     read_costs,
     total_cost_s,
@@ -33,7 +31,6 @@ from pipeline.report.numbers import (
     lost_by_protocol,
     split,
     stage_costs,
-    sweep_curves,
     timed_rows,
 )
 from pipeline.report.page import index_page, run_page, scene_page
@@ -42,12 +39,7 @@ from pipeline.scenes import TABLE_2, Scene, parse_scene, stages
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.statistics import as_json
-from pipeline.tracking import Curves, Results, TrackingUnavailable, metrics_of, publishing, read_times, scores_link
-from pipeline.tracking import publish as write_runs
 from pipeline.training.choice import choose, fingerprint, to_record
-from pipeline.training.final import EXPERIMENT as FINAL_EXPERIMENT
-from pipeline.training.final import FILE as FINAL_FILE
 from pipeline.training.final import final_numbers
 from reskin import io
 from reskin.config import read_yaml
@@ -96,7 +88,7 @@ def report(
     io.write_text(reports / "index.html", scene_page(shared, tables, drawn))
     # Seconds, commit and machine differ between equal runs, so this page is not an output of the DVC stage.
     timed = accuracy_and_cost.figures({"rows": timed_rows(numbers)}, {}, scene.source)
-    io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers), timed))
+    io.write_text(reports / "run.html", run_page(numbers, run_tables(numbers, scene.source), timed))
     write_index(reports.parent)
     say(f"{name}: {accuracies(numbers)}open {reports}/index.html in a browser; training runs: make ui")
 
@@ -190,58 +182,6 @@ def write_index(reports: Path) -> None:
     """Write the page that lists all scenes with reports."""
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
     io.write_text(reports / "index.html", index_page([one for one in results if "described" in one]))
-
-
-def publish(settings: Settings, indentations: Path, models: Path, scores: Path, results: Path, reports: Path) -> None:
-    """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
-    if not publishing():
-        return
-    scene, name = planned_scene(settings), settings.scene
-    # Results of `dvc exp` and results of the checkout are in different MLflow experiments.
-    experiment = f"{name} (dvc exp)" if is_experiment() else name
-    try:
-        found = published_results(scene, name, indentations, models, scores, results, reports)
-        say(write_scene(found, experiment, home(), register=not is_experiment()))
-    except TrackingUnavailable as error:
-        say(f"warning: the results of scene {name} were not written to MLflow: {error}")
-
-
-def published_results(
-    scene: Scene, name: str, indentations: Path, models: Path, scores: Path, results: Path, reports: Path
-) -> Results:
-    """Collect what the stages of a scene wrote, for MLflow."""
-    scores_file = reports / "scores.json"
-    table_2 = io.read_json(scores_file).get("table2", {}) if scores_file.exists() else {}
-    return Results(
-        models={stage: models / stage for stage in scene.model_stages},
-        curves=read_curves(scene, scores, results),
-        reports=reports,
-        scores={EXPERIMENTS[TABLE_2[row]].stage: means for row, means in table_2.items() if row in TABLE_2},
-        final=models / FINAL_EXPERIMENT / FINAL_FILE,
-        readings=sorted(indentations.glob("*.parquet")),
-        times=read_times(name),
-    )
-
-
-def write_scene(results: Results, experiment: str, root: Path, *, register: bool = True) -> str:
-    """Write the runs of a scene that MLflow lacks; return a sentence with their number and their address."""
-    counts = write_runs(results, scene=experiment, root=root, register=register)
-    return f"{experiment}: MLflow runs {counts}; scores of all training runs: {scores_link(experiment, root)}"
-
-
-def read_curves(scene: Scene, scores: Path, results: Path) -> Curves:
-    """Read the results that MLflow shows as curves: the points of every sweep, and the numbers of every analysis.
-
-    The keys of the result are the names of the stages that computed the curves.
-    """
-    table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
-    curves: dict[str, list[tuple[str, int, dict[str, float]]]]
-    curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(table).items()}
-    analyses = {experiment: io.read_json(results / f"{experiment}.json") for experiment in scene.analyses}
-    for experiment, numbers in as_json(experiment_numbers(analyses, table)).items():
-        named_values = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
-        curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named_values]
-    return curves
 
 
 def planned_scene(settings: Settings) -> Scene:
