@@ -18,7 +18,8 @@ from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
 if TYPE_CHECKING:
-    from pipeline.scenes import Plan, Source
+    from pipeline.plan import Plan
+    from pipeline.scenes import Source
 
 ROOT = Path()  # the checkout, which is the working directory
 
@@ -108,13 +109,6 @@ def add(
             "the name of each file."
         ),
     ] = None,
-    like: Annotated[
-        str | None,
-        Option(
-            help="Create the scene as a copy of this recorded scene (ini, lab, ...), with the same settings. Only if "
-            "the scene does not exist yet."
-        ),
-    ] = None,
     name: Annotated[
         str | None,
         Option(help="Name of the recording in the scene. Default: the name is made from the board and the skin."),
@@ -164,13 +158,12 @@ def add(
         ),
     ] = False,
 ) -> None:
-    """Add recordings to a scene, so that the next `dvc repro` uses them.
+    """Add recordings to a scene. `dvc repro` uses them if the scene is in the plan (`reskin scenes use`).
 
     If one of the recordings cannot be added, none of them is added.
     """
-    from pipeline import plan
     from pipeline.manage import add as adding
-    from pipeline.scenes import read_plan
+    from pipeline.plan import next_command
     from reskin.recordings import preparing
 
     serial, native = {"serial-binary", "serial-text"}, {"capture", "serial-binary", "serial-text"}
@@ -183,9 +176,9 @@ def add(
         },
     )  # fmt: skip
     _check_number(recordings, {"--name": name, "--skin": skin, "--probe": probe, "--mark": mark or None})
-    marks, planned = preparing.parse_marks(mark or []), read_plan(ROOT / PLAN).scenes
+    marks = preparing.parse_marks(mark or [])
     added: list[str] = []
-    with plan.scene_copy(ROOT, scene, like), adding.undoing(ROOT, scene, added):
+    with adding.undoing(ROOT, scene, added):
         for recording in recordings:
             names = adding.names_of(ROOT, scene, recording, preparing.CaptureNames(board or "", skin or "", name))
             with preparing.suggesting_layout(recording, layout):
@@ -205,9 +198,7 @@ def add(
                 header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
             added.append(header.capture)
             typer.echo(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
-    typer.echo(f"next: dvc repro report@{scene}")
-    if scene not in planned:
-        typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(planned) or 'none'})")
+    typer.echo(f"next: {next_command(ROOT, scene)}")
 
 
 def _check_number(recordings: list[Path], options: Mapping[str, object]) -> None:
@@ -381,10 +372,10 @@ def readme(
 @scenes.command("list")
 def list_scenes() -> None:
     """List all scenes. A star marks the scenes that `dvc repro` runs."""
-    from pipeline import plan
+    from pipeline.scenes import scene_names
 
     planned = checked_plan().scenes
-    for name in plan.scene_names(ROOT):
+    for name in scene_names(ROOT):
         typer.echo(f"{'*' if name in planned else ' '} {name}")
 
 
@@ -400,8 +391,6 @@ def use(
 
     plan.use(ROOT, names)
     typer.echo(f"dvc repro now runs: {', '.join(names)}")
-    for sentence in plan.unused_settings(ROOT, names):
-        typer.echo(f"note: {sentence}")
     if stale := tidying.stale_outputs(ROOT, checked_plan()):
         typer.echo(
             f"There are still results of stages that no longer run: {', '.join(stale)}. To delete them: reskin scenes "
@@ -424,12 +413,8 @@ def tidy() -> None:
 @scenes.command()
 def check() -> None:
     """Check the settings of the scenes that `dvc repro` runs, and whether pipeline/plan.yaml is up to date."""
-    from pipeline import plan
-
     names = list(checked_plan().scenes)
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(names) or 'none'}")
-    for sentence in plan.unused_settings(ROOT, names):
-        typer.echo(f"note: {sentence}")
 
 
 @models.command("make")

@@ -17,7 +17,7 @@ from pipeline.manage import add as adding
 from pipeline.manage import fetch as fetching
 from pipeline.manage.fetch import Origin
 from pipeline.manage.registry import read_registry
-from pipeline.scenes import read_plan
+from pipeline.plan import read_plan
 from reskin.errors import ReskinError
 from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames

@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline import plan
+from pipeline.scenes import scene_file
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
@@ -214,7 +214,7 @@ def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     try:
         folder = root / "reports" / scene
         if not (folder / "numbers.json").exists():
-            plan.scene_file(root, scene)
+            scene_file(root, scene)
             remedy = f"Run the scene first: reskin scenes use {scene}, then dvc repro."
             raise SchemaError(f"{folder / 'numbers.json'}: file not found. {remedy}")
         committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, Field
 from pipeline import PLAN
 from pipeline.manage import add
 from pipeline.manage.registry import read_registry
-from pipeline.scenes import read_plan
+from pipeline.plan import read_plan
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, ParamsError

@@ -20,7 +20,7 @@ from pipeline.manage.registry import (
     without_capture,
     write_registry,
 )
-from pipeline.scenes import read_plan
+from pipeline.plan import read_plan
 from reskin import io
 from reskin.config import parse
 from reskin.errors import ParamsError

@@ -10,7 +10,6 @@ from ruamel.yaml import YAML
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import CaptureError, did_you_mean
-from reskin.recordings.header import Header
 
 REGISTRY = "data/captures.yaml"
 COMMENT = "# The recorded captures of this checkout, by scene; written by `reskin add` and `reskin remove`.\n"
@@ -40,22 +39,8 @@ def read_registry(root: Path) -> Registry:
     return parse(Registry, read_yaml(root / REGISTRY), str(root / REGISTRY))
 
 
-def with_capture(
-    registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
-) -> Registry:
-    """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another capture."""
-    entry = Entry(
-        board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
-        fingerprints=fingerprints, copy_of=None,
-    )  # fmt: skip
-    return with_entry(registry, scene, header.capture, entry, allow_copy=allow_copy)
-
-
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Return the registry with one more entry.
-
-    The entry may be from the registry of another clone of the repository. The errors are the same as in `with_capture`.
-    """
+    """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another capture."""
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None

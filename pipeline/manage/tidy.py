@@ -10,8 +10,8 @@ from typing import Any
 from ruamel.yaml import YAML
 
 from pipeline.manage.running import require_idle
-from pipeline.plan import scene_names
-from pipeline.scenes import Plan
+from pipeline.plan import Plan
+from pipeline.scenes import scene_names
 from reskin import io
 from reskin.config import read_yaml
 

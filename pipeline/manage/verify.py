@@ -12,10 +12,10 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline import plan
 from pipeline.manage.add import RAW
 from pipeline.manage.compare import Echo, print_comparison, read_folder, read_revision
 from pipeline.manage.registry import REGISTRY
+from pipeline.scenes import scene_file
 from pipeline.stage import say
 from pipeline.tracking import PUBLISH
 from reskin import io
@@ -35,7 +35,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
     The new reports are those in folder `against` or, if this is None, the reports of a rerun.
     """
     for name in names:
-        plan.scene_file(root, name)
+        scene_file(root, name)
     # Committed reports are read first, so that errors in them are found before the rerun, which takes hours.
     committed = {name: read_revision(root, name, "HEAD") for name in names}
     if against is None:

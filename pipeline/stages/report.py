@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline import PLAN, SCENES
-from pipeline.catalogue import EXPERIMENTS
+from pipeline.catalogue import EXPERIMENTS, stages
 from pipeline.executors import make_executor
 from pipeline.experiments import accuracy_and_cost
 from pipeline.formatting import rounded, to_markdown
@@ -41,7 +41,7 @@ from pipeline.report.numbers import (
 from pipeline.report.page import about_scene, index, page, run_page
 from pipeline.report.summary import summarise
 from pipeline.report.tables import make_tables, run_tables, table_2_summary, table_texts
-from pipeline.scenes import TABLE_2, Scene, parse_scene, stages
+from pipeline.scenes import TABLE_2, Scene, parse_scene
 from pipeline.scores import read_scores, to_csv
 from pipeline.settings import Settings
 from pipeline.stage import say
@@ -81,7 +81,7 @@ def report(
     source, inputs = scene.source, read_inputs(name, scene, indentations, folds, models, results)
     table = read_scores(scores / f"{stage}.parquet" for stage in scene.scored_stages)
     numbers = rounded(compute_numbers(settings, scene, inputs, table))
-    plot_data = {EXPERIMENTS[name].key: result["drawn"] for name, result in inputs.analyses.items()}
+    plot_data = {name: result["drawn"] for name, result in inputs.analyses.items()}
     if "choice" in scene.experiments:
         physics = fingerprint(settings.shared)
         record = to_record(numbers["chosen"], inputs.cards, source=source, seed=settings.seed, physics=physics)
@@ -153,13 +153,12 @@ def read_inputs(scene_name: str, scene: Scene, indentations: Path, folds: Path, 
 
 def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.DataFrame) -> dict[str, Any]:
     """Compute the content of numbers.json and provenance.json."""
-    analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
     runtime: dict[str, Any] = {"stages": stage_costs(costs)}
     seconds = SECONDS / settings.scene / "accuracy_and_cost.json"
     if "accuracy_and_cost" in scene.experiments and seconds.exists():
         runtime["accuracy_and_cost"] = io.read_json(seconds)
-    experiments = {EXPERIMENTS[name].key: found for name, found in experiment_numbers(inputs.analyses, table).items()}
+    experiments = experiment_numbers(inputs.analyses, table)
     numbers = {
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
@@ -170,9 +169,9 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, table: pd.
         **learning_numbers(table, headline=HEADLINE),
         **inputs.final_model,
         **before_touch_numbers(table),
-        "trainings": count_trainings(inputs.cards, inputs.curves | analyses),
+        "trainings": count_trainings(inputs.cards, inputs.curves | inputs.analyses),
         "described": inputs.described,
-        **{entry.key: experiments[entry.key] for entry in scene.entries if entry.key in experiments},
+        **{entry.name: experiments[entry.name] for entry in scene.entries if entry.name in experiments},
         "runtime": runtime,
     }  # fmt: skip
     if scene.simulate is not None:
